@@ -1,0 +1,1 @@
+"""Interferometer map ingest and calibration of deformable mirrors."""

@@ -1,0 +1,25 @@
+from setuptools import find_packages, setup
+
+package_name = "dm_calibration"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="Deformable mirror maintainers",
+    maintainer_email="maintainers@deformable-mirror.example",
+    description="Interferometer map ingest and calibration of deformable mirrors",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "interferometer = dm_calibration.interferometer_node:main",
+            "calibration = dm_calibration.calibration_node:main",
+        ],
+    },
+)

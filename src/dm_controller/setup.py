@@ -1,0 +1,29 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = "dm_controller"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+        (f"share/{package_name}/launch", glob("launch/*.launch.py")),
+        (f"share/{package_name}/config", glob("config/*.*")),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="Deformable mirror maintainers",
+    maintainer_email="maintainers@deformable-mirror.example",
+    description="Open-loop focus controller for deformable mirrors, with launch files and the dm command",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "focus_controller = dm_controller.focus_controller_node:main",
+            "dm = dm_controller.cli:main",
+        ],
+    },
+)

@@ -1,0 +1,1 @@
+"""Drive electronics, safety limiter and virtual bench for piezo deformable mirrors."""

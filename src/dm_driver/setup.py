@@ -1,0 +1,25 @@
+from setuptools import find_packages, setup
+
+package_name = "dm_driver"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="Deformable mirror maintainers",
+    maintainer_email="maintainers@deformable-mirror.example",
+    description="Drive electronics, safety limiter and virtual bench for piezo deformable mirrors",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "pdm_driver = dm_driver.pdm_driver_node:main",
+            "virtual_bench = dm_driver.virtual_bench_node:main",
+        ],
+    },
+)

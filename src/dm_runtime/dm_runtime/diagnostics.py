@@ -1,0 +1,49 @@
+"""Health of a node on `/diagnostics`, once a second (the Python diagnostic_updater is not on PyPI)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+STALE = DiagnosticStatus.STALE
+
+
+@dataclass
+class Health:
+    """One status: a level (OK, WARN, ERROR, STALE), a line for a person, and figures."""
+
+    level: bytes = OK
+    message: str = "ok"
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+class Diagnostics:
+    """Publish `check()` on `/diagnostics` once a second of wall time, whatever ROS time does."""
+
+    def __init__(self, node: Node, hardware_id: str, check: Callable[[], Health], period_s: float = 1.0) -> None:
+        self._node = node
+        self._check = check
+        self.hardware_id = hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._timer = node.create_timer(period_s, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def publish(self) -> None:
+        """Publish now."""
+        health = self._check()
+        status = DiagnosticStatus(
+            level=health.level,
+            name=self._node.get_fully_qualified_name().lstrip("/"),
+            message=health.message,
+            hardware_id=self.hardware_id,
+            values=[KeyValue(key=str(key), value=str(value)) for key, value in health.values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)

@@ -1,0 +1,168 @@
+"""Parameters declared once: type, default, unit, range and description in one table per node.
+
+The table declares the parameters, checks every value (at start and on `ros2 param set`) and is the source of the
+parameter pages of the documentation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+_TYPES: dict[type | str, RosParameter.Type] = {
+    bool: RosParameter.Type.BOOL,
+    int: RosParameter.Type.INTEGER,
+    float: RosParameter.Type.DOUBLE,
+    str: RosParameter.Type.STRING,
+    "float[]": RosParameter.Type.DOUBLE_ARRAY,
+    "int[]": RosParameter.Type.INTEGER_ARRAY,
+    "str[]": RosParameter.Type.STRING_ARRAY,
+}
+
+#: Marks a parameter that the configuration must give.
+REQUIRED = object()
+
+
+class ParameterError(ValueError):
+    """A parameter is missing or out of its range; the message names it, its value and what is allowed."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a node.
+
+    Attributes:
+        name: snake_case; dots group.
+        kind: bool, int, float, str, "float[]", "int[]" or "str[]".
+        default: the value when none is given; REQUIRED when the configuration must give it; an empty list for arrays.
+        description: what it is, for a person.
+        unit: SI unit, "" when it has none.
+        low, high: allowed range of numbers (of each element for arrays), inclusive.
+        choices: allowed strings.
+        live: True when it may change while the node runs.
+    """
+
+    name: str
+    kind: type | str
+    default: Any
+    description: str
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    live: bool = False
+
+    def describe(self) -> str:
+        """Description with unit and range, as `ros2 param describe` shows it."""
+        text = self.description + (f" [{self.unit}]" if self.unit else "")
+        if self.choices:
+            text += f" One of: {', '.join(self.choices)}."
+        return text
+
+    def allowed(self) -> str:
+        """The allowed values in words."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        kind = self.kind if isinstance(self.kind, str) else self.kind.__name__
+        if math.isinf(self.low) and math.isinf(self.high):
+            return f"a {kind}"
+        return f"{kind}, {self.low:g} to {self.high:g}{' ' + self.unit if self.unit else ''}"
+
+    def check(self, value: Any) -> None:
+        """Raise ParameterError when `value` is not allowed."""
+        if self.choices and value not in self.choices:
+            raise ParameterError(f"{self.name} = {value!r}: must be {self.allowed()}")
+        numbers = value if self.kind in ("float[]", "int[]") else [value] if self.kind in (int, float) else []
+        for number in numbers:
+            if not (math.isfinite(number) and self.low <= number <= self.high):
+                raise ParameterError(f"{self.name} = {value!r}: must be {self.allowed()}")
+
+    def descriptor(self) -> ParameterDescriptor:
+        descriptor = ParameterDescriptor(
+            name=self.name,
+            type=_TYPES[self.kind].value,
+            description=self.describe(),
+            additional_constraints=self.allowed(),
+            read_only=not self.live,
+        )
+        if self.kind is float and not (math.isinf(self.low) and math.isinf(self.high)):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=max(self.low, -1e308), to_value=min(self.high, 1e308))
+            ]
+        if self.kind is int and not (math.isinf(self.low) and math.isinf(self.high)):
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(max(self.low, -(2**62))), to_value=int(min(self.high, 2**62)))
+            ]
+        return descriptor
+
+
+def declare(
+    node: Node,
+    table: Sequence[Parameter],
+    on_change: Callable[[Mapping[str, Any]], None] | None = None,
+) -> dict[str, Any]:
+    """Declare every parameter of `table` on `node` and return their values by name.
+
+    Live parameters are checked on every set; accepted changes are put into the returned dictionary, then given to
+    `on_change`.
+
+    Raises:
+        ParameterError: naming every required parameter that is missing, or the first value out of range.
+    """
+    values: dict[str, Any] = {}
+    missing: list[Parameter] = []
+    for parameter in table:
+        default = _TYPES[parameter.kind] if parameter.default is REQUIRED else parameter.default
+        if isinstance(default, list):  # rclpy cannot tell the type of an empty list
+            default = _TYPES[parameter.kind] if not default else default
+        descriptor = parameter.descriptor()
+        node.declare_parameter(parameter.name, default, descriptor)
+        value = node.get_parameter_or(parameter.name).value
+        if value is None:
+            if parameter.default is REQUIRED:
+                missing.append(parameter)
+                continue
+            value = list(parameter.default)
+        elif isinstance(parameter.kind, str):
+            value = list(value)
+        parameter.check(value)
+        values[parameter.name] = value
+    if missing:
+        names = "; ".join(f"{parameter.name} ({parameter.describe()})" for parameter in missing)
+        raise ParameterError(f"{node.get_name()}: required parameters are missing from the configuration: {names}")
+
+    by_name = {parameter.name: parameter for parameter in table}
+
+    def validate(changes: list[RosParameter]) -> SetParametersResult:
+        try:
+            for change in changes:
+                if change.name in by_name:
+                    by_name[change.name].check(change.value)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def apply(changes: list[RosParameter]) -> None:
+        accepted = {change.name: change.value for change in changes if change.name in by_name}
+        values.update(accepted)
+        if on_change is not None and accepted:
+            on_change(accepted)
+
+    node.add_on_set_parameters_callback(validate)
+    node.add_post_set_parameters_callback(apply)
+    return values
+
+
+def as_markdown(table: Sequence[Parameter]) -> str:
+    """The table as a Markdown table, for the documentation."""
+    lines = ["| parameter | default | allowed | what it is |", "|---|---|---|---|"]
+    for parameter in table:
+        default = "**required**" if parameter.default is REQUIRED else f"`{parameter.default!r}`"
+        lines.append(f"| `{parameter.name}` | {default} | {parameter.allowed()} | {parameter.describe()} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,19 @@
+from setuptools import find_packages, setup
+
+package_name = "dm_runtime"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="Deformable mirror maintainers",
+    maintainer_email="maintainers@deformable-mirror.example",
+    description="What the nodes of the deformable-mirror suite share: executor, worker threads, parameters, diagnostics",
+    license="Apache-2.0",
+)

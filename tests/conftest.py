@@ -1,0 +1,49 @@
+"""Fixtures of the cross-package tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import NodeProcess, Observer, own_domain
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """A ROS domain of the test's own."""
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def observer(domain: int) -> Iterator[Observer]:
+    """A node in the test process on the test's domain."""
+    with Observer(domain) as node:
+        yield node
+
+
+@pytest.fixture
+def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
+    """start(package, executable, parameters) starts a node as a process; all are stopped after the test."""
+    started: list[NodeProcess] = []
+
+    def begin(package: str, executable: str, parameters: Mapping[str, Any], *arguments: str) -> NodeProcess:
+        process = NodeProcess(package, executable, parameters, tmp_path / f"node{len(started)}", domain, arguments)
+        started.append(process)
+        return process
+
+    yield begin
+    for process in reversed(started):
+        if process.running:
+            process.stop()
+
+
+@pytest.fixture(scope="session")
+def samples() -> Path:
+    """The folder of real ZYGO maps beside the checkout; tests that need it are skipped where it is absent."""
+    folder = Path(__file__).resolve().parents[2] / "shared" / "samples"
+    if not folder.is_dir():
+        pytest.skip("no folder of real sample maps beside the checkout")
+    return folder

@@ -1,0 +1,167 @@
+"""What the cross-package tests share: nodes as separate processes over real DDS, and an observer to talk to them."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import rclpy
+import yaml
+from dm_runtime.executor import make_executor, spin
+from rclpy.action import ActionClient
+from rclpy.context import Context  # noqa: F401  (documents that one context serves the test process)
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+
+
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """Lend a ROS domain that no other test on this machine uses at the same time."""
+    folder = Path(tempfile.gettempdir()) / "dm-test-domains"
+    folder.mkdir(exist_ok=True)
+    for domain in range(1, 100):
+        handle: IO[str] = (folder / str(domain)).open("w")
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            handle.close()
+            continue
+        try:
+            yield domain
+        finally:
+            handle.close()
+        return
+    raise RuntimeError("no free ROS domain: 99 tests run at once?")
+
+
+def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str = "") -> Any:
+    """Return the first true value of `condition()`; fail the test when there is none in time."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.01)
+    raise AssertionError(f"not within {timeout_s:g} s: {what or condition}")
+
+
+class NodeProcess:
+    """One node of the suite in its own process, its output in a file."""
+
+    def __init__(
+        self,
+        package: str,
+        executable: str,
+        parameters: Mapping[str, Any],
+        folder: Path,
+        domain: int,
+        arguments: tuple[str, ...] = (),
+    ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.log = folder / f"{executable}.log"
+        parameter_file = folder / f"{executable}.yaml"
+        parameter_file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dict(parameters)}}))
+        module = f"{package}.{executable}_node"
+        self._output = self.log.open("ab")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments, "--ros-args", "--params-file", str(parameter_file)],
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        )
+
+    @property
+    def output(self) -> str:
+        return self.log.read_text(errors="replace")
+
+    @property
+    def running(self) -> bool:
+        return self.process.poll() is None
+
+    def stop(self, number: int = signal.SIGINT, timeout_s: float = 15.0) -> int:
+        """Send a signal, wait for the end, return the exit status."""
+        if self.running:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.send_signal(number)
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            raise AssertionError(f"the node did not end on signal {number}:\n{self.output}") from None
+        finally:
+            self._output.close()
+
+
+class Observer:
+    """A node in the test process: publishes, records topics, calls services and actions. Use as a context manager."""
+
+    def __init__(self, domain: int, name: str = "observer") -> None:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node(name)
+        self._stop = False
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._clients: dict[str, Any] = {}
+
+    def _spin(self) -> None:
+        self._executor = make_executor(self.node)
+        spin(self._executor, until=lambda: self._stop)
+
+    def __enter__(self) -> Observer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._stop = True
+        self._executor.create_task(lambda: None)
+        self._thread.join(5)
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+    def record(self, message_type: Any, topic: str, qos: QoSProfile | int = 10) -> list[Any]:
+        """Return a list to which every message on `topic` is appended."""
+        received: list[Any] = []
+        self.node.create_subscription(message_type, topic, received.append, qos)
+        return received
+
+    def call(self, service_type: Any, name: str, request: Any = None, timeout_s: float = 15.0) -> Any:
+        """Call a service and return its response."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_type, name)
+        client = self._clients[name]
+        wait_until(client.service_is_ready, timeout_s, f"service {name}")
+        future = client.call_async(request if request is not None else service_type.Request())
+        wait_until(future.done, timeout_s, f"answer of {name}")
+        return future.result()
+
+    def send_goal(
+        self, action_type: Any, name: str, goal: Any, feedback: Callable[[Any], None] | None = None
+    ) -> tuple[Any, Any]:
+        """Send a goal; return (goal handle, future of the result)."""
+        if name not in self._clients:
+            self._clients[name] = ActionClient(self.node, action_type, name)
+        client = self._clients[name]
+        wait_until(client.server_is_ready, 15, f"action {name}")
+        accepted = client.send_goal_async(goal, feedback_callback=feedback)
+        wait_until(accepted.done, 15, f"acceptance by {name}")
+        handle = accepted.result()
+        return handle, handle.get_result_async() if handle.accepted else None
+
+    def run_goal(self, action_type: Any, name: str, goal: Any, timeout_s: float = 120.0) -> Any:
+        """Send a goal and wait for its result (the whole GetResult response: .status, .result)."""
+        handle, result = self.send_goal(action_type, name, goal)
+        assert handle.accepted, f"{name} refused the goal"
+        wait_until(result.done, timeout_s, f"result of {name}")
+        return result.result()
