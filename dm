@@ -6,6 +6,8 @@ Standard library only: this file must start on a machine that has nothing but Py
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import json
 import os
@@ -14,11 +16,14 @@ import subprocess
 import sys
 import sysconfig
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
+#: Raise when this script sets the environment up in another way, so that existing ones are made anew.
+RECIPE = 1
 ENVIRONMENT_STAMP = VENV / "dm-environment.json"
 BUILD_STAMP = ROOT / "install" / "dm-build.json"
 SUPPORTED_PYTHON = ((3, 11), (3, 13))
@@ -62,7 +67,7 @@ def sourced_jazzy() -> bool:
     """Whether the shell has sourced an apt (or source) installation of ROS 2 Jazzy."""
     if os.environ.get("ROS_DISTRO") != "jazzy" or not os.environ.get("AMENT_PREFIX_PATH"):
         return False
-    return not os.environ["AMENT_PREFIX_PATH"].startswith(str(VENV))
+    return str(VENV) not in os.environ["AMENT_PREFIX_PATH"].split(os.pathsep)  # else this is a ./dm inside a ./dm exec
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -126,7 +131,7 @@ def requirement_files() -> list[Path]:
 
 
 def environment_key() -> str:
-    return digest([*requirement_files(), ROOT / "dm"]) + sys.version + str(sourced_jazzy()) + str(ROOT)
+    return digest(requirement_files()) + str(RECIPE) + sys.version + str(sourced_jazzy()) + str(ROOT)
 
 
 def run_logged(command: list[str], log: Path, what: str, environment: dict[str, str] | None = None) -> None:
@@ -155,7 +160,10 @@ def name_this_python(venv: Path) -> None:
     include, library = sysconfig.get_path("include"), f"lib/python{sys.version_info[0]}.{sys.version_info[1]}"
     replacements = [
         (re.compile(r"/opt/python/cp3\d+-cp3\d+/include/python3\.\d+"), include),
-        (re.compile(r"/opt/python/cp3\d+-cp3\d+/lib/python3\.\d+/site-packages"), str(venv / library / "site-packages")),
+        (
+            re.compile(r"/opt/python/cp3\d+-cp3\d+/lib/python3\.\d+/site-packages"),
+            str(venv / library / "site-packages"),
+        ),
     ]
     for path in (venv / "share").rglob("*.cmake"):
         text = changed = path.read_text(errors="surrogateescape")
@@ -165,9 +173,17 @@ def name_this_python(venv: Path) -> None:
             path.write_text(changed, errors="surrogateescape")
 
 
+def stamped(stamp: Path, key: str) -> bool:
+    return stamp.is_file() and json.loads(stamp.read_text()).get("key") == key
+
+
+def environment_is_ready() -> bool:
+    return stamped(ENVIRONMENT_STAMP, environment_key())
+
+
 def set_up_environment() -> None:
     key = environment_key()
-    if ENVIRONMENT_STAMP.is_file() and json.loads(ENVIRONMENT_STAMP.read_text()).get("key") == key:
+    if environment_is_ready():
         return
     check_tools()
     # A half-made environment is worthless, and one of other pins must not linger: begin anew.
@@ -196,7 +212,7 @@ def set_up_environment() -> None:
 def build_key() -> str:
     """What needs a new colcon build when it changes.
 
-    Python sources, launch and configuration files are linked into the install space: only the names of the latter count.
+    Python sources, launch and configuration files are linked into the install space: of these only names count.
     """
     inputs = [path for path in (ROOT / "src" / "dm_msgs").rglob("*") if path.is_file()]
     names = []
@@ -215,22 +231,37 @@ def wheel_environment() -> dict[str, str]:
     return environment
 
 
-def captured_environment() -> dict[str, str]:
-    """What the set-up files of the workspace change, so that later runs need no shell."""
-    script = f"source '{ROOT}/install/setup.bash' >/dev/null 2>&1; exec '{PYTHON}' -c 'import json,os;print(json.dumps(dict(os.environ)))'"
-    before = wheel_environment()
-    output = subprocess.run(["bash", "-c", script], env=before, check=True, capture_output=True, text=True).stdout
-    after = json.loads(output)
+def captured_environment() -> dict[str, dict[str, object]]:
+    """What the set-up files of the workspace change, so that later runs need no shell: values, and entries of paths."""
+    dump = "import json,os;print(json.dumps(dict(os.environ)))"
+    script = f"source '{ROOT}/install/setup.bash' >/dev/null 2>&1; exec '{PYTHON}' -c '{dump}'"
+    output = subprocess.run(["bash", "-c", script], env=wheel_environment(), check=True, capture_output=True, text=True)
     volatile = {"_", "PWD", "OLDPWD", "SHLVL"}
-    original = dict(os.environ)
-    return {key: value for key, value in after.items() if key not in volatile and original.get(key) != value}
+    values: dict[str, object] = {}
+    paths: dict[str, object] = {}
+    for name, value in json.loads(output.stdout).items():
+        before = os.environ.get(name)
+        if name in volatile or value == before:
+            continue
+        if name.endswith("PATH"):
+            known = (before or "").split(os.pathsep)
+            paths[name] = [entry for entry in value.split(os.pathsep) if entry and entry not in known]
+        else:
+            values[name] = value
+    return {"values": values, "paths": paths}
+
+
+def workspace_key() -> str:
+    return build_key() + environment_key()
+
+
+def workspace_is_ready() -> bool:
+    return stamped(BUILD_STAMP, workspace_key())
 
 
 def build_workspace() -> None:
-    # The captured environment holds the paths of the shell that built; another shell must not be mistaken for it.
-    shell = [os.environ.get(name, "") for name in ("PATH", "LD_LIBRARY_PATH", "PYTHONPATH")]
-    key = build_key() + environment_key() + hashlib.sha256("\0".join(shell).encode()).hexdigest()
-    if BUILD_STAMP.is_file() and json.loads(BUILD_STAMP.read_text()).get("key") == key:
+    key = workspace_key()
+    if workspace_is_ready():
         return
     check_tools()
     for package in (ROOT / "src").iterdir():  # stale links of moved files would survive a rebuild
@@ -248,14 +279,32 @@ def build_workspace() -> None:
 
 
 def run_environment() -> dict[str, str]:
-    environment = {**os.environ, **json.loads(BUILD_STAMP.read_text())["environment"]}
+    captured = json.loads(BUILD_STAMP.read_text())["environment"]
+    environment = {**os.environ, **captured["values"]}
+    for name, added in captured["paths"].items():
+        present = [entry for entry in os.environ.get(name, "").split(os.pathsep) if entry and entry not in added]
+        environment[name] = os.pathsep.join([*added, *present])
     # Nodes of a bench talk on this machine only unless the user opens it.
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     profile = ROOT / "src" / "dm_controller" / "config" / "fastdds.xml"
     environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
     environment.setdefault("PYTHONUNBUFFERED", "1")
+    # Matrix products here take a millisecond; the threads of several nodes would fight over the cores for longer.
+    environment.setdefault("OPENBLAS_NUM_THREADS", "1")
     environment["DM_ROOT"] = str(ROOT)
     return environment
+
+
+@contextlib.contextmanager
+def only_one() -> Iterator[None]:
+    """Keep a second ./dm waiting while the first sets up or builds."""
+    with (ROOT / ".dm-lock").open("w") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            say("another ./dm is setting up; waiting for it")
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
 
 
 def main(arguments: list[str]) -> int:
@@ -266,8 +315,10 @@ def main(arguments: list[str]) -> int:
     try:
         if command == "doctor" and missing_tools():
             check_tools()  # the full doctor needs the environment; without a compiler this is its answer
-        set_up_environment()
-        build_workspace()
+        if not (environment_is_ready() and workspace_is_ready()):
+            with only_one():
+                set_up_environment()
+                build_workspace()
     except SetupError as error:
         say(f"./dm: {error}")
         return 1
@@ -284,7 +335,7 @@ def main(arguments: list[str]) -> int:
             say(f"./dm exec: no command named {rest[0]!r} in the environment")
             return 127
         os.execve(target, rest, environment)
-    os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_controller.cli", command, *rest], environment)
+    return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_controller.cli", command, *rest], environment)
 
 
 if __name__ == "__main__":

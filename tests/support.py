@@ -2,47 +2,24 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import signal
 import subprocess
 import sys
-import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import rclpy
 import yaml
-from dm_runtime.executor import make_executor, spin
 from rclpy.action import ActionClient
-from rclpy.context import Context  # noqa: F401  (documents that one context serves the test process)
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-
-@contextmanager
-def own_domain() -> Iterator[int]:
-    """Lend a ROS domain that no other test on this machine uses at the same time."""
-    folder = Path(tempfile.gettempdir()) / "dm-test-domains"
-    folder.mkdir(exist_ok=True)
-    for domain in range(1, 100):
-        handle: IO[str] = (folder / str(domain)).open("w")
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            handle.close()
-            continue
-        try:
-            yield domain
-        finally:
-            handle.close()
-        return
-    raise RuntimeError("no free ROS domain: 99 tests run at once?")
+from dm_controller.suite import own_domain
+from dm_runtime.executor import BackgroundExecutor
 
 
 def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str = "") -> Any:
@@ -54,6 +31,9 @@ def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str 
             return value
         time.sleep(0.01)
     raise AssertionError(f"not within {timeout_s:g} s: {what or condition}")
+
+
+__all__ = ["NodeProcess", "Observer", "own_domain", "wait_until"]
 
 
 class NodeProcess:
@@ -111,23 +91,14 @@ class Observer:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node(name)
-        self._stop = False
-        self._thread = threading.Thread(target=self._spin, daemon=True)
         self._clients: dict[str, Any] = {}
 
-    def _spin(self) -> None:
-        self._executor = make_executor(self.node)
-        spin(self._executor, until=lambda: self._stop)
-
     def __enter__(self) -> Observer:
-        self._thread.start()
+        self._background = BackgroundExecutor(self.node)
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        self._stop = True
-        self._executor.create_task(lambda: None)
-        self._thread.join(5)
-        self.node.destroy_node()
+        self._background.destroy_node()
         rclpy.try_shutdown()
 
     def record(self, message_type: Any, topic: str, qos: QoSProfile | int = 10) -> list[Any]:

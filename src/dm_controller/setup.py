@@ -1,4 +1,4 @@
-from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -11,8 +11,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
-        (f"share/{package_name}/launch", glob("launch/*.launch.py")),
-        (f"share/{package_name}/config", glob("config/*.*")),
+        (f"share/{package_name}/launch", [str(path) for path in Path("launch").glob("*.launch.py")]),
+        (f"share/{package_name}/config", [str(path) for path in Path("config").glob("*.*")]),
     ],
     install_requires=["setuptools"],
     zip_safe=True,

@@ -14,6 +14,6 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="What the nodes of the deformable-mirror suite share: executor, worker threads, parameters, diagnostics",
+    description="What the nodes of the suite share: executor, worker threads, parameters, diagnostics",
     license="Apache-2.0",
 )

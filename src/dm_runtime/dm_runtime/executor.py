@@ -4,9 +4,12 @@
 with care (measured with rclpy 7.1.6):
 
 * `spin()` without a time limit never dispatches in the PyPI wheels; `spin_once(timeout_sec=...)` in a loop does.
-* An exception in a callback leaves `spin_once`; it must not end a process that holds a mirror.
+* An exception in a callback leaves `spin_once` and with it the rest of the batch: messages that arrived together with
+  the one that raised would wait for the next event, and every later one would be late by one.
 * `async def` service callbacks are not run, and a pending `await` in an action callback is polled at 100 % CPU. Work
   that waits therefore runs in worker threads (see :mod:`dm_runtime.worker`), and callbacks stay short.
+* It keeps a hold on every entity it serves: a node destroyed before its executor is shut down stays in the ROS graph,
+  latched messages and all.
 * It installs its own SIGINT/SIGTERM handler, which shuts the ROS context down and ends the loop.
 """
 
@@ -14,6 +17,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 
@@ -21,6 +25,7 @@ import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental import EventsExecutor
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -29,8 +34,8 @@ WAKE_PERIOD_S = 1.0
 
 
 def make_executor(*nodes: Node) -> Executor:
-    """Return the suite's executor with `nodes` added."""
-    executor = EventsExecutor()
+    """Return the suite's executor with `nodes` (at least one, all of one context) added."""
+    executor = EventsExecutor(context=nodes[0].context)
     for node in nodes:
         executor.add_node(node)
     return executor
@@ -41,15 +46,58 @@ def spin(executor: Executor, until: Callable[[], bool] | None = None) -> None:
 
     A callback that raises is logged with its traceback and the loop goes on.
     """
-    while rclpy.ok() and not (until is not None and until()):
+    context = executor.context
+    while context.ok() and not (until is not None and until()):
         try:
             executor.spin_once(timeout_sec=WAKE_PERIOD_S)
         except (KeyboardInterrupt, ExternalShutdownException):
             return
         except Exception:
-            if not rclpy.ok():
+            if not context.ok():
                 return
-            rclpy.logging.get_logger("dm_runtime").error(f"a callback raised:\n{traceback.format_exc()}")
+            _log_exception()
+            _serve_rest_of_batch(executor)
+
+
+def _log_exception() -> None:
+    get_logger("dm_runtime").error(f"a callback raised:\n{traceback.format_exc()}")
+
+
+def _serve_rest_of_batch(executor: Executor) -> None:
+    """Serve what the executor dropped when a callback raised."""
+    for node in executor.get_nodes():
+        for subscription in list(node.subscriptions):
+            while (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
+                try:
+                    subscription.callback(taken[0])
+                except Exception:
+                    _log_exception()
+        for service in list(node.services):
+            while (taken := service.handle.service_take_request(service.srv_type.Request))[0] is not None:
+                request, header = taken
+                try:
+                    service.send_response(service.callback(request, service.srv_type.Response()), header)
+                except Exception:
+                    _log_exception()
+
+
+class BackgroundExecutor:
+    """Serves a node from a thread of its own, for programs that are not nodes themselves."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._executor = make_executor(node)
+        self._stop = False
+        self._thread = threading.Thread(target=spin, args=(self._executor, lambda: self._stop), daemon=True)
+        self._thread.start()
+
+    def destroy_node(self) -> None:
+        """Stop serving and take the node, with all it published, out of the ROS graph."""
+        self._stop = True
+        self._executor.create_task(lambda: None)  # wake() alone does not end a spin_once
+        self._thread.join(2 * WAKE_PERIOD_S)
+        self._executor.shutdown(2 * WAKE_PERIOD_S)
+        self._node.destroy_node()
 
 
 def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int:
@@ -60,11 +108,15 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
 
     Returns the exit status: 0, or 1 when the node could not be made (the reason is on standard error).
     """
+    # Until the executor takes the signals over, SIGTERM must end the process by the same path as Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node: Node | None = None
+    executor: Executor | None = None
     try:
         node = make_node()
-        spin(make_executor(node))
+        executor = make_executor(node)
+        spin(executor)
         return 0
     except (ParameterException, ValueError, OSError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
@@ -78,5 +130,7 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
             make_safe = getattr(node, "make_safe", None)
             if make_safe is not None:
                 make_safe()
+            if executor is not None:
+                executor.shutdown(WAKE_PERIOD_S)
             node.destroy_node()
         rclpy.try_shutdown()

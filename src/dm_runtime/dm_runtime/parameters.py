@@ -120,7 +120,7 @@ def declare(
     for parameter in table:
         default = _TYPES[parameter.kind] if parameter.default is REQUIRED else parameter.default
         if isinstance(default, list):  # rclpy cannot tell the type of an empty list
-            default = _TYPES[parameter.kind] if not default else default
+            default = default or _TYPES[parameter.kind]
         descriptor = parameter.descriptor()
         node.declare_parameter(parameter.name, default, descriptor)
         value = node.get_parameter_or(parameter.name).value

@@ -44,7 +44,7 @@ class WorkerService:
         # The executor calls `callback` and passes what it returns to `send_response(response, header)`: the only place
         # where the header that a later answer needs can be had.
         self._send: Callable[[Any, Any], None] = self._service.send_response
-        self._service.send_response = self._start  # type: ignore[method-assign]
+        self._service.send_response = self._start
 
     def _start(self, request_and_response: tuple[Any, Any], header: Any) -> None:
         self._pool.submit(self._work, *request_and_response, header)

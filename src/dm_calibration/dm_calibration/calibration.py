@@ -1,0 +1,209 @@
+"""A calibration: what was measured, the influence function fitted to it, and where it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.hdf5_image import Attribute, Column
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.optics.sampling import SamplePoints
+
+T = TypeVar("T")
+Floats = NDArray[np.float64]
+
+SCHEMA = "dm_calibration/calibration"
+SCHEMA_VERSION = 1
+
+_POINTS = ("x", "y", "weight")
+
+
+class CalibrationFileError(ValueError):
+    """A calibration file is damaged, foreign, or of an unknown schema; the message says which and where."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibration, complete: raw data, result, provenance. All of it is in the file.
+
+    Attributes:
+        id: unique name, also the file's stem.
+        mirror_name, mirror_serial: the mirror measured.
+        wavelength: m; 0 = the maps did not tell.
+        aperture_radius: m.
+        created_ns: time of writing, ns since the epoch of the node's clock.
+        software_version: of dm_calibration.
+        actuator_x, actuator_y: (N,) m, positions in the configuration at the time of measuring.
+        maps: the raw data.
+        fit: the result.
+        dropped: "label: reason" of the states that gave no map at all.
+        limitations: sentences; those of the fit, of the run, and of the poke check.
+        note: the user's.
+    """
+
+    id: str
+    mirror_name: str
+    mirror_serial: str
+    wavelength: float
+    aperture_radius: float
+    created_ns: int
+    actuator_x: Floats
+    actuator_y: Floats
+    maps: MapSet
+    fit: InfluenceFit
+    dropped: tuple[str, ...] = ()
+    limitations: tuple[str, ...] = ()
+    note: str = ""
+    software_version: str = ""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the last map, ns."""
+        return int(self.maps.stamp_ns.max())
+
+    @property
+    def maps_dropped(self) -> int:
+        """Maps that did not enter the fit, and states that gave none."""
+        return int((~self.fit.used).sum()) + len(self.dropped)
+
+
+def software_version() -> str:
+    """Version of this package as installed; "unknown" when run from a bare checkout."""
+    try:
+        return version("dm_calibration")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, Attribute]]:
+    """The calibration as datasets and root attributes of its file."""
+    maps, fit = calibration.maps, calibration.fit
+    columns: dict[str, Column] = {
+        "mirror/actuator_x": np.asarray(calibration.actuator_x, dtype=np.float64),
+        "mirror/actuator_y": np.asarray(calibration.actuator_y, dtype=np.float64),
+    }
+    for name in _POINTS:
+        columns[f"points/{name}"] = getattr(maps.points, name)
+    for field in fields(MapSet):
+        if field.name != "points":
+            columns[f"maps/{field.name}"] = getattr(maps, field.name)
+    columns["maps/reference"] = maps.reference
+    attributes: dict[str, Attribute] = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "id": calibration.id,
+        "mirror_name": calibration.mirror_name,
+        "mirror_serial": calibration.mirror_serial,
+        "wavelength": float(calibration.wavelength),
+        "aperture_radius": float(calibration.aperture_radius),
+        "created_ns": int(calibration.created_ns),
+        "software_version": calibration.software_version,
+        "dropped": calibration.dropped,
+        "known_limitations": calibration.limitations,
+        "note": calibration.note,
+        "maps_used": int(fit.used.sum()),
+    }
+    for field in fields(InfluenceFit):
+        value = getattr(fit, field.name)
+        if field.name == "points":
+            continue
+        if isinstance(value, np.ndarray):
+            columns[f"result/{field.name}"] = value
+        elif field.name == "reasons":
+            columns["result/reasons"] = value
+        else:
+            attributes[f"fit_{field.name}"] = value
+    return columns, attributes
+
+
+def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribute]) -> Calibration:
+    """The calibration in the datasets and attributes of a file.
+
+    Raises:
+        CalibrationFileError: another schema, something missing, of a wrong type or shape, or not finite.
+    """
+    if attributes.get("schema") != SCHEMA:
+        raise CalibrationFileError(f"schema {attributes.get('schema')!r}: not a calibration of this suite")
+    if attributes.get("schema_version") != SCHEMA_VERSION:
+        raise CalibrationFileError(
+            f"schema version {attributes.get('schema_version')}: this software reads {SCHEMA_VERSION}"
+        )
+    try:
+        points = SamplePoints(*(np.asarray(columns[f"points/{name}"], dtype=np.float64) for name in _POINTS))
+        raw: dict[str, Any] = {f.name: columns[f"maps/{f.name}"] for f in fields(MapSet) if f.name != "points"}
+        maps = MapSet(points=points, **raw)
+        result: dict[str, Any] = {"points": points}
+        for field in fields(InfluenceFit):
+            if field.name == "points":
+                continue
+            path = f"result/{field.name}"
+            result[field.name] = columns[path] if path in columns else attributes[f"fit_{field.name}"]
+        fit = InfluenceFit(**result)
+        calibration = Calibration(
+            id=_typed(attributes, "id", str),
+            mirror_name=_typed(attributes, "mirror_name", str),
+            mirror_serial=_typed(attributes, "mirror_serial", str),
+            wavelength=_typed(attributes, "wavelength", float),
+            aperture_radius=_typed(attributes, "aperture_radius", float),
+            created_ns=_typed(attributes, "created_ns", int),
+            actuator_x=np.asarray(columns["mirror/actuator_x"], dtype=np.float64),
+            actuator_y=np.asarray(columns["mirror/actuator_y"], dtype=np.float64),
+            maps=maps,
+            fit=fit,
+            dropped=_typed(attributes, "dropped", tuple),
+            limitations=_typed(attributes, "known_limitations", tuple),
+            note=_typed(attributes, "note", str),
+            software_version=_typed(attributes, "software_version", str),
+        )
+    except KeyError as error:
+        raise CalibrationFileError(f"{error.args[0]} is missing") from error
+    except (TypeError, ValueError) as error:
+        raise CalibrationFileError(str(error)) from error
+    _check_result(calibration)
+    return calibration
+
+
+def _typed(attributes: Mapping[str, Attribute], name: str, kind: type[T]) -> T:
+    value = attributes[name]
+    if not isinstance(value, kind):
+        raise ValueError(f"attribute {name} = {value!r}: must be a {kind.__name__}")
+    return value
+
+
+def _check_result(calibration: Calibration) -> None:
+    """Shapes and finiteness of everything that a controller will compute with."""
+    fit, maps = calibration.fit, calibration.maps
+    n, k, p, m = maps.actuators, maps.terms, maps.points.x.size, len(maps)
+    shapes = {
+        "influence_zernike": (k, n),
+        "zernike_offset": (k,),
+        "influence_sag": (p, n),
+        "sag_offset": (p,),
+        "response": (n,),
+        "standard_error": (n,),
+        "signal_covariance": (n, n),
+        "grades": (n,),
+        "used": (m,),
+        "map_residual": (m,),
+    }
+    for name, shape in shapes.items():
+        value = getattr(fit, name)
+        if not isinstance(value, np.ndarray) or value.shape != shape:
+            raise CalibrationFileError(f"result/{name} has the shape {np.shape(value)}: must be {shape}")
+        if name != "map_residual" and not np.isfinite(value).all():
+            raise CalibrationFileError(f"result/{name} holds values that are not finite")
+    if len(fit.reasons) != m:
+        raise CalibrationFileError(f"result/reasons has {len(fit.reasons)} entries: must be {m}")
+    if calibration.actuator_x.shape != (n,) or calibration.actuator_y.shape != (n,):
+        raise CalibrationFileError(f"mirror/actuator_x and actuator_y: must have {n} values each")
+    for name in ("x", "y", "weight"):
+        if not np.isfinite(getattr(maps.points, name)).all():
+            raise CalibrationFileError(f"points/{name} holds values that are not finite")
+    if not calibration.aperture_radius > 0.0:
+        raise CalibrationFileError(f"aperture_radius = {calibration.aperture_radius}: must be positive, m")

@@ -1,0 +1,160 @@
+"""The body of the action `calibrate`: goal to plan, run, fit, store, publish."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dm_msgs.action import Calibrate
+from dm_msgs.msg import ErrorCode
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+
+from dm_calibration.calibration_bench import RosBench
+from dm_calibration.calibration_desk import CalibrationDesk
+from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
+from dm_calibration.calibration_parameters import fit_options, procedure_options
+from dm_calibration.calibrator import check_fit, dropped_maps, evaluate
+from dm_calibration.influence.fit import fit_influence
+from dm_calibration.influence.mirror import Mirror
+from dm_calibration.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure import Outcome, Procedure, Progress
+
+#: Least time between two feedback messages, s.
+FEEDBACK_PERIOD_S = 0.1
+
+_PHASES = {
+    StepKind.DEGAUSS: Calibrate.Feedback.PHASE_DEGAUSS,
+    StepKind.POKE: Calibrate.Feedback.PHASE_POKES,
+    StepKind.SURFACE: Calibrate.Feedback.PHASE_SURFACES,
+}
+
+
+class CalibrateAction:
+    """Runs one goal at a time, in a worker thread."""
+
+    def __init__(self, node: Node, values: Mapping[str, Any], bench: RosBench, desk: CalibrationDesk) -> None:
+        self._node, self._values, self._bench, self._desk = node, values, bench, desk
+
+    def run(self, handle: ServerGoalHandle) -> tuple[str, Calibrate.Result]:
+        result = Calibrate.Result()
+        started = self._node.get_clock().now()
+        outcome = Outcome()
+        moved = False
+        try:
+            mirror = self._desk.known_mirror()
+            plan = self._planned(handle.request, mirror)
+            self._bench.check_ready()
+            self._bench.settle_time = handle.request.settle_time or self._values["settle_time"]
+            self._bench.cancelled = lambda: bool(handle.is_cancel_requested)
+            procedure, report = self._procedure(handle, plan, mirror)
+            outcome = procedure.outcome
+            moved = True
+            procedure.run()
+            report(Calibrate.Feedback.PHASE_FIT, "fit", len(plan.steps))
+            self._conclude(handle.request, plan, mirror, outcome, report, result)
+        except EXPECTED as error:
+            result.error_code, result.message = error_code(error), str(error)
+            result.maps = result.maps or len(outcome.records)
+            result.dropped = result.dropped or list(outcome.dropped)
+        finally:
+            if moved:
+                result.message = "; ".join(filter(None, (result.message, self._bench.rest(mirror.rest))))
+        result.maps_dropped = len(result.dropped)
+        result.duration = (self._node.get_clock().now() - started).nanoseconds * 1e-9
+        if result.error_code == ErrorCode.OK:
+            self._node.get_logger().info(f"calibration {result.id}: {result.message}")
+            return "succeed", result
+        self._node.get_logger().warning(f"calibration ended with code {result.error_code}: {result.message}")
+        return ("canceled" if result.error_code == ErrorCode.CANCELED else "abort"), result
+
+    def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> Plan:
+        """The plan of a goal, after its fields were checked."""
+        if goal.plan not in tuple(PlanKind):
+            raise Refused(ErrorCode.OUT_OF_RANGE, f"plan = {goal.plan}: must be 0 to {max(PlanKind)}")
+        if not 0.0 <= goal.poke_amplitude <= 1.0:  # also refuses NaN
+            raise Refused(
+                ErrorCode.OUT_OF_RANGE, f"poke_amplitude = {goal.poke_amplitude}: must be 0 to 1, 0 = configured"
+            )
+        if not 0.0 <= goal.settle_time <= 600.0:
+            raise Refused(ErrorCode.OUT_OF_RANGE, f"settle_time = {goal.settle_time}: must be 0 to 600 s")
+        if goal.maps_per_state > 100:
+            raise Refused(ErrorCode.OUT_OF_RANGE, f"maps_per_state = {goal.maps_per_state}: must be 0 to 100")
+        options = PlanOptions(
+            poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],
+            reference_every=goal.reference_every or self._values["reference_every"],
+            surfaces=tuple(goal.surfaces),
+            degauss=not goal.skip_degauss,
+        )
+        return make_plan(PlanKind(goal.plan), mirror, options)
+
+    def _procedure(
+        self, handle: ServerGoalHandle, plan: Plan, mirror: Mirror
+    ) -> tuple[Procedure, Callable[[int, str, int], None]]:
+        """The run of `plan`, and a function that reports phase, label and step."""
+        feedback = Calibrate.Feedback(steps=len(plan.steps))
+        sent = -FEEDBACK_PERIOD_S
+
+        def report(phase: int, label: str, step: int) -> None:
+            nonlocal sent
+            feedback.phase, feedback.label, feedback.step = phase, label, step
+            if time.monotonic() - sent >= FEEDBACK_PERIOD_S:
+                sent = time.monotonic()
+                handle.publish_feedback(feedback)
+
+        def progress(now: Progress) -> None:
+            feedback.maps_dropped, feedback.residual_rms = now.dropped, now.residual_rms
+            # Reference frames belong to the phase around them.
+            report(_PHASES.get(now.kind, feedback.phase), now.label, now.done)
+
+        in_use = self._desk.in_use
+        # A full plan solves its shapes on the pokes of this very run.
+        model = in_use.fit if in_use and plan.kind is PlanKind.SURFACES else None
+        options = procedure_options(self._values, handle.request.maps_per_state)
+        procedure = Procedure(
+            plan, mirror, self._bench, options, model=model, progress=progress, cancelled=self._bench.cancelled
+        )
+        return procedure, report
+
+    def _conclude(
+        self,
+        goal: Calibrate.Goal,
+        plan: Plan,
+        mirror: Mirror,
+        outcome: Outcome,
+        report: Callable[[int, str, int], None],
+        result: Calibrate.Result,
+    ) -> None:
+        """Fit, check, store and publish what was measured; fills `result`."""
+        if plan.kind is PlanKind.POKE_CHECK:
+            fit = fit_influence(outcome.maps(), fit_options(self._values), rings=mirror.rings)
+            check = check_fit(fit, mirror)
+            result.dropped = dropped_maps(outcome.maps(), fit, outcome.dropped)
+        else:
+            state = self._bench.state
+            unknown = goal.skip_degauss and not (state is not None and state.history_known)
+            remarks = ["Measured from an unknown hysteresis state, without a degauss before."] if unknown else []
+            provenance = self._desk.provenance(mirror.name, mirror.serial, goal.note)
+            calibration, check = evaluate(outcome, mirror, fit_options(self._values), provenance, remarks)
+            fit = calibration.fit
+            result.dropped = dropped_maps(calibration.maps, fit, outcome.dropped)
+        result.maps = int(fit.used.sum())
+        result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms
+        result.condition_number = fit.condition_number
+        result.poke_check_passed, result.poke_findings = check.passed, list(check.findings)
+        if plan.kind is PlanKind.POKE_CHECK:
+            if not check.passed:
+                raise Refused(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
+            result.message = "wiring and orientation are as configured"
+            return
+        report(Calibrate.Feedback.PHASE_STORE, calibration.id, len(plan.steps))
+        result.file = str(self._desk.store.save(calibration))
+        result.id = calibration.id
+        if goal.activate:
+            self._desk.use(calibration)
+        found = "" if check.passed else f", poke check: {'; '.join(check.findings)}"
+        result.message = (
+            f"{result.maps} maps, residual {fit.in_sample_rms * 1e9:.2f} nm in sample, "
+            f"{fit.held_out_rms * 1e9:.2f} nm held out{found}"
+        )

@@ -1,0 +1,115 @@
+"""The mirror that is connected, the stored calibrations, and the one in use."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from dm_msgs.msg import ErrorCode
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_errors import Refused
+from dm_calibration.calibrator import Provenance, mismatch
+from dm_calibration.influence.mirror import Mirror
+from dm_calibration.store import CalibrationStore
+
+
+class CalibrationDesk:
+    """Shared by the topics, services and the action of the node; every method may be called from any thread.
+
+    Attributes:
+        store: the folder of calibration files.
+    """
+
+    def __init__(
+        self,
+        store: CalibrationStore,
+        aperture_tolerance: Callable[[], float],
+        now_ns: Callable[[], int],
+        publish: Callable[[Calibration | None, Path | None], None],
+    ) -> None:
+        """`publish` is called with the calibration in use and its file at every change."""
+        self.store = store
+        self._aperture_tolerance, self._now_ns, self._publish = aperture_tolerance, now_ns, publish
+        self._lock = threading.RLock()
+        self._mirror: Mirror | None = None
+        self._in_use: Calibration | None = None
+
+    @property
+    def mirror(self) -> Mirror | None:
+        """The mirror the driver describes; None before it did."""
+        with self._lock:
+            return self._mirror
+
+    @property
+    def in_use(self) -> Calibration | None:
+        """The calibration in use."""
+        with self._lock:
+            return self._in_use
+
+    def known_mirror(self) -> Mirror:
+        """The mirror.
+
+        Raises:
+            Refused: it is not known yet.
+        """
+        mirror = self.mirror
+        if mirror is None:
+            raise Refused(ErrorCode.DRIVER_UNAVAILABLE, "no mirror_info yet: is pdm_driver running and configured?")
+        return mirror
+
+    def set_mirror(self, mirror: Mirror) -> str:
+        """Take over the mirror. Returns why the calibration in use was withdrawn, in words; "" = it was not."""
+        with self._lock:
+            self._mirror = mirror
+            wrong = self.mismatch(self._in_use) if self._in_use else ""
+            if not wrong:
+                return ""
+            withdrawn = self._in_use.id if self._in_use else ""
+            self.use(None)
+            return f"calibration {withdrawn} withdrawn: {wrong}"
+
+    def mismatch(self, calibration: Calibration) -> str:
+        """Why `calibration` does not belong to the mirror, in words; "" = it does, or no mirror is known."""
+        mirror = self.mirror
+        return mismatch(calibration, mirror, self._aperture_tolerance()) if mirror else ""
+
+    def check_fits(self, calibration: Calibration) -> None:
+        """Raise Refused unless `calibration` belongs to the mirror."""
+        self.known_mirror()
+        if wrong := self.mismatch(calibration):
+            raise Refused(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
+
+    def use(self, calibration: Calibration | None) -> None:
+        """Use `calibration`, which is in the store, from now on."""
+        with self._lock:
+            self._in_use = calibration
+            self._publish(calibration, self.store.find(calibration.id) if calibration else None)
+
+    def load(self, name: str) -> Calibration:
+        """Load by id or file, or the newest that fits when `name` is empty, and use it.
+
+        Raises:
+            Refused: no mirror, or the calibration belongs to another; the one in use stays.
+            UnknownCalibrationError, CalibrationFileError: see the store.
+        """
+        mirror = self.known_mirror()
+        if name:
+            calibration = self.store.load(name)
+            self.check_fits(calibration)
+        else:
+            readable = (entry.calibration for entry in self.store.entries() if entry.calibration)
+            newest = next((candidate for candidate in readable if not self.mismatch(candidate)), None)
+            if newest is None:
+                raise Refused(
+                    ErrorCode.NOT_CALIBRATED, f"no calibration in {self.store.folder} fits mirror {mirror.serial!r}"
+                )
+            calibration = newest
+        self.use(calibration)
+        return calibration
+
+    def provenance(self, name: str, serial: str, note: str) -> Provenance:
+        """A new id and the time for a calibration of mirror `name`, `serial`."""
+        now = self._now_ns()
+        return Provenance(self.store.new_id(name, serial, now), now, note.replace("\0", ""))

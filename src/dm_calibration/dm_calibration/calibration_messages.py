@@ -1,0 +1,139 @@
+"""Between the messages of dm_msgs and the types of the calibration library."""
+
+from __future__ import annotations
+
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from dm_msgs.msg import Calibration as CalibrationMsg
+from dm_msgs.msg import MirrorInfo, ZernikeCoefficients
+from numpy.typing import NDArray
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.mirror import Mirror
+from dm_calibration.optics.sampling import SamplePoints
+from dm_calibration.procedure import Measurement
+
+Floats = NDArray[np.float64]
+
+
+def doubles(values: Floats) -> array[float]:
+    """`values`, flattened row by row, as a buffer that a float64[] field takes without looking at each element."""
+    buffer = array("d")
+    buffer.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return buffer
+
+
+def time_message(stamp_ns: int) -> Time:
+    """ns since the epoch of the clock as a message."""
+    return Time(sec=int(stamp_ns // 10**9), nanosec=int(stamp_ns % 10**9))
+
+
+def stamp_ns(message: Time) -> int:
+    """A time message in ns."""
+    return int(message.sec * 10**9 + message.nanosec)
+
+
+def mirror_from(message: MirrorInfo) -> Mirror:
+    """The mirror that the driver describes.
+
+    Raises:
+        ValueError: naming the field that makes no sense.
+    """
+    for name in ("actuator_x", "actuator_y"):
+        if len(getattr(message, name)) != message.actuators:
+            raise ValueError(f"mirror_info: {name} has {len(getattr(message, name))} values, not {message.actuators}")
+    if len(message.neighbour_a) != len(message.neighbour_b):
+        raise ValueError(f"mirror_info: {len(message.neighbour_a)} neighbour_a, {len(message.neighbour_b)} neighbour_b")
+    return Mirror(
+        name=message.name,
+        serial=message.serial,
+        x=np.array(message.actuator_x, dtype=np.float64),
+        y=np.array(message.actuator_y, dtype=np.float64),
+        working_radius=0.5 * message.working_aperture_diameter,
+        signal_min=message.signal_min,
+        signal_max=message.signal_max,
+        neighbours=np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.int64).reshape(-1, 2),
+        neighbour_difference_max=message.neighbour_difference_max,
+    )
+
+
+def measurement_from(response: Any) -> Measurement:
+    """The map in an answer of the service `measure`.
+
+    Raises:
+        ValueError: the answer holds no samples, or coefficients of another convention.
+    """
+    zernike, samples = response.zernike, response.samples
+    if zernike.convention != ZernikeCoefficients.BORN_WOLF:
+        raise ValueError(f"zernike.convention = {zernike.convention}: must be {ZernikeCoefficients.BORN_WOLF}")
+    if not len(samples.sag) == len(samples.x) == len(samples.y) == len(samples.weight) > 0:
+        raise ValueError(f"samples: {len(samples.sag)} sag values at {len(samples.x)} points")
+    coefficients = np.array(zernike.coefficients, dtype=np.float64)
+    sigma = np.array(zernike.sigma, dtype=np.float64)
+    return Measurement(
+        points=SamplePoints(np.array(samples.x), np.array(samples.y), np.array(samples.weight)),
+        sag=np.array(samples.sag, dtype=np.float64),
+        coefficients=coefficients,
+        sigma=sigma if sigma.shape == coefficients.shape else np.full(coefficients.shape, np.nan),
+        stamp_ns=stamp_ns(zernike.header.stamp),
+        residual_rms=zernike.residual_rms,
+        valid_fraction=zernike.valid_fraction,
+        radius=zernike.radius,
+        wavelength=zernike.wavelength,
+        system_error_subtracted=response.info.system_error_subtracted,
+        file=response.info.file,
+        sha256=response.info.sha256,
+    )
+
+
+def calibration_message(
+    calibration: Calibration | None, file: Path | None, frame_id: str, calibrated_error_max: float
+) -> CalibrationMsg:
+    """The message on `calibration`; None = no calibration.
+
+    A calibration counts as CALIBRATED when its held-out coefficient error is at most `calibrated_error_max` (m) and no
+    actuator is dead or was never moved, else as APPROXIMATE.
+    """
+    message = CalibrationMsg()
+    message.header.frame_id = frame_id
+    if calibration is None:
+        return message
+    fit, points = calibration.fit, calibration.fit.points
+    usable = np.isin(fit.grades, (CalibrationMsg.GRADE_GOOD, CalibrationMsg.GRADE_WEAK)).all()
+    good = fit.held_out_max_zernike <= calibrated_error_max and bool(usable)
+    message.header.stamp = time_message(calibration.stamp_ns)
+    message.id = calibration.id
+    message.file = str(file or "")
+    message.mirror_name = calibration.mirror_name
+    message.mirror_serial = calibration.mirror_serial
+    message.method = fit.method
+    message.software_version = calibration.software_version
+    message.wavelength = calibration.wavelength
+    message.aperture_radius = calibration.aperture_radius
+    message.actuators = fit.actuators
+    message.convention = ZernikeCoefficients.BORN_WOLF
+    message.terms = calibration.maps.terms
+    message.influence_zernike = doubles(fit.influence_zernike)
+    message.zernike_offset = doubles(fit.zernike_offset)
+    message.points = points.x.size
+    message.sample_x = doubles(points.x)
+    message.sample_y = doubles(points.y)
+    message.sample_weight = doubles(points.weight)
+    message.influence_sag = doubles(fit.influence_sag)
+    message.sag_offset = doubles(fit.sag_offset)
+    message.signal_min = fit.signal_min
+    message.signal_max = fit.signal_max
+    message.maps_used = int(fit.used.sum())
+    message.maps_dropped = calibration.maps_dropped
+    message.in_sample_rms = fit.in_sample_rms
+    message.held_out_rms = fit.held_out_rms
+    message.held_out_max_zernike = fit.held_out_max_zernike
+    message.condition_number = fit.condition_number
+    message.quality = CalibrationMsg.CALIBRATED if good else CalibrationMsg.APPROXIMATE
+    message.actuator_grade = array("B", fit.grades.astype(np.uint8).tobytes())
+    message.known_limitations = list(calibration.limitations)
+    return message

@@ -1,0 +1,160 @@
+"""Node `calibration`: measures the influence function, keeps the calibrations, publishes the one in use."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from dm_msgs.action import Calibrate
+from dm_msgs.msg import Calibration as CalibrationMsg
+from dm_msgs.msg import ErrorCode, MirrorInfo
+from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
+from rclpy.node import Node
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_action import CalibrateAction
+from dm_calibration.calibration_bench import RosBench
+from dm_calibration.calibration_desk import CalibrationDesk
+from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
+from dm_calibration.calibration_messages import calibration_message, mirror_from, time_message
+from dm_calibration.calibration_parameters import PARAMETERS, fit_options
+from dm_calibration.calibrator import refit
+from dm_calibration.store import CalibrationStore
+from dm_runtime import diagnostics, qos
+from dm_runtime.executor import run_node
+from dm_runtime.parameters import declare
+from dm_runtime.worker import WorkerActionServer, WorkerService
+
+
+class CalibrationNode(Node):
+    """Topics, services and the action of the calibration; what they do is in CalibrationDesk and CalibrateAction."""
+
+    def __init__(self) -> None:
+        super().__init__("calibration")
+        self._values = declare(self, PARAMETERS)
+        self._frame_id = ""
+        self._start_pending = bool(self._values["load_on_start"])
+        # Latched: a controller that starts later must know the calibration in use.
+        self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.LATCHED)
+        self._desk = CalibrationDesk(
+            CalibrationStore(self._values["calibration_folder"]),
+            lambda: float(self._values["aperture_tolerance"]),
+            lambda: int(self.get_clock().now().nanoseconds),
+            self._publish,
+        )
+        self._bench = RosBench(self, self._values)
+        action = CalibrateAction(self, self._values, self._bench, self._desk)
+        self._server = WorkerActionServer(self, Calibrate, "calibrate", action.run, exclusive="refuse")
+        WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
+        WorkerService(self, LoadCalibration, "load_calibration", self._on_load)
+        WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)
+        self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
+        self._publish(None, None)
+        self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
+
+    def make_safe(self) -> None:
+        """Bring the mirror back to mid range when the process ends in the middle of a calibration."""
+        mirror = self._desk.mirror
+        if self._server.busy and mirror is not None:
+            self.get_logger().warning(f"ended during a calibration: {self._bench.rest_at_exit(mirror.rest)}")
+
+    def _publish(self, calibration: Calibration | None, file: Path | None) -> None:
+        error_max = self._values["calibrated_error_max"]
+        self._publisher.publish(calibration_message(calibration, file, self._frame_id, error_max))
+
+    def _on_mirror_info(self, message: MirrorInfo) -> None:
+        self._frame_id = message.header.frame_id
+        try:
+            mirror = mirror_from(message)
+        except ValueError as error:
+            self.get_logger().error(f"mirror_info refused: {error}")
+            return
+        if withdrawn := self._desk.set_mirror(mirror):
+            self.get_logger().warning(withdrawn)
+        self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"
+        if self._start_pending:
+            self._start_pending = False
+            # Reading the folder takes longer than a callback may.
+            threading.Thread(target=self._load_on_start, daemon=True).start()
+
+    def _load_on_start(self) -> None:
+        name = self._values["load_on_start"]
+        try:
+            calibration = self._desk.load("" if name == "newest" else name)
+            self.get_logger().info(f"calibration {calibration.id} loaded at start")
+        except EXPECTED as error:
+            self.get_logger().warning(f"load_on_start = {name!r}: {error}")
+
+    def _answer(self, response: Any, work: Callable[[], None]) -> Any:
+        """Run `work`; an expected failure becomes error code and message of the response."""
+        try:
+            work()
+        except EXPECTED as error:
+            response.error_code, response.message = error_code(error), str(error)
+            self.get_logger().warning(str(error))
+        return response
+
+    def _on_list(self, _request: Any, response: Any) -> Any:
+        in_use = self._desk.in_use
+        for entry in self._desk.store.entries():
+            calibration, remark = entry.calibration, entry.remark
+            if calibration:
+                remark = "in use" if in_use and calibration.id == in_use.id else self._desk.mismatch(calibration)
+            response.ids.append(entry.id)
+            response.mirror_serials.append(calibration.mirror_serial if calibration else "")
+            response.methods.append(calibration.fit.method if calibration else "")
+            response.stamps.append(time_message(calibration.created_ns if calibration else 0))
+            response.held_out_rms.append(calibration.fit.held_out_rms if calibration else float("nan"))
+            response.remarks.append(remark)
+        return response
+
+    def _on_load(self, request: Any, response: Any) -> Any:
+        def work() -> None:
+            response.id = self._desk.load(request.calibration).id
+            response.message = f"calibration {response.id} is in use"
+
+        return self._answer(response, work)
+
+    def _on_fit(self, request: Any, response: Any) -> Any:
+        def work() -> None:
+            named = request.calibration
+            stored = self._desk.store.load(named) if named else self._desk.in_use
+            if stored is None:
+                raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use and none was named")
+            if request.activate:
+                self._desk.check_fits(stored)
+            provenance = self._desk.provenance(stored.mirror_name, stored.mirror_serial, "")
+            calibration = refit(stored, fit_options(self._values, request.method), request.exclude, provenance)
+            response.file = str(self._desk.store.save(calibration))
+            response.id = calibration.id
+            response.in_sample_rms = calibration.fit.in_sample_rms
+            response.held_out_rms = calibration.fit.held_out_rms
+            response.condition_number = calibration.fit.condition_number
+            response.message = f"fitted again from {stored.id}: {int(calibration.fit.used.sum())} maps used"
+            if request.activate:
+                self._desk.use(calibration)
+
+        return self._answer(response, work)
+
+    def _health(self) -> diagnostics.Health:
+        calibration, mirror = self._desk.in_use, self._desk.mirror
+        values: dict[str, object] = {"calibrating": self._server.busy, "folder": str(self._desk.store.folder)}
+        if mirror is None:
+            return diagnostics.Health(diagnostics.WARN, "no mirror_info: is pdm_driver running?", values)
+        if calibration is None:
+            return diagnostics.Health(diagnostics.WARN, "no calibration is in use", values)
+        values["held_out_rms_nm"] = round(calibration.fit.held_out_rms * 1e9, 3)
+        values["maps_used"] = int(calibration.fit.used.sum())
+        return diagnostics.Health(diagnostics.OK, f"calibration {calibration.id}", values)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(CalibrationNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""Parameters of the node `calibration`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dm_calibration.influence.fit import FitOptions
+from dm_calibration.influence.quality import GradeOptions
+from dm_calibration.influence.screening import ScreeningOptions
+from dm_calibration.procedure import ProcedureOptions
+from dm_runtime.parameters import Parameter
+
+PARAMETERS = (
+    Parameter("calibration_folder", str, "~/.ros/dm_calibrations", "Folder of the calibration files."),
+    Parameter(
+        "load_on_start",
+        str,
+        "",
+        "Calibration to use as soon as the mirror is known: empty = none, newest = the newest that fits, or an id.",
+    ),
+    Parameter("poke_amplitude", float, 0.5, "Half-swing of a push-pull poke, normalised.", "", 0.01, 1.0, live=True),
+    Parameter("reference_every", int, 10, "Steps between two reference frames.", "", 1, 1000, live=True),
+    Parameter("settle_time", float, 0.5, "Wait between command and map, in ROS time.", "s", 0.0, 600.0, live=True),
+    Parameter("measure_retries", int, 1, "Further tries after a map that failed.", "", 0, 20, live=True),
+    Parameter(
+        "failures_max", int, 3, "Shapes in a row without a map after which a run is given up.", "", 1, 1000, live=True
+    ),
+    Parameter("driver_timeout", float, 30.0, "Longest wait for the driver to set a shape.", "s", 0.1, 600.0, live=True),
+    Parameter("degauss_timeout", float, 180.0, "Longest wait for a degauss.", "s", 0.1, 3600.0, live=True),
+    Parameter("measure_timeout", float, 60.0, "Longest wait for one map.", "s", 0.1, 3600.0, live=True),
+    Parameter(
+        "aperture_tolerance",
+        float,
+        0.02,
+        "Largest relative difference between the aperture radius of maps or calibrations and the mirror's.",
+        "",
+        0.0,
+        0.5,
+        live=True,
+    ),
+    Parameter("folds", int, 10, "Folds of the cross-validation.", "", 2, 1000, live=True),
+    Parameter("valid_fraction_min", float, 0.5, "Least share of valid pixels of a map.", "", 0.0, 1.0, live=True),
+    Parameter(
+        "outlier_sigmas",
+        float,
+        6.0,
+        "Residual of a map, in robust sigmas, beyond which it is dropped.",
+        "",
+        3.0,
+        1e3,
+        live=True,
+    ),
+    Parameter(
+        "hysteresis_allowance",
+        float,
+        0.10,
+        "Share of their moves by which actuators may miss their mark (hysteresis) without the map being an outlier.",
+        "",
+        0.0,
+        1.0,
+        live=True,
+    ),
+    Parameter("dead_sigmas", float, 3.0, "Dead below this many standard errors.", "", 0.0, 1e3, live=True),
+    Parameter("weak_sigmas", float, 10.0, "Weak below this many standard errors.", "", 0.0, 1e3, live=True),
+    Parameter(
+        "weak_share",
+        float,
+        0.4,
+        "Weak below this share of the median response of its ring.",
+        "",
+        0.0,
+        1.0,
+        live=True,
+    ),
+    Parameter(
+        "calibrated_error_max",
+        float,
+        32e-9,
+        "A calibration whose held-out coefficient error is larger counts as APPROXIMATE (default: wavelength / 20).",
+        "m",
+        0.0,
+        1e-3,
+        live=True,
+    ),
+)
+
+
+def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
+    """Options of a fit from the node's parameters; `method` empty = the default."""
+    screening = ScreeningOptions(
+        valid_fraction_min=values["valid_fraction_min"],
+        outlier_sigmas=values["outlier_sigmas"],
+        hysteresis_allowance=values["hysteresis_allowance"],
+    )
+    grades = GradeOptions(
+        dead_sigmas=values["dead_sigmas"], weak_sigmas=values["weak_sigmas"], weak_share=values["weak_share"]
+    )
+    return FitOptions(method or FitOptions().method, values["folds"], screening, grades)
+
+
+def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> ProcedureOptions:
+    """Options of a run from the node's parameters; `maps_per_state` 0 = 1."""
+    return ProcedureOptions(
+        measure_retries=values["measure_retries"],
+        failures_max=values["failures_max"],
+        maps_per_state=maps_per_state or 1,
+        aperture_tolerance=values["aperture_tolerance"],
+        fit=fit_options(values),
+    )

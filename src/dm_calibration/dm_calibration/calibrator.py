@@ -1,0 +1,121 @@
+"""From the maps of a run, or of a stored calibration, to a calibration: fit, poke check, limitations in words."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration, software_version
+from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.mirror import Mirror
+from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
+from dm_calibration.poke_check import PokeCheck, check_pokes
+from dm_calibration.procedure import Outcome
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a calibration comes from: its id, time (ns), the user's note."""
+
+    id: str
+    created_ns: int
+    note: str = ""
+
+
+def check_fit(fit: InfluenceFit, mirror: Mirror) -> PokeCheck:
+    """Poke check of the responses in `fit` against the layout of `mirror`."""
+    return check_pokes(
+        fit.influence_sag,
+        fit.points,
+        mirror.x / mirror.working_radius,
+        mirror.y / mirror.working_radius,
+        silent=fit.grades == GRADE_DEAD,
+        unmoved=fit.grades == GRADE_NOT_EXCITED,
+    )
+
+
+def evaluate(
+    outcome: Outcome, mirror: Mirror, options: FitOptions, provenance: Provenance, run_limitations: Collection[str] = ()
+) -> tuple[Calibration, PokeCheck]:
+    """Fit the maps of a run and compare the responses with the layout.
+
+    Raises:
+        TooFewMapsError: the good maps do not determine the unknowns.
+    """
+    maps = outcome.maps()
+    fit = fit_influence(maps, options, rings=mirror.rings)
+    check = check_fit(fit, mirror)
+    limitations = [*fit.limitations, *run_limitations]
+    if not outcome.radius_known:
+        limitations.append(
+            "The maps do not tell their aperture radius; the mirror's working aperture "
+            f"({mirror.working_radius * 1e3:.2f} mm radius) is taken."
+        )
+    if outcome.wavelength == 0.0:
+        limitations.append("The maps do not tell their wavelength.")
+    limitations += [f"Poke check: {finding}." for finding in check.findings]
+    limitations += [f"Measured differently: {remark}." for remark in outcome.remarks]
+    calibration = Calibration(
+        id=provenance.id,
+        mirror_name=mirror.name,
+        mirror_serial=mirror.serial,
+        wavelength=outcome.wavelength,
+        aperture_radius=mirror.working_radius,
+        created_ns=provenance.created_ns,
+        actuator_x=mirror.x,
+        actuator_y=mirror.y,
+        maps=maps,
+        fit=fit,
+        dropped=tuple(outcome.dropped),
+        limitations=tuple(limitations),
+        note=provenance.note,
+        software_version=software_version(),
+    )
+    return calibration, check
+
+
+def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], provenance: Provenance) -> Calibration:
+    """A new calibration from the raw data of `stored`, without the maps in `exclude`.
+
+    Raises:
+        UnknownNameError: an unknown method or label.
+        TooFewMapsError: the maps left do not determine the unknowns.
+    """
+    mirror = Mirror(
+        stored.mirror_name, stored.mirror_serial, stored.actuator_x, stored.actuator_y, stored.aperture_radius
+    )
+    fit = fit_influence(stored.maps, options, rings=mirror.rings, exclude=exclude)
+    of_the_run = [sentence for sentence in stored.limitations if sentence not in stored.fit.limitations]
+    without = f" without {', '.join(exclude)}" if exclude else ""
+    return replace(
+        stored,
+        id=provenance.id,
+        created_ns=provenance.created_ns,
+        fit=fit,
+        limitations=(*fit.limitations, *of_the_run, f"Fitted again from the raw data of {stored.id}{without}."),
+        note=provenance.note or stored.note,
+        software_version=software_version(),
+    )
+
+
+def mismatch(calibration: Calibration, mirror: Mirror, aperture_tolerance: float) -> str:
+    """Why `calibration` does not belong to `mirror`, in words; "" = it does."""
+    if calibration.mirror_serial != mirror.serial:
+        return f"measured on mirror {calibration.mirror_serial!r}, this is {mirror.serial!r}"
+    if calibration.fit.actuators != mirror.actuators:
+        return f"has {calibration.fit.actuators} actuators, this mirror {mirror.actuators}"
+    if abs(calibration.aperture_radius - mirror.working_radius) > aperture_tolerance * mirror.working_radius:
+        return (
+            f"aperture radius {calibration.aperture_radius * 1e3:.3f} mm, this mirror's working aperture "
+            f"{mirror.working_radius * 1e3:.3f} mm +-{aperture_tolerance:.1%}"
+        )
+    return ""
+
+
+def dropped_maps(maps: MapSet, fit: InfluenceFit, never_measured: Collection[str]) -> list[str]:
+    """ "label: reason" of everything that is not in the fit."""
+    rejected = [f"{maps.label[i]}: {fit.reasons[i]}" for i in np.flatnonzero(~fit.used)]
+    return [*never_measured, *rejected]

@@ -1,0 +1,145 @@
+"""Plain arrays, texts and attributes to and from an HDF5 file image, with a hash over the content.
+
+The file is made in memory, so that a full disk meets ordinary file writing, which reports it, rather than the HDF5
+library in the middle of its own bookkeeping.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+#: A dataset: a numeric array, or texts.
+Column = NDArray[np.generic] | tuple[str, ...]
+#: An attribute of the root: a number, a text, or texts.
+Attribute = bool | int | float | str | tuple[str, ...]
+
+#: Attribute that holds the hash over everything else.
+HASH = "content_sha256"
+#: Files of more data than this are not calibrations.
+SIZE_MAX = 1 << 30
+
+_TEXT = h5py.string_dtype("utf-8")
+
+
+class ImageError(ValueError):
+    """The file is not a whole, plain HDF5 file whose content agrees with its hash."""
+
+
+def write_image(columns: Mapping[str, Column], attributes: Mapping[str, Attribute]) -> bytes:
+    """The bytes of an HDF5 file with `columns` by path and `attributes` of the root, and their hash."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name, value in columns.items():
+            if isinstance(value, tuple):
+                file.create_dataset(name, data=np.array(value, dtype=object), dtype=_TEXT, shape=(len(value),))
+            else:
+                file.create_dataset(name, data=value)
+        for name, attribute in attributes.items():
+            if isinstance(attribute, tuple):
+                file.attrs.create(name, np.array(attribute, dtype=object), shape=(len(attribute),), dtype=_TEXT)
+            else:
+                file.attrs[name] = attribute
+        file.attrs[HASH] = content_hash(columns, attributes)
+    return buffer.getvalue()
+
+
+def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
+    """Columns and attributes of a file written by :func:`write_image`.
+
+    Only plain datasets are read: links out of the file, virtual and external storage are refused.
+
+    Raises:
+        ImageError: not HDF5, truncated, damaged, not plain, or the hash does not agree.
+        OSError: the file cannot be opened at all.
+    """
+    with path.open("rb") as raw:
+        try:
+            with h5py.File(raw, "r") as file:
+                columns = {name: _column(name, dataset) for name, dataset in _datasets(file, "")}
+                attributes = {name: _attribute(value) for name, value in file.attrs.items()}
+        except ImageError:
+            raise
+        except Exception as error:  # h5py raises OSError, RuntimeError, KeyError, ... for damaged files
+            raise ImageError(f"not a whole HDF5 file: {error}") from error
+    stored = attributes.pop(HASH, "")
+    if stored == "":
+        raise ImageError(f"attribute {HASH} is missing: not written by this suite")
+    if stored != content_hash(columns, attributes):
+        raise ImageError("the content does not agree with its hash: the file was damaged or changed")
+    return columns, attributes
+
+
+def content_hash(columns: Mapping[str, Column], attributes: Mapping[str, Attribute]) -> str:
+    """SHA-256 over names, types, shapes and values, independent of how HDF5 lays them out."""
+    digest = hashlib.sha256()
+
+    def add(kind: str, name: str, shape: tuple[int, ...], content: bytes) -> None:
+        digest.update(f"{name}\0{kind}\0{shape}\0{len(content)}\0".encode())
+        digest.update(content)
+
+    for name in sorted(columns):
+        value = columns[name]
+        if isinstance(value, tuple):
+            add("text", name, (len(value),), "\0".join(value).encode())
+        else:
+            plain = np.ascontiguousarray(value)
+            little = plain.astype(plain.dtype.newbyteorder("<"))
+            add(little.dtype.str, name, plain.shape, little.tobytes())
+    for name in sorted(attributes):
+        attribute = attributes[name]
+        if isinstance(attribute, tuple):
+            add("texts", f"@{name}", (len(attribute),), "\0".join(attribute).encode())
+        else:
+            add("value", f"@{name}", (), repr(attribute).encode())
+    return digest.hexdigest()
+
+
+def _datasets(group: h5py.Group, prefix: str) -> Iterator[tuple[str, h5py.Dataset]]:
+    size = 0
+    for name in group:
+        path = f"{prefix}{name}"
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise ImageError(f"{path} is a link, which is not followed")
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            yield from _datasets(item, f"{path}/")
+            continue
+        if item.is_virtual or item.external:
+            raise ImageError(f"{path} keeps its data outside the file, which is not followed")
+        size += item.size * item.dtype.itemsize
+        if size > SIZE_MAX:
+            raise ImageError(f"{path}: more than {SIZE_MAX >> 20} MiB of data")
+        yield path, item
+
+
+def _column(name: str, dataset: h5py.Dataset) -> Column:
+    if h5py.check_string_dtype(dataset.dtype) is not None:
+        if dataset.ndim != 1:
+            raise ImageError(f"{name}: texts must be a list")
+        return tuple(str(text) for text in dataset.asstr()[()])
+    if dataset.dtype.kind not in "fiub":
+        raise ImageError(f"{name} has the type {dataset.dtype}: must be numbers or texts")
+    return np.asarray(dataset[()])
+
+
+def _attribute(value: object) -> Attribute:
+    if isinstance(value, np.ndarray):
+        return tuple(text.decode() if isinstance(text, bytes) else str(text) for text in value)
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if isinstance(value, np.integer):
+        return int(value)
+    if isinstance(value, np.floating):
+        return float(value)
+    if isinstance(value, str):
+        return value
+    if isinstance(value, h5py.Empty):  # an empty list of texts
+        return ()
+    raise ImageError(f"an attribute has the type {type(value).__name__}: must be a number or text")

@@ -1,0 +1,313 @@
+"""Fit the influence function to the maps of a calibration, and say how good it is.
+
+The model is ``c = c0 + G s`` for the Zernike coefficients (Eq. 6 of the paper) and ``z = z0 + H s`` for the sag at the
+sampling points. Both are regressions on the same design: the applied signals and a figure that drifts from reference
+frame to reference frame (see :mod:`~dm_calibration.influence.drift`). An interferometer does not know piston and tilt,
+so they are removed, area-weighted, from every sag vector before the fit and from every residual that is reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence import quality, screening
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.quality import GradeOptions
+from dm_calibration.influence.regression import METHODS, Design, Method, Regression, TooFewMapsError, make_design
+from dm_calibration.influence.sag import fill_gaps, remove_piston_tilt, rms, weighted_fit
+from dm_calibration.influence.screening import ScreeningOptions
+from dm_calibration.names import unknown_name
+from dm_calibration.optics.sampling import SamplePoints
+from dm_calibration.optics.zernike import basis
+
+Floats = NDArray[np.float64]
+
+#: Number of the first terms, piston and the two tilts, that an interferometer does not know.
+PISTON_TILT = 3
+#: Rounds in which sampling points without data are filled from the fit, and the change in m that ends them sooner.
+GAP_ROUNDS = 60
+GAP_TOLERANCE = 1e-11
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit: method, folds of the cross-validation, thresholds."""
+
+    method: str = "AZreg"
+    folds: int = 10
+    screening: ScreeningOptions = field(default_factory=ScreeningOptions)
+    grades: GradeOptions = field(default_factory=GradeOptions)
+
+
+@dataclass(frozen=True)
+class InfluenceFit:
+    """An influence function with its quality. N actuators, K Zernike terms, P sampling points, M maps.
+
+    Attributes:
+        method: name of the method.
+        influence_zernike: (K, N) m per unit signal; columns of actuators that never moved are 0.
+        zernike_offset: (K,) m, figure at zero signals, averaged over the run.
+        influence_sag: (P, N) m per unit signal, piston and tilt removed.
+        sag_offset: (P,) m, piston and tilt removed.
+        points: the sampling points.
+        signal_min, signal_max: range of applied signals in the maps used.
+        used: (M,) which maps entered the fit.
+        reasons: (M,) why not; "" for those used.
+        map_residual: (M,) rms sag left by the fit, m; NaN for maps not used.
+        in_sample_rms: rms sag over all maps used, m.
+        held_out_rms: the same for maps predicted from a fit that has not seen them, m.
+        held_out_max_zernike: 95th percentile over held-out maps of the largest coefficient error without piston and
+            tilt, m.
+        condition_number: of influence_zernike without piston (and without tilt when the maps do not show it).
+        response: (N,) rms sag of a unit signal, m.
+        standard_error: (N,) of the response, m.
+        signal_covariance: (N, N) of each row of G, for coefficients of unit variance.
+        grades: (N,) quality.GRADE_*.
+        drift_rms: rms sag of the figure about its mean over the run, m.
+        limitations: sentences a user of the result must know.
+    """
+
+    method: str
+    influence_zernike: Floats
+    zernike_offset: Floats
+    influence_sag: Floats
+    sag_offset: Floats
+    points: SamplePoints
+    signal_min: float
+    signal_max: float
+    used: NDArray[np.bool_]
+    reasons: tuple[str, ...]
+    map_residual: Floats
+    in_sample_rms: float
+    held_out_rms: float
+    held_out_max_zernike: float
+    condition_number: float
+    response: Floats
+    standard_error: Floats
+    signal_covariance: Floats
+    grades: NDArray[np.uint8]
+    drift_rms: float
+    limitations: tuple[str, ...]
+
+    @property
+    def actuators(self) -> int:
+        return int(self.influence_zernike.shape[1])
+
+
+def fit_influence(
+    maps: MapSet,
+    options: FitOptions | None = None,
+    *,
+    rings: NDArray[np.int64] | None = None,
+    exclude: Collection[str] = (),
+) -> InfluenceFit:
+    """Fit the influence function to `maps`.
+
+    Args:
+        rings: (N,) ring of each actuator, for the grades; None = all are compared with each other.
+        exclude: labels of maps to leave out.
+
+    Raises:
+        UnknownNameError: an unknown method or label, listing the near ones.
+        TooFewMapsError: the good maps do not determine the unknowns.
+    """
+    options = options or FitOptions()
+    if options.method not in METHODS:
+        raise unknown_name("method", options.method, METHODS)
+    for label in exclude:
+        if label not in maps.label:
+            raise unknown_name("map label", label, maps.label)
+    method = METHODS[options.method]
+    reasons = screening.unusable(maps, options.screening)
+    reasons = ["excluded by request" if label in exclude else r for label, r in zip(maps.label, reasons, strict=True)]
+
+    sag = _without_gaps(maps, reasons)
+    good, design, fitted, responses = _fit_good(method, maps, sag, reasons)
+    budget = int(options.screening.dropped_max * len(maps))
+    doubtful = False
+    while not doubtful:
+        outlier = screening.worst_outlier(
+            rms(fitted.residual[:, maps.terms :], maps.points.weight),
+            fitted.leverage,
+            good.applied,
+            _response(fitted, design, good),
+            good.reference,
+            options.screening,
+        )
+        if outlier is None:
+            break
+        if budget == 0:
+            doubtful = True
+            break
+        budget -= 1
+        index = maps.label.index(good.label[outlier[0]])
+        reasons[index] = outlier[1]
+        try:
+            good, design, fitted, responses = _fit_good(method, maps, sag, reasons)
+        except TooFewMapsError:  # a doubtful map is better than none
+            reasons[index] = ""
+            doubtful = True
+    return _judge(maps, options, rings, reasons, good, design, fitted, responses, doubtful)
+
+
+def _fit_good(
+    method: Method, maps: MapSet, sag: Floats, reasons: list[str]
+) -> tuple[MapSet, Design, Regression, Floats]:
+    """Fit the maps without a reason against them: those maps, their design, the regression, its responses."""
+    used = np.array([not reason for reason in reasons], dtype=bool)
+    good = maps.select(used)
+    design = make_design(good)
+    fitted, responses = _regress(method, design, good, sag[used])
+    return good, design, fitted, responses
+
+
+def _without_gaps(maps: MapSet, reasons: list[str]) -> Floats:
+    """Sag of usable maps with piston and tilt removed; gaps still NaN, unusable maps zero."""
+    usable = np.array([not reason for reason in reasons], dtype=bool)
+    sag = np.zeros_like(maps.sag)
+    if not usable.any():
+        raise TooFewMapsError(f"none of the {len(maps)} maps is usable; the first: {maps.label[0]}: {reasons[0]}")
+    sag[usable] = remove_piston_tilt(maps.sag[usable], maps.points)
+    return sag
+
+
+def _regress(method: Method, design: Design, maps: MapSet, sag: Floats) -> tuple[Regression, Floats]:
+    """Regress coefficients and sag together; points without data are filled from the fit, round by round.
+
+    That is the expectation-maximisation form of least squares with missing data; a gap converges as fast as the other
+    maps, rather than its own, determine the fit there.
+    """
+    gaps = np.isnan(sag).any(axis=1)
+    if not gaps.any():
+        responses = np.hstack((maps.coefficients, sag))
+        return method(design, responses), responses
+    modes = basis(maps.points.x, maps.points.y)
+    filled = sag.copy()
+    model = weighted_fit(sag[gaps], modes, maps.points.weight) @ modes.T
+    projection = np.linalg.qr(design.matrix)[0]
+    for _ in range(GAP_ROUNDS):
+        before = filled[gaps]
+        filled[gaps] = fill_gaps(sag[gaps], model, maps.points)
+        if np.abs(filled[gaps] - before).max(initial=0.0) < GAP_TOLERANCE:  # NaN in the first round
+            break
+        model = projection[gaps] @ (projection.T @ filled)
+    responses = np.hstack((maps.coefficients, filled))
+    return method(design, responses), responses
+
+
+def _response(fitted: Regression, design: Design, maps: MapSet) -> Floats:
+    response = np.zeros(maps.actuators)
+    response[design.excited] = rms(fitted.coefficients[design.drift :, maps.terms :], maps.points.weight)
+    return response
+
+
+def _judge(
+    maps: MapSet,
+    options: FitOptions,
+    rings: NDArray[np.int64] | None,
+    reasons: list[str],
+    good: MapSet,
+    design: Design,
+    fitted: Regression,
+    responses: Floats,
+    doubtful: bool,
+) -> InfluenceFit:
+    """Put the result together with its quality figures."""
+    used = np.array([not reason for reason in reasons], dtype=bool)
+    terms, weight = maps.terms, maps.points.weight
+    coefficients = np.zeros((maps.actuators, responses.shape[1]))
+    coefficients[design.excited] = fitted.coefficients[design.drift :]
+    figure = fitted.coefficients[: design.drift]
+
+    freedom = len(good) - design.unknowns
+    residual = fitted.residual
+    variance = np.square(residual).sum(axis=0) / freedom
+    scatter = float(np.sqrt(variance[terms:] @ weight))
+    covariance = np.zeros((maps.actuators, maps.actuators))
+    covariance[np.ix_(design.excited, design.excited)] = fitted.covariance[design.drift :, design.drift :]
+    standard_error = scatter * np.sqrt(np.diag(covariance))
+
+    held_out, tested = quality.held_out_residual(design, responses, good.step, ~good.reference, options.folds)
+    untested = int((~tested & ~good.reference).sum())
+    in_sample = rms(residual[:, terms:], weight)
+    map_residual = np.full(len(maps), np.nan)
+    map_residual[used] = in_sample
+    worst_term = np.abs(held_out[tested, PISTON_TILT:terms]).max(axis=1, initial=0.0)
+
+    tilt = coefficients[:, 1:PISTON_TILT]
+    tilt_error = np.sqrt(np.diag(covariance)[:, None] * variance[1:PISTON_TILT])
+    tilt_known = bool(np.all(np.linalg.norm(tilt, axis=0) > 3.0 * np.linalg.norm(tilt_error, axis=0)))
+
+    response = _response(fitted, design, good)
+    grades = quality.grade(response, standard_error, design.excited, rings, options.grades)
+    figure_sag = figure[:, terms:]
+    return InfluenceFit(
+        method=options.method,
+        influence_zernike=coefficients[:, :terms].T.copy(),
+        zernike_offset=figure[:, :terms].mean(axis=0),
+        influence_sag=coefficients[:, terms:].T.copy(),
+        sag_offset=figure_sag.mean(axis=0),
+        points=maps.points,
+        signal_min=float(good.applied.min()),
+        signal_max=float(good.applied.max()),
+        used=used,
+        reasons=tuple(reasons),
+        map_residual=map_residual,
+        in_sample_rms=float(np.sqrt(np.mean(np.square(in_sample)))),
+        held_out_rms=float(np.sqrt(np.mean(np.square(rms(held_out[tested, terms:], weight))))),
+        held_out_max_zernike=float(np.percentile(worst_term, 95.0)),
+        condition_number=quality.condition_number(coefficients[:, :terms].T, tilt_known),
+        response=response,
+        standard_error=standard_error,
+        signal_covariance=covariance,
+        grades=grades,
+        drift_rms=float(np.sqrt(np.mean(np.square(rms(figure_sag - figure_sag.mean(axis=0), weight))))),
+        limitations=tuple(_limitations(maps, options, good, design, grades, tilt_known, untested, doubtful)),
+    )
+
+
+def _limitations(
+    maps: MapSet,
+    options: FitOptions,
+    good: MapSet,
+    design: Design,
+    grades: NDArray[np.uint8],
+    tilt_known: bool,
+    untested: int,
+    doubtful: bool,
+) -> list[str]:
+    """What a user of the influence function must know, in sentences."""
+    sentences = ["The model is linear and without memory: hysteresis and creep stay in its error."]
+    if not tilt_known:
+        sentences.append(
+            "The maps do not show the mirror's tilt (the interferometer's own is larger); "
+            "the condition number leaves tilt out."
+        )
+    if design.drift == 1:
+        sentences.append("The figure is taken as constant over the run: too few reference frames to follow its drift.")
+    for value, words in (
+        (quality.GRADE_WEAK, "respond weakly or uncertainly"),
+        (quality.GRADE_DEAD, "show no response above the noise"),
+        (quality.GRADE_NOT_EXCITED, "were never moved and count as without effect"),
+    ):
+        numbers = np.flatnonzero(grades == value) + 1
+        if numbers.size:
+            sentences.append(f"Actuators {', '.join(map(str, numbers))} {words}.")
+    if untested:
+        sentences.append(
+            f"{untested} maps move an actuator as no other map does; predicting them from the others would be "
+            "extrapolation, so they do not count in the held-out error."
+        )
+    if doubtful:
+        sentences.append(
+            f"More than {options.screening.dropped_max:.0%} of the maps look like outliers; not all of them were "
+            "dropped. Doubt this calibration."
+        )
+    blind = np.isnan(good.sag).all(axis=0).sum()
+    if blind:
+        sentences.append(f"{blind} of the {maps.points.x.size} sampling points have no data in any map.")
+    return sentences

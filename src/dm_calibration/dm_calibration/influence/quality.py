@@ -1,0 +1,107 @@
+"""How good an influence function is: held-out error, condition number, and a grade per actuator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.regression import Design
+
+Floats = NDArray[np.float64]
+
+#: Variance of a held-out prediction, in variances of one measurement, beyond which it is extrapolation.
+EXTRAPOLATION_MAX = 10.0
+
+# Values of dm_msgs/Calibration.actuator_grade.
+GRADE_GOOD = 0
+GRADE_WEAK = 1
+GRADE_DEAD = 2
+GRADE_NOT_EXCITED = 3
+GRADE_NAMES = ("good", "weak", "dead", "not excited")
+
+
+@dataclass(frozen=True)
+class GradeOptions:
+    """Thresholds for actuators; a response is the weighted rms sag of a unit signal, piston and tilt removed.
+
+    Attributes:
+        dead_sigmas: DEAD below this many standard errors ...
+        dead_share: ... or below this share of the median response of all excited actuators.
+        weak_sigmas: WEAK below this many standard errors ...
+        weak_share: ... or below this share of the median response of its ring.
+    """
+
+    dead_sigmas: float = 3.0
+    dead_share: float = 0.02
+    weak_sigmas: float = 10.0
+    weak_share: float = 0.4
+
+
+def grade(
+    response: Floats,
+    standard_error: Floats,
+    excited: NDArray[np.bool_],
+    rings: NDArray[np.int64] | None = None,
+    options: GradeOptions | None = None,
+) -> NDArray[np.uint8]:
+    """Grade of each actuator from its response (N,) and standard error (N,), both m per unit signal."""
+    options = options or GradeOptions()
+    rings = np.zeros(response.size, dtype=np.int64) if rings is None else rings
+    overall = float(np.median(response[excited])) if excited.any() else 0.0
+    ring_median = np.array([np.median(response[excited & (rings == ring)]) if e else 0.0
+                            for ring, e in zip(rings, excited, strict=True)])  # fmt: skip
+    dead = (response < options.dead_sigmas * standard_error) | (response < options.dead_share * overall)
+    weak = (response < options.weak_sigmas * standard_error) | (response < options.weak_share * ring_median)
+    grades = np.where(dead, GRADE_DEAD, np.where(weak, GRADE_WEAK, GRADE_GOOD))
+    return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
+
+
+def held_out_residual(
+    design: Design, responses: Floats, step: NDArray[np.int64], held: NDArray[np.bool_], folds: int
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Residual of each map predicted from a fit that has not seen it, by k-fold cross-validation.
+
+    Folds go by commanded state, so that repeated maps of a state leave together, and are dealt out in order: the two
+    directions of a push-pull poke lie in different folds. Reference frames stay in every fit: without them the figure
+    of the day would be extrapolated, which is not what the influence function is judged by.
+
+    Args:
+        design: (M, p).
+        responses: (M, Q).
+        step: (M,) index of the commanded state.
+        held: (M,) which maps take their turn (all but the reference frames).
+        folds: number of folds, at least 2.
+
+    Returns:
+        The residual (M, Q), and which maps (M,) were tested. A map whose prediction is EXTRAPOLATION_MAX times as
+        uncertain as a measurement is not, because the fit without its fold knows too little about what it moves;
+        unless no map could be tested otherwise.
+    """
+    order = np.unique(step[held], return_inverse=True)[1]
+    fold = np.full(step.size, -1)
+    fold[held] = order % folds
+    residual = np.full(responses.shape, np.nan)
+    inflation = np.full(step.size, np.inf)
+    for k in range(min(folds, int(order.max(initial=-1)) + 1)):
+        left_out = fold == k
+        # Where a fold holds the only map that tells two actuators apart, this is the smallest solution.
+        inverse = np.linalg.pinv(design.matrix[~left_out], rcond=1e-9)
+        residual[left_out] = responses[left_out] - design.matrix[left_out] @ (inverse @ responses[~left_out])
+        inflation[left_out] = np.square(design.matrix[left_out] @ inverse).sum(axis=1)
+        known = inverse @ design.matrix[~left_out]
+        beyond = np.abs(design.matrix[left_out] - design.matrix[left_out] @ known).max(axis=1, initial=0.0) > 1e-6
+        inflation[left_out] = np.where(beyond, np.inf, inflation[left_out])
+    tested = inflation <= EXTRAPOLATION_MAX
+    return residual, tested if tested.any() else fold >= 0
+
+
+def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
+    """Ratio of the largest to the smallest singular value of G without piston, and without tilt unless it is known.
+
+    Only as many modes as there are actuators can be told apart, so of (K, N) with N < K - 1 the N largest count.
+    """
+    singular = np.linalg.svd(influence_zernike[1 if tilt_known else 3 :], compute_uv=False)
+    smallest = float(singular[-1])
+    return float(singular[0] / smallest) if smallest > 0.0 else float("inf")

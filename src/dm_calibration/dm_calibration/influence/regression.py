@@ -1,0 +1,116 @@
+"""Eq. (6): the influence function as an ordinary least-squares problem, and the registry of methods."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from dm_calibration.influence.drift import drift_columns
+from dm_calibration.influence.maps import MapSet
+
+Floats = NDArray[np.float64]
+
+#: Least range of applied signals over the maps, normalised, for an actuator to count as excited.
+EXCITATION_MIN = 0.02
+#: Maps beyond the number of unknowns before the drift is followed; with fewer, the figure is taken as constant.
+DRIFT_SPARE_MAPS = 5
+#: Smallest singular value of the design, relative to the largest, that still tells actuators apart.
+RANK_TOLERANCE = 1e-7
+
+
+class TooFewMapsError(ValueError):
+    """The maps do not determine the influence function; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """The design of the regression.
+
+    Attributes:
+        matrix: (M, R + E) hat functions of the drifting figure, then the applied signals of the excited actuators.
+        drift: R, number of drift columns.
+        excited: (N,) which actuators have a column.
+    """
+
+    matrix: Floats
+    drift: int
+    excited: NDArray[np.bool_]
+
+    @property
+    def unknowns(self) -> int:
+        return int(self.matrix.shape[1])
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Outcome of one regression of Q responses on a design with p columns.
+
+    Attributes:
+        coefficients: (p, Q).
+        residual: (M, Q).
+        leverage: (M,) diagonal of the hat matrix; 1 = the map alone fixes something.
+        covariance: (p, p) of the coefficients for responses of unit variance.
+    """
+
+    coefficients: Floats
+    residual: Floats
+    leverage: Floats
+    covariance: Floats
+
+
+def make_design(maps: MapSet) -> Design:
+    """Design matrix of `maps`.
+
+    Raises:
+        TooFewMapsError: no actuator was moved, or fewer maps than unknowns.
+    """
+    excited = np.ptp(maps.applied, axis=0) >= EXCITATION_MIN
+    count = int(excited.sum())
+    if count == 0:
+        raise TooFewMapsError(f"no actuator was moved by {EXCITATION_MIN:g} or more in the {len(maps)} good maps")
+    drift = drift_columns(maps.stamp_ns, maps.reference)
+    if len(maps) < drift.shape[1] + count + DRIFT_SPARE_MAPS:
+        drift = np.ones((len(maps), 1))
+    unknowns = drift.shape[1] + count
+    if len(maps) <= unknowns:
+        raise TooFewMapsError(
+            f"{len(maps)} good maps for {unknowns} unknowns ({count} actuators and the figure): "
+            f"at least {unknowns + 1} are needed"
+        )
+    return Design(np.hstack((drift, maps.applied[:, excited])), drift.shape[1], excited)
+
+
+def least_squares(design: Design, responses: Floats) -> Regression:
+    """Regress `responses` (M, Q) on the design by one QR decomposition.
+
+    Raises:
+        TooFewMapsError: some actuators always moved together, naming them.
+    """
+    q, r = np.linalg.qr(design.matrix)
+    _, singular, right = np.linalg.svd(r)
+    if singular[-1] < RANK_TOLERANCE * singular[0]:
+        null = right[singular < RANK_TOLERANCE * singular[0]][:, design.drift :]
+        involved = np.flatnonzero(design.excited)[np.abs(null).max(axis=0) > 0.02] + 1
+        names = ", ".join(str(number) for number in involved) or "all"
+        raise TooFewMapsError(
+            f"the maps do not tell the actuators {names} apart: each must move on its own in some map"
+        )
+    coefficients = scipy.linalg.solve_triangular(r, q.T @ responses)
+    inverse = scipy.linalg.solve_triangular(r, np.eye(r.shape[0]))
+    return Regression(
+        coefficients=coefficients,
+        residual=responses - design.matrix @ coefficients,
+        leverage=np.square(q).sum(axis=1),
+        covariance=inverse @ inverse.T,
+    )
+
+
+#: A method estimates (p, Q) coefficients, with what is needed to judge them, from a design and responses (M, Q).
+Method = Callable[[Design, Floats], Regression]
+
+#: Methods by the name used in messages and calibration files.
+METHODS: dict[str, Method] = {"AZreg": least_squares}

@@ -1,0 +1,114 @@
+"""Which maps are fit for the regression, and why the others are not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.maps import MapSet
+
+Floats = NDArray[np.float64]
+
+#: Median absolute deviation to standard deviation, for normal errors.
+MAD_TO_SIGMA = 1.4826
+#: Maps with a leverage above this fix something alone: their own residual says nothing about them.
+LEVERAGE_MAX = 0.95
+
+
+@dataclass(frozen=True)
+class ScreeningOptions:
+    """Thresholds for maps.
+
+    Attributes:
+        valid_fraction_min: least share of valid pixels in the aperture.
+        missing_points_max: largest share of sampling points without data.
+        outlier_sigmas: residual, in robust sigmas above the median, beyond which a map is an outlier.
+        hysteresis_allowance: share of an actuator's move by which it may miss its mark because of hysteresis (half the
+            loop, whose width is 7-15 % of the move) without the map counting as an outlier.
+        residual_floor: no map with a smaller residual is an outlier, m rms.
+        dropped_max: largest share of the maps that may be dropped as outliers.
+    """
+
+    valid_fraction_min: float = 0.5
+    missing_points_max: float = 0.2
+    outlier_sigmas: float = 6.0
+    hysteresis_allowance: float = 0.10
+    residual_floor: float = 5e-9
+    dropped_max: float = 0.25
+
+
+def unusable(maps: MapSet, options: ScreeningOptions) -> list[str]:
+    """Reason for which each map cannot enter a fit; "" = it can."""
+    terms_finite = np.asarray(np.isfinite(maps.coefficients).all(axis=1))
+    applied_finite = np.asarray(np.isfinite(maps.applied).all(axis=1))
+    infinite = np.asarray(np.isinf(maps.sag).any(axis=1))
+    missing = np.isnan(maps.sag).mean(axis=1)
+    reasons = []
+    for i in range(len(maps)):
+        reason = ""
+        if not terms_finite[i]:
+            reason = "a Zernike coefficient is not finite"
+        elif not applied_finite[i]:
+            reason = "an applied signal is not finite"
+        elif infinite[i]:
+            reason = "a sag sample is infinite"
+        elif not maps.valid_fraction[i] >= options.valid_fraction_min:
+            reason = (
+                f"too few valid pixels: {maps.valid_fraction[i]:.1%} of the aperture, "
+                f"at least {options.valid_fraction_min:.0%} are needed"
+            )
+        elif missing[i] > options.missing_points_max:
+            reason = (
+                f"{missing[i]:.1%} of the sampling points have no data, at most {options.missing_points_max:.0%} may"
+            )
+        reasons.append(reason)
+    return reasons
+
+
+def worst_outlier(
+    residual_rms: Floats,
+    leverage: Floats,
+    applied: Floats,
+    response: Floats,
+    reference: NDArray[np.bool_],
+    options: ScreeningOptions,
+) -> tuple[int, str] | None:
+    """The map that stands out most from the fit, with the reason in words; None when none does.
+
+    A fit follows a map the more, the greater the map's leverage; residual / sqrt(1 - leverage) makes up for that. A map
+    is an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis of the actuators
+    it moved can explain, added up without coherence. A reference frame moves nothing but carries the remanence of the
+    moves around it; it gets the allowance of the largest of them.
+
+    Args:
+        residual_rms: (M,) m.
+        leverage: (M,).
+        applied: (M, N) normalised.
+        response: (N,) rms sag per unit signal, m.
+        reference: (M,) which maps are reference frames.
+    """
+    judged = leverage < LEVERAGE_MAX
+    if judged.sum() < 3:
+        return None
+    scaled = np.where(judged, residual_rms / np.sqrt(np.maximum(1.0 - leverage, 1.0 - LEVERAGE_MAX)), 0.0)
+    median = float(np.median(scaled[judged]))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(scaled[judged] - median)))
+    move = np.sqrt(np.square(applied) @ np.square(response))
+    frames = np.flatnonzero(reference)
+    borders = np.concatenate(([0], frames, [move.size - 1]))
+    around = move.copy()
+    for before, frame, after in zip(borders[:-2], frames, borders[2:], strict=True):
+        around[frame] = move[before : after + 1].max()
+    allowance = options.hysteresis_allowance * around
+    limit = np.maximum(np.maximum(median + options.outlier_sigmas * sigma, options.residual_floor), allowance)
+    outside = scaled > limit
+    if not outside.any():
+        return None
+    # The square of this is what leaving the map out takes off the sum of squares. A bad map of great leverage pulls
+    # good ones out of their (narrower) limits, but takes off most itself.
+    worst = int(np.argmax(np.where(outside, scaled, 0.0)))
+    return worst, (
+        f"outlier: {scaled[worst] * 1e9:.1f} nm rms from what the maps together say, limit {limit[worst] * 1e9:.1f} nm"
+    )

@@ -1,0 +1,215 @@
+"""The 69 sample surfaces of Table 1 of the paper, by name.
+
+p01-p54 prescribe signals and are exact. p55-p58 (spheres) and pz01-pz11 (Zernike terms) prescribe a shape; their
+signals come from an influence function by bounded least squares, and the shape aimed at travels with the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from dm_calibration.influence.mirror import Mirror, scale_to_limits
+from dm_calibration.influence.sag import remove_piston_tilt, rms
+from dm_calibration.names import unknown_name
+from dm_calibration.optics.conic import conic_coefficients
+from dm_calibration.optics.sampling import SamplePoints
+from dm_calibration.optics.zernike import TERMS, basis
+
+Floats = NDArray[np.float64]
+
+#: Channels 1..37 have a surface of their own in Table 1.
+TABLE_CHANNELS = 37
+#: Radius of curvature of the spheres, m; positive = concave.
+SPHERES = {"p55": 60.0, "p56": -60.0, "p57": 100.0, "p58": -100.0}
+#: Index in the 21 terms of Z_1^1, Z_2^0, Z_2^2, Z_3^1, Z_3^3, Z_4^0, Z_4^2, Z_4^4, Z_5^1, Z_5^3, Z_5^5, cosine terms.
+#: The order within a degree n is m rising, cosine before sine.
+ZERNIKE_NAMES = ("Z_1^1", "Z_2^0", "Z_2^2", "Z_3^1", "Z_3^3", "Z_4^0", "Z_4^2", "Z_4^4", "Z_5^1", "Z_5^3", "Z_5^5")
+ZERNIKE_INDEX = (1, 3, 4, 6, 8, 10, 11, 13, 15, 17, 19)
+#: Amplitude of the Zernike surfaces as a share of the largest one the limits allow.
+ZERNIKE_SHARE = 0.5
+#: Weight of small signals in the bounded solve, relative to the influence function.
+DAMPING = 1e-4
+
+_LEVELS = {"p01": -1.0, "p02": -0.5, "p03": 0.0, "p04": 0.5, "p05": 1.0}
+_POKES = {f"p{6 + k:02d}": k for k in range(TABLE_CHANNELS)}
+_RINGS = {"p43": 1, "p44": 2, "p45": 3}
+_CENTRE = {f"p{46 + k}": round(-0.8 + 0.2 * k, 1) for k in range(9)}
+_ZERNIKES = {f"pz{k + 1:02d}": k for k in range(len(ZERNIKE_NAMES))}
+
+SIGNAL_NAMES = tuple([*_LEVELS, *_POKES, *_RINGS, *_CENTRE])
+MODEL_NAMES = tuple([*SPHERES, *_ZERNIKES])
+#: All names of Table 1, in its order.
+TABLE_1 = SIGNAL_NAMES + MODEL_NAMES
+
+
+class LinearModel(Protocol):
+    """What a shape is solved from; :class:`~dm_calibration.influence.fit.InfluenceFit` is one."""
+
+    @property
+    def influence_sag(self) -> Floats: ...
+    @property
+    def sag_offset(self) -> Floats: ...
+    @property
+    def points(self) -> SamplePoints: ...
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A sample surface ready to be commanded.
+
+    Attributes:
+        name: as in Table 1.
+        signals: (N,) normalised, inside the mirror's limits.
+        nominal: (21,) Zernike coefficients of the shape aimed at, m; None when signals were prescribed.
+        remark: what differs from Table 1, in words; "" = nothing.
+    """
+
+    name: str
+    signals: Floats
+    nominal: Floats | None = None
+    remark: str = ""
+
+
+def check_names(names: Sequence[str]) -> tuple[str, ...]:
+    """`names` in the order of Table 1, without repetition; all of Table 1 when empty.
+
+    Raises:
+        UnknownNameError: naming the near ones.
+    """
+    for name in names:
+        if name not in TABLE_1:
+            raise unknown_name("surface", name, TABLE_1)
+    return tuple(name for name in TABLE_1 if name in names) if names else TABLE_1
+
+
+def missing_on(name: str, mirror: Mirror) -> str:
+    """Why a surface of Table 1 makes no sense on `mirror`, in words; "" = it does."""
+    if name in _POKES and _POKES[name] >= mirror.actuators:
+        return f"{name} moves actuator {_POKES[name] + 1}; the mirror has {mirror.actuators}"
+    if name in _RINGS and not (mirror.rings == _RINGS[name]).any():
+        return f"{name} moves circle {_RINGS[name] + 1} of actuators; the mirror has {mirror.rings.max() + 1}"
+    return ""
+
+
+def signal_surface(name: str, mirror: Mirror) -> Surface:
+    """A surface with prescribed signals (p01-p54), scaled about its mean when it breaks a limit of the mirror.
+
+    Table 1's -1 and +1 are the ends of the signal range.
+
+    Raises:
+        ValueError: the mirror has no such actuator or ring, or the surface needs a model.
+    """
+    if reason := missing_on(name, mirror):
+        raise ValueError(reason)
+    table = np.full(mirror.actuators, -1.0)
+    if name in _LEVELS:
+        table[:] = _LEVELS[name]
+    elif name in _POKES:
+        table[_POKES[name]] = 1.0
+    elif name in _RINGS:
+        table[mirror.rings == _RINGS[name]] = 1.0
+    elif name in _CENTRE:
+        table[0] = _CENTRE[name]
+    else:
+        raise ValueError(f"{name} does not prescribe signals")
+    middle, half = mirror.rest[0], 0.5 * (mirror.signal_max - mirror.signal_min)
+    signals, factor = scale_to_limits(middle + half * table, mirror)
+    remark = "" if factor == 1.0 else f"{name}: scaled about its mean to {factor:.0%} to keep the mirror's limits"
+    return Surface(name, signals, remark=remark)
+
+
+def solve_shape(target: Floats, model: LinearModel, mirror: Mirror) -> tuple[Floats, float]:
+    """Signals inside the range for the sag `target` (P,), m, by bounded least squares; piston and tilt are free.
+
+    Returns:
+        Signals (N,) and the rms sag that is left, m.
+    """
+    root = np.sqrt(model.points.weight)[:, None]
+    wanted = remove_piston_tilt((target - model.sag_offset)[None, :], model.points)[0]
+    matrix = root * remove_piston_tilt(model.influence_sag.T, model.points).T
+    damping = DAMPING * np.linalg.norm(matrix, 2)
+    # A QR first makes the iterations of lsq_linear work on N rows rather than on P.
+    q, r = np.linalg.qr(np.vstack((matrix, damping * np.eye(mirror.actuators))))
+    right = q.T @ np.concatenate((root[:, 0] * wanted, damping * mirror.rest))
+    solution = lsq_linear(r, right, bounds=(mirror.signal_min, mirror.signal_max), method="bvls")
+    left = wanted - remove_piston_tilt((model.influence_sag @ solution.x)[None, :], model.points)[0]
+    return np.asarray(solution.x), float(rms(left, model.points.weight))
+
+
+def largest_step(start: Floats, direction: Floats, mirror: Mirror) -> float:
+    """Largest t >= 0 for which start + t direction keeps the range and the neighbour limit; 0 when start breaks one."""
+    value, slope = start, direction
+    limit_high, limit_low = np.full(start.size, mirror.signal_max), np.full(start.size, mirror.signal_min)
+    if mirror.neighbours.size:
+        a, b = mirror.neighbours.T
+        most = np.full(a.size, mirror.neighbour_difference_max)
+        value, slope = np.append(value, start[a] - start[b]), np.append(slope, direction[a] - direction[b])
+        limit_high, limit_low = np.append(limit_high, most), np.append(limit_low, -most)
+    room = np.where(slope > 0, limit_high - value, value - limit_low)
+    moving = np.abs(slope) > 1e-12
+    if not moving.any():
+        return 0.0
+    return max(0.0, float((room[moving] / np.abs(slope[moving])).min()))
+
+
+def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
+    """A sphere (p55-p58) or Zernike surface (pz01-pz11), solved on an influence function.
+
+    A Zernike surface gets the amplitude ZERNIKE_SHARE x the largest that the limits allow on top of the flattened
+    figure. Both kinds aim at the absolute shape: the initial figure is corrected as far as the actuators can.
+    """
+    points = model.points
+    if name in SPHERES:
+        nominal = conic_coefficients(1.0 / SPHERES[name], 0.0, mirror.working_radius)
+        wanted = f"sphere of radius {SPHERES[name]:+g} m"
+    elif name in _ZERNIKES:
+        index = ZERNIKE_INDEX[_ZERNIKES[name]]
+        unit = np.zeros(len(TERMS))
+        unit[index] = 1.0
+        if index < 3:
+            return _tilt_surface(name, unit, model, mirror)
+        flat, _ = solve_shape(np.zeros(points.x.size), model, mirror)
+        # Wide bounds: the direction is scaled to the limits afterwards.
+        direction = _unbounded(basis(points.x, points.y) @ unit, model)
+        amplitude = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
+        nominal = amplitude * unit
+        wanted = f"{ZERNIKE_NAMES[_ZERNIKES[name]]} of {amplitude * 1e9:.0f} nm"
+    else:
+        raise ValueError(f"{name} prescribes signals, not a shape")
+    signals, left = solve_shape(basis(points.x, points.y) @ nominal, model, mirror)
+    signals, factor = scale_to_limits(signals, mirror)
+    remark = f"{name}: {wanted}, {left * 1e9:.1f} nm rms beyond the mirror's reach"
+    if factor < 1.0:
+        nominal = factor * nominal
+        remark += f"; reduced to {factor:.0%} to keep the limit between neighbours"
+    return Surface(name, signals, nominal, remark)
+
+
+def _unbounded(target: Floats, model: LinearModel) -> Floats:
+    root = np.sqrt(model.points.weight)[:, None]
+    matrix = root * remove_piston_tilt(model.influence_sag.T, model.points).T
+    damping = DAMPING * np.linalg.norm(matrix, 2)
+    stacked = np.vstack((matrix, damping * np.eye(matrix.shape[1])))
+    wanted = remove_piston_tilt(target[None, :], model.points)[0]
+    right = np.concatenate((root[:, 0] * wanted, np.zeros(matrix.shape[1])))
+    return np.asarray(np.linalg.lstsq(stacked, right)[0])
+
+
+def _tilt_surface(name: str, unit: Floats, model: LinearModel, mirror: Mirror) -> Surface:
+    """Z_1^1: the actuators move in proportion to x, because the maps do not show tilt.
+
+    The amplitude is that of a rigid tilt in signals; the coefficient aimed at is not known in metres and counts as 0
+    after removal of tilt.
+    """
+    flat, _ = solve_shape(np.zeros(model.points.x.size), model, mirror)
+    direction = mirror.x / np.abs(mirror.x).max() if np.abs(mirror.x).max() > 0 else np.zeros(mirror.actuators)
+    share = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
+    signals, _ = scale_to_limits(flat + share * direction, mirror)
+    remark = f"{name}: Z_1^1 as a plane of signals of +-{share:.2f}; its size in metres is not measured"
+    return Surface(name, signals, 0.0 * unit, remark)

@@ -1,0 +1,294 @@
+"""Node `interferometer`: reads map files by request, from a watched folder and after a trigger command, and publishes
+map, map info, Zernike coefficients and samples.
+
+Stamps are the time of the measurement in ROS time: the middle of the trigger command's run; for a file from the watched
+folder its modification time when that is recent; for a file named to `ingest_file` the time in its header, else its
+modification time. Where ROS time is a simulator's, or the file's time cannot be right, it is the time of reading.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from dm_msgs.msg import ErrorCode, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.srv import IngestFile, Measure
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.time import Time
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
+from dm_runtime import diagnostics, parameters, qos
+from dm_runtime.executor import run_node
+from dm_runtime.worker import WorkerService
+
+from . import interferometer_messages as messages
+from .acquisition import Acquired, Acquisition, AcquisitionStoppedError, MapTimeoutError, NothingToAcquireError
+from .ingest import Ingest, MapRejectedError, Measurement
+from .interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
+from .map_files import MapFileError, NoValidPixelsError
+from .optics.aperture import InsufficientDataError
+from .trigger import TriggerError
+
+#: First match wins, so the special case of a family stands before it.
+_ERROR_CODES: tuple[tuple[type[Exception], int], ...] = (
+    (TriggerError, ErrorCode.TRIGGER_FAILED),
+    (MapTimeoutError, ErrorCode.MAP_TIMEOUT),
+    (AcquisitionStoppedError, ErrorCode.INTERFEROMETER_INACTIVE),
+    (InsufficientDataError, ErrorCode.MAP_INSUFFICIENT),
+    (NoValidPixelsError, ErrorCode.MAP_INSUFFICIENT),
+    (MapRejectedError, ErrorCode.MAP_REJECTED),
+    (MapFileError, ErrorCode.MAP_UNREADABLE),
+    (NothingToAcquireError, ErrorCode.NOT_SUPPORTED),
+)
+_REFUSALS = tuple(kind for kind, _code in _ERROR_CODES)
+
+#: A watched file's modification time further in the past is not believed (clocks of two machines differ).
+_RECENT_NS = 60 * 10**9
+
+
+class InterferometerNode(LifecycleNode):
+    """Translates between map files and messages; reading and fitting are in `ingest` and `acquisition`."""
+
+    def __init__(self) -> None:
+        super().__init__("interferometer")
+        self._values = parameters.declare(self, PARAMETERS)
+        self._ingest = Ingest()
+        self._acquisition: Acquisition | None = None
+        self._configured = self._active = False
+        self._publishing = threading.Lock()  # the four messages of one map stay together
+        self._taken = self._bad = 0
+        self._last_file = self._last_refusal = ""
+        self._warned_of_pitch = False
+        self._published: dict[str, str] = {}  # sha256 by path of what came from the watched folder
+        self._diagnostics = diagnostics.Diagnostics(self, "interferometer", self._health)
+        self._worker_services = [
+            WorkerService(self, IngestFile, "ingest_file", self._on_ingest_file),
+            WorkerService(self, Measure, "measure", self._on_measure),
+        ]
+        if self._values["autostart"]:
+            steady = Clock(clock_type=ClockType.STEADY_TIME)
+            self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
+
+    def _autostart(self) -> None:
+        self._autostart_timer.cancel()
+        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            ingest_settings(self._values)
+            self._acquisition = Acquisition(
+                acquisition_settings(self._values), self._read, self._now_ns, self._on_new_file, self._warn_of_file
+            )
+        except (ValueError, RuntimeError) as error:  # RuntimeError: ~name of an unknown user
+            self.get_logger().error(f"cannot configure: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self._map_publisher = self.create_lifecycle_publisher(Image, "surface_map", qos.MAP)
+        self._info_publisher = self.create_lifecycle_publisher(SurfaceMapInfo, "surface_map_info", qos.STATE)
+        self._zernike_publisher = self.create_lifecycle_publisher(ZernikeCoefficients, "zernike", qos.STATE)
+        self._samples_publisher = self.create_lifecycle_publisher(SurfaceSamples, "surface_samples", qos.STATE)
+        self._configured = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        assert self._acquisition is not None
+        result = super().on_activate(state)
+        self._active = True
+        self._acquisition.start()
+        source = self._acquisition.settings.folder or "files named to ingest_file only"
+        self.get_logger().info(f"active; maps from {source}")
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.make_safe()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.make_safe()
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def make_safe(self) -> None:
+        """End the watching thread and a running trigger command."""
+        self._active = False
+        if self._acquisition is not None:
+            self._acquisition.stop()
+
+    def _release(self) -> None:
+        if self._configured:
+            self._configured = False
+            with self._publishing:
+                for publisher in (
+                    self._map_publisher,
+                    self._info_publisher,
+                    self._zernike_publisher,
+                    self._samples_publisher,
+                ):
+                    self.destroy_lifecycle_publisher(publisher)
+        self._acquisition = None
+
+    def _on_ingest_file(self, request: IngestFile.Request, response: IngestFile.Response) -> IngestFile.Response:
+        if not self._configured:
+            return self._refuse(response, ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
+        try:
+            measurement = self._read(self._expanded(request.path))
+        except _REFUSALS as error:
+            return self._refuse_for(response, error)
+        header = self._header(self._file_time(measurement, believe_header=True))
+        return self._accept(response, measurement, header, "ingested")
+
+    @staticmethod
+    def _expanded(path: str) -> Path:
+        try:
+            return Path(path).expanduser()
+        except RuntimeError as error:
+            raise MapFileError(f"{path}: {error}") from error
+
+    def _on_measure(self, request: Measure.Request, response: Measure.Response) -> Measure.Response:
+        acquisition = self._acquisition
+        if not self._active or acquisition is None:
+            return self._refuse(
+                response, ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not active: activate it first"
+            )
+        timeout_s = request.timeout or self._values["measure_timeout"]
+        if not 0 < timeout_s < 86400:
+            return self._refuse(
+                response, ErrorCode.OUT_OF_RANGE, f"timeout = {request.timeout} s: must be 0 (configured) to 86400 s"
+            )
+        try:
+            acquired = acquisition.acquire(timeout_s)
+        except _REFUSALS as error:
+            return self._refuse_for(response, error)
+        header = self._header(self._measurement_time(acquired))
+        return self._accept(response, acquired.measurement, header, f"measured {request.label}".strip())
+
+    def _on_new_file(self, path: Path) -> None:
+        """A new file in the watched folder that nobody waits for; runs in the watching thread."""
+        try:
+            measurement = self._read(path)
+        except _REFUSALS as error:
+            self._warn_of_file(str(error))
+            return
+        except Exception as error:  # whatever one file does, the next one must be taken
+            self._warn_of_file(f"{path}: {type(error).__name__}: {error}")
+            return
+        if self._published.get(str(path)) == measurement.source.sha256:
+            return  # touched or copied over itself
+        self._published.pop(str(path), None)
+        self._published[str(path)] = measurement.source.sha256
+        while len(self._published) > 1000:
+            self._published.pop(next(iter(self._published)))
+        if self._active:
+            self._publish(measurement, self._header(self._file_time(measurement, believe_header=False)))
+            self._log_taken(measurement, "new file")
+
+    def _read(self, path: Path) -> Measurement:
+        return self._ingest.read(path, ingest_settings(self._values))
+
+    def _accept(self, response: Any, measurement: Measurement, header: Header, what: str) -> Any:
+        if self._active:
+            self._publish(measurement, header)
+        self._log_taken(measurement, what)
+        response.error_code = ErrorCode.OK
+        response.info = messages.info_message(measurement, header)
+        response.zernike = messages.zernike_message(measurement, header)
+        response.samples = messages.samples_message(measurement, header)
+        return response
+
+    def _refuse_for(self, response: Any, error: Exception) -> Any:
+        code = next(code for kind, code in _ERROR_CODES if isinstance(error, kind))
+        self._warn_of_file(str(error))
+        return self._refuse(response, code, str(error))
+
+    def _refuse(self, response: Any, code: int, message: str) -> Any:
+        response.error_code = code
+        response.message = message
+        return response
+
+    def _publish(self, measurement: Measurement, header: Header) -> None:
+        with self._publishing:
+            if not self._configured:
+                return
+            if self._values["publish_map"]:
+                self._map_publisher.publish(messages.image_message(measurement, header))
+            self._info_publisher.publish(messages.info_message(measurement, header))
+            self._zernike_publisher.publish(messages.zernike_message(measurement, header))
+            self._samples_publisher.publish(messages.samples_message(measurement, header))
+
+    def _log_taken(self, measurement: Measurement, what: str) -> None:
+        self._taken += 1
+        self._last_file, self._last_refusal = measurement.source.file, ""
+        self.get_logger().info(
+            f"{what}: {measurement.source.file}: PV {measurement.pv * 1e9:.1f} nm, rms {measurement.rms * 1e9:.1f} nm, "
+            f"{100 * measurement.fit.valid_fraction:.1f} % valid"
+        )
+        if measurement.pitch is None and not self._warned_of_pitch:
+            self._warned_of_pitch = True
+            self.get_logger().warning(
+                f"{measurement.source.file}: the file does not tell its lateral resolution, so coefficients carry "
+                "radius 0 (unknown); set the parameter `pitch` [m per pixel]"
+            )
+
+    def _warn_of_file(self, reason: str) -> None:
+        self._bad += 1
+        self._last_refusal = reason
+        self.get_logger().warning(reason)
+
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _header(self, stamp_ns: int) -> Header:
+        return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=self._values["frame_id"])
+
+    def _measurement_time(self, acquired: Acquired) -> int:
+        if acquired.began_ns is None or acquired.ended_ns is None:
+            return self._file_time(acquired.measurement, believe_header=False)
+        return (acquired.began_ns + acquired.ended_ns) // 2
+
+    def _file_time(self, measurement: Measurement, believe_header: bool) -> int:
+        now = self._now_ns()
+        if self.get_clock().ros_time_is_active:
+            return now
+        source = measurement.source
+        if believe_header and source.time_stamp is not None and 0 < source.time_stamp * 1e9 <= now:
+            return round(source.time_stamp * 1e9)
+        try:
+            modified = Path(source.file).stat().st_mtime_ns
+        except OSError:
+            return now
+        oldest = 0 if believe_header else now - _RECENT_NS
+        return modified if oldest < modified <= now else now
+
+    def _health(self) -> diagnostics.Health:
+        acquisition = self._acquisition
+        trouble = acquisition.folder_trouble if acquisition is not None and self._active else ""
+        values = {
+            "active": self._active,
+            "watch_folder": self._values["watch_folder"],
+            "maps_taken": self._taken,
+            "files_refused": self._bad,
+            "last_file": self._last_file,
+            "last_refusal": self._last_refusal,
+        }
+        if trouble:
+            return diagnostics.Health(diagnostics.ERROR, trouble, values)
+        if self._last_refusal:
+            return diagnostics.Health(diagnostics.WARN, f"refused: {self._last_refusal}", values)
+        return diagnostics.Health(diagnostics.OK, "active" if self._active else "inactive", values)
+
+
+def main() -> int:
+    """Run the node until SIGINT or SIGTERM."""
+    return run_node(InterferometerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

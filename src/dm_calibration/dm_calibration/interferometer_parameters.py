@@ -1,0 +1,147 @@
+"""Parameters of the node `interferometer`, and what they mean to the library."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dm_runtime.parameters import Parameter
+
+from .acquisition import AcquisitionSettings
+from .ingest import IngestSettings
+from .map_files import XYZ_UNITS
+from .optics.orientation import ROTATIONS, Orientation
+
+PARAMETERS = (
+    Parameter("autostart", bool, True, "Configure and activate by itself after the start."),
+    Parameter("frame_id", str, "mirror", "Name of the mirror surface frame (x right, y up)."),
+    Parameter("watch_folder", str, "", "Folder in which the instrument saves its maps; empty = watch nothing."),
+    Parameter(
+        "file_pattern",
+        "str[]",
+        ["*.dat", "*.datx", "*.asc", "*.xyz"],
+        "Names of the files to take from watch_folder, as shell patterns.",
+    ),
+    Parameter("stable_time", float, 0.5, "Time for which size and time of a file must stand still.", "s", 0.02, 3600.0),
+    Parameter(
+        "trigger_command",
+        "str[]",
+        [],
+        "Command that makes the instrument take a map, as an argument list (no shell); {path} in an argument is "
+        "replaced by the file in watch_folder it must write. Empty = measure waits for the next new file.",
+    ),
+    Parameter("trigger_output_suffix", str, ".datx", "Ending of the file name that replaces {path}."),
+    Parameter("trigger_timeout", float, 30.0, "Time limit of trigger_command.", "s", 0.1, 3600.0),
+    Parameter(
+        "measure_timeout", float, 60.0, "Time limit of a measurement that asks for none.", "s", 0.1, 86400.0, live=True
+    ),
+    Parameter(
+        "aperture.radius",
+        float,
+        0.0,
+        "Radius of the aperture; 0 = find the valid region of each map.",
+        "m",
+        0.0,
+        1.0,
+        live=True,
+    ),
+    Parameter(
+        "aperture.centre_x",
+        float,
+        0.0,
+        "Centre of the aperture from the oriented map's centre, x right; used with aperture.radius.",
+        "m",
+        -1.0,
+        1.0,
+        live=True,
+    ),
+    Parameter("aperture.centre_y", float, 0.0, "The same, y up.", "m", -1.0, 1.0, live=True),
+    Parameter(
+        "aperture.minimum_valid_fraction",
+        float,
+        0.7,
+        "Smallest share of valid pixels inside the aperture; maps with fewer are refused.",
+        "",
+        0.0,
+        1.0,
+        live=True,
+    ),
+    Parameter("orientation.flip_x", bool, False, "Exchange left and right of the instrument's picture.", live=True),
+    Parameter("orientation.flip_y", bool, False, "Exchange top and bottom of the instrument's picture.", live=True),
+    Parameter(
+        "orientation.rotate_deg",
+        int,
+        0,
+        f"Then rotate it counter-clockwise by {', '.join(map(str, ROTATIONS))} degrees.",
+        "",
+        0,
+        270,
+    ),
+    Parameter(
+        "wavelength.expected",
+        float,
+        0.0,
+        "Wavelength of the instrument; maps of another are refused. 0 = any.",
+        "m",
+        0.0,
+        2e-5,
+        live=True,
+    ),
+    Parameter("wavelength.tolerance", float, 1e-9, "Allowed difference from it.", "m", 0.0, 1e-6, live=True),
+    Parameter(
+        "pitch",
+        float,
+        0.0,
+        "Lateral resolution per pixel for files that do not tell it; 0 = unknown.",
+        "m",
+        0.0,
+        0.1,
+        live=True,
+    ),
+    Parameter(
+        "xyz_unit",
+        str,
+        "",
+        "Unit of the values in .xyz files, which do not tell it; empty = refuse them.",
+        choices=("", *XYZ_UNITS),
+        live=True,
+    ),
+    Parameter(
+        "remove_piston_tilt",
+        bool,
+        False,
+        "Subtract piston and tilt from the published map; coefficients and samples keep them.",
+        live=True,
+    ),
+    Parameter("publish_map", bool, True, "Publish the map itself, several megabytes.", live=True),
+)
+
+
+def ingest_settings(values: Mapping[str, Any]) -> IngestSettings:
+    """Raises ValueError for a rotation that is not a multiple of 90 degrees."""
+    return IngestSettings(
+        xyz_unit=values["xyz_unit"],
+        pitch=values["pitch"],
+        wavelength=values["wavelength.expected"],
+        wavelength_tolerance=values["wavelength.tolerance"],
+        orientation=Orientation(
+            values["orientation.flip_x"], values["orientation.flip_y"], values["orientation.rotate_deg"]
+        ),
+        aperture_radius=values["aperture.radius"],
+        aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
+        minimum_valid_fraction=values["aperture.minimum_valid_fraction"],
+        remove_piston_tilt=values["remove_piston_tilt"],
+    )
+
+
+def acquisition_settings(values: Mapping[str, Any]) -> AcquisitionSettings:
+    folder = values["watch_folder"]
+    return AcquisitionSettings(
+        folder=Path(folder).expanduser() if folder else None,
+        patterns=values["file_pattern"],
+        stable_time=values["stable_time"],
+        trigger_command=[argument for argument in values["trigger_command"]],
+        trigger_suffix=values["trigger_output_suffix"],
+        trigger_timeout=values["trigger_timeout"],
+    )

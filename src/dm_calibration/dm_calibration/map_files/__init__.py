@@ -1,0 +1,84 @@
+"""Readers of interferometer map files: `read_map(path).sag` is the surface sag in metres."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import stat
+from pathlib import Path
+
+from . import dat
+from .asc import parse_asc
+from .dat import is_dat, parse_dat
+from .datx import is_datx, parse_datx
+from .surface_map import MapFileError, NoValidPixelsError, SurfaceMap
+from .text_header import XYZ_TITLE, is_text
+from .xyz import UNITS as XYZ_UNITS
+from .xyz import parse_xyz
+
+__all__ = ["XYZ_UNITS", "MapFileError", "NoValidPixelsError", "SurfaceMap", "read_map"]
+
+#: Larger files are refused before they are read; the largest map in the wordiest format stays below.
+MAX_FILE_BYTES = 2**30
+
+_START_BYTES = 4096
+
+
+def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> SurfaceMap:
+    """Read a surface map from a ZYGO `.dat`, `.asc`, `.xyz` or `.datx` file.
+
+    The format is found from the content; the suffix matters only between the two text formats, whose titles are
+    sometimes mixed up.
+
+    Args:
+        xyz_unit: unit of the values of an `.xyz` file, one of XYZ_UNITS; other formats know theirs.
+
+    Raises:
+        MapFileError: not a whole, readable map; the message names the file, the field, its value and what is allowed.
+        NoValidPixelsError: whole, but without a valid pixel.
+    """
+    path = Path(path)
+    if "\0" in str(path):
+        raise MapFileError(f"path = {str(path)!r}: must not contain a NUL character")
+    try:
+        content = _read(path)
+        surface_map = _parse(content, path.suffix.lower(), xyz_unit)
+    except OSError as error:
+        raise MapFileError(f"{path}: {error.strerror or error}") from error
+    except MapFileError as error:
+        raise type(error)(f"{path}: {error}") from error
+    return dataclasses.replace(surface_map, file=str(path), sha256=hashlib.sha256(content).hexdigest())
+
+
+def _read(path: Path) -> bytes:
+    """The whole file, once what its first bytes promise agrees with its length."""
+    with open(path, "rb", opener=_open_without_waiting) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise MapFileError("not a regular file")
+        if status.st_size > MAX_FILE_BYTES:
+            raise MapFileError(f"file length = {status.st_size} bytes: must be at most {MAX_FILE_BYTES}")
+        start = file.read(_START_BYTES)
+        if is_dat(start):
+            dat.check_length(dat.read_header(start), status.st_size)
+        elif not (is_datx(start) or is_text(start)):
+            raise MapFileError(
+                f"begins with bytes {start[:8].hex(' ') or '(none)'}: not a ZYGO .dat, .datx, .asc or .xyz file"
+            )
+        return start + file.read(status.st_size - len(start))
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    """Opening a named pipe would otherwise wait for its writer."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def _parse(content: bytes, suffix: str, xyz_unit: str | None) -> SurfaceMap:
+    if is_dat(content):
+        return parse_dat(content)
+    if is_datx(content):
+        return parse_datx(content)
+    if content.lstrip().startswith(XYZ_TITLE) or suffix == ".xyz":
+        return parse_xyz(content, xyz_unit)
+    return parse_asc(content)

@@ -1,0 +1,119 @@
+"""ZYGO binary `.dat` maps, as MetroPro and Mx write them (MetroPro reference guide, data format)."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+
+from .surface_map import MapFileError, SurfaceMap, check_pitch, check_size, sag_from_counts, sag_per_count
+
+#: magic: (format, header size in bytes)
+HEADERS = {0x881B036F: (1, 834), 0x881B0370: (2, 834), 0x881B0371: (3, 4096)}
+
+_FIELDS = {
+    "magic": (0, ">I"),
+    "format": (4, ">H"),
+    "header_size": (6, ">I"),
+    "software": (10, ">h"),
+    "intensity_width": (52, ">H"),
+    "intensity_height": (54, ">H"),
+    "intensity_buckets": (56, ">H"),
+    "origin_x": (64, ">h"),
+    "origin_y": (66, ">h"),
+    "width": (68, ">H"),
+    "height": (70, ">H"),
+    "time_stamp": (76, ">I"),
+    "scale_factor": (164, ">f"),
+    "wavelength": (168, ">f"),
+    "obliquity": (176, ">f"),
+    "lateral_resolution": (184, ">f"),
+    "phase_resolution": (218, ">h"),
+    "data_sign": (232, ">h"),
+    "system_type": (238, ">h"),
+    "system_serial": (242, ">H"),  # declared signed, but real serial numbers exceed 32767
+    "part_name": (258, "40s"),
+    "system_error_subtracted": (302, ">h"),
+}
+
+_SOFTWARE = {0: "Mx", 1: "MetroPro", 2: "MetroBASIC", 3: "d2bug"}
+
+
+def is_dat(start: bytes) -> bool:
+    """Whether the first bytes of a file carry the format's magic number."""
+    return len(start) >= 4 and struct.unpack(">I", start[:4])[0] in HEADERS
+
+
+def read_header(content: bytes) -> dict[str, Any]:
+    """Return the header fields by name, checked for agreement with each other.
+
+    Raises:
+        MapFileError: too short, or magic number, format and header size do not belong together.
+    """
+    smallest = min(size for _format, size in HEADERS.values())
+    if len(content) < smallest:
+        raise MapFileError(f"file length = {len(content)} bytes: a .dat header alone has at least {smallest}")
+    header = {name: struct.unpack_from(code, content, offset)[0] for name, (offset, code) in _FIELDS.items()}
+    if header["magic"] not in HEADERS:
+        known = ", ".join(f"0x{magic:08X}" for magic in HEADERS)
+        raise MapFileError(f"magic number = 0x{header['magic']:08X}: must be one of {known}")
+    expected = HEADERS[header["magic"]]
+    if (header["format"], header["header_size"]) != expected:
+        raise MapFileError(
+            f"format = {header['format']}, header size = {header['header_size']}: magic number "
+            f"0x{header['magic']:08X} belongs to format {expected[0]} with a header of {expected[1]} bytes"
+        )
+    return header
+
+
+def check_length(header: dict[str, Any], length: int) -> int:
+    """Return the offset of the phase data; the file must be exactly as long as its header says.
+
+    Raises:
+        MapFileError: the length differs, or the size is absurd.
+    """
+    pixels = check_size(header["width"], header["height"])
+    intensities = header["intensity_width"] * header["intensity_height"] * header["intensity_buckets"]
+    offset: int = header["header_size"] + 2 * intensities
+    expected = offset + 4 * pixels
+    if length != expected:
+        problem = "truncated" if length < expected else "longer than its header says"
+        raise MapFileError(
+            f"file length = {length} bytes: must be {expected} for {header['width']} x {header['height']} phase and "
+            f"{intensities} intensity values; the file is {problem}"
+        )
+    return offset
+
+
+def parse_dat(content: bytes) -> SurfaceMap:
+    """Parse a whole `.dat` file.
+
+    Raises:
+        MapFileError: not a whole, meaningful map; the message names the field.
+    """
+    header = read_header(content)
+    offset = check_length(header, len(content))
+    width, height = header["width"], header["height"]
+    counts = np.frombuffer(content, ">i4", width * height, offset).reshape(height, width)
+    metres_per_count = sag_per_count(
+        header["scale_factor"],
+        header["wavelength"],
+        header["obliquity"],
+        header["phase_resolution"],
+        header["data_sign"],
+    )
+    pitch = check_pitch(header["lateral_resolution"])
+    software = _SOFTWARE.get(header["software"], f"software {header['software']}")
+    return SurfaceMap(
+        sag=sag_from_counts(counts, metres_per_count),
+        wavelength=header["wavelength"],
+        pitch=pitch,
+        format="dat",
+        origin=(header["origin_x"], header["origin_y"]),
+        instrument=f"{software}, system type {header['system_type']}",
+        serial=str(header["system_serial"]) if header["system_serial"] else "",
+        part_name=header["part_name"].split(b"\0")[0].decode("latin-1").strip(' "'),
+        time_stamp=float(header["time_stamp"]) if header["time_stamp"] else None,
+        system_error_subtracted={0: False, 1: True}.get(header["system_error_subtracted"]),
+    )

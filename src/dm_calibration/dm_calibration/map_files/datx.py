@@ -1,0 +1,258 @@
+"""ZYGO `.datx` maps (HDF5, written by Mx)."""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from .surface_map import (
+    MapFileError,
+    SurfaceMap,
+    check_factor,
+    check_pitch,
+    check_size,
+    check_wavelength,
+    no_valid_pixels,
+)
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+#: Units of length a surface may be stored in, as m. "Fringes" is scaled by the optical factors instead.
+_LENGTHS = {"nanometers": 1e-9, "micrometers": 1e-6, "millimeters": 1e-3, "meters": 1.0, "angstroms": 1e-10}
+
+_FILTER_NAMES = {h5py.h5z.FILTER_SZIP: "Szip", h5py.h5z.FILTER_DEFLATE: "gzip"}
+
+#: Pitches along x and y may differ by this much before pixels count as not square.
+_SQUARE_TOLERANCE = 0.01
+
+
+def is_datx(start: bytes) -> bool:
+    """Whether the first bytes of a file are the HDF5 signature."""
+    return start.startswith(SIGNATURE)
+
+
+def parse_datx(content: bytes) -> SurfaceMap:
+    """Parse a whole `.datx` file.
+
+    The file is read from memory, and links and storage that lead out of it are refused, so nothing outside is touched.
+
+    Raises:
+        MapFileError: not a whole, meaningful map; the message names what is missing or wrong.
+    """
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            return _parse(file)
+    except MapFileError:
+        raise
+    except Exception as error:  # h5py raises whatever a damaged file provokes: OSError, KeyError, RuntimeError, ...
+        raise MapFileError(f"the HDF5 content is damaged or truncated: {type(error).__name__}: {error}") from error
+
+
+def _parse(file: h5py.File) -> SurfaceMap:
+    metadata = _metadata(file)
+    surface = _object(file, _path(metadata, "Surface"))
+    if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
+        raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
+    height, width = surface.shape
+    check_size(width, height)
+    extra = _extra_attributes(file, metadata)
+
+    wavelength = _number(surface, "Wavelength")
+    if wavelength is None:
+        wavelength = _extra_number(extra, "Wavelength")
+    if wavelength is None:
+        raise _missing(surface, "Wavelength")
+    check_wavelength(wavelength)
+    scale = _metres_per_unit(surface, extra, wavelength)
+    no_data = _number(surface, "No Data")
+    if no_data is None:
+        raise _missing(surface, "No Data")
+    pitch = _pitch(surface, extra)
+
+    sag = _read(surface)
+    invalid = ~np.isfinite(sag)
+    if not math.isnan(no_data):
+        with np.errstate(invalid="ignore"):
+            invalid |= sag >= no_data
+    if invalid.all():
+        raise no_valid_pixels(sag.shape)
+    sag *= scale
+    sag[invalid] = math.nan
+
+    software = " ".join(filter(None, (_extra_text(extra, "Software Info Name"), _extra_text(extra, "System Type"))))
+    time_stamp = _extra_number(extra, "Time Stamp")
+    return SurfaceMap(
+        sag=sag,
+        wavelength=wavelength,
+        pitch=pitch,
+        format="datx",
+        origin=_origin(surface),
+        instrument=software or "Mx",
+        serial=_extra_text(extra, "System Serial Number"),
+        part_name=_extra_text(extra, "Part Name") or _extra_text(extra, "Part Number"),
+        time_stamp=time_stamp if time_stamp else None,
+        system_error_subtracted=_truth(extra.get("Subtract System Error")),
+    )
+
+
+def _missing(where: Any, name: str) -> MapFileError:
+    return MapFileError(f"{where.name}: the attribute '{name}' is missing")
+
+
+def _text(value: Any) -> str:
+    return value.decode("latin-1") if isinstance(value, bytes) else str(value)
+
+
+def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
+    """The table /MetaData as {(source, link): destination}."""
+    table = _object(file, "/MetaData")
+    if not isinstance(table, h5py.Dataset) or len(table.dtype.names or ()) != 3:
+        raise MapFileError("/MetaData: must be a table of Source, Link and Destination")
+    return {(_text(source), _text(link)): _text(destination) for source, link, destination in table[()]}
+
+
+def _path(metadata: dict[tuple[str, str], str], what: str) -> str:
+    """Walk Root -> Measurement -> `what` -> Path."""
+    node = "Root"
+    for link in ("Measurement", what, "Path"):
+        if (node, link) not in metadata:
+            raise MapFileError(f"/MetaData: no link '{link}' from '{node}' (Root -> Measurement -> {what} -> Path)")
+        node = metadata[node, link]
+    return node
+
+
+def _object(file: h5py.File, path: str) -> Any:
+    """The object at `path`, reached through hard links only: others may lead out of the file."""
+    node: Any = file
+    for name in path.strip("/").split("/"):
+        link = node.get(name, getlink=True) if isinstance(node, h5py.Group) else None
+        if link is None:
+            raise MapFileError(f"{path}: missing from the file")
+        if not isinstance(link, h5py.HardLink):
+            raise MapFileError(f"{path}: '{name}' is a link elsewhere; links are not followed")
+        node = node[name]
+    return node
+
+
+def _number(node: Any, name: str) -> float | None:
+    if name not in node.attrs:
+        return None
+    value = np.asarray(node.attrs[name]).ravel()
+    if value.size != 1 or value.dtype.kind not in "fiu":
+        raise MapFileError(f"{node.name}: attribute '{name}' = {value.tolist()}: must be one number")
+    return float(value[0])
+
+
+def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> dict[str, Any]:
+    """What /Attributes/<id> tells, by the last part of each name without the ending ':Value'."""
+    try:
+        node = _object(file, _path(metadata, "Attributes"))
+    except MapFileError:  # older files do not list it in /MetaData
+        try:
+            node = next(iter(_object(file, "/Attributes").values()), None)
+        except MapFileError:
+            node = None
+    if node is None:
+        return {}
+    found: dict[str, Any] = {}
+    for name in node.attrs:
+        if not name.endswith((":Unit", ":Converter")):
+            found[name.removesuffix(":Value").rpartition(".")[2]] = np.asarray(node.attrs[name]).ravel()
+    return found
+
+
+def _extra_number(extra: dict[str, Any], name: str) -> float | None:
+    value = extra.get(name)
+    return float(value[0]) if value is not None and value.size == 1 and value.dtype.kind in "fiu" else None
+
+
+def _extra_text(extra: dict[str, Any], name: str) -> str:
+    value = extra.get(name)
+    return _text(value[0]).strip() if value is not None and value.size == 1 else ""
+
+
+def _truth(value: NDArray[Any] | None) -> bool | None:
+    """Yes or no from 0/1, a boolean or a word; None when it is neither."""
+    if value is None or value.size != 1:
+        return None
+    word = _text(value[0]).strip().lower()
+    return {"0": False, "false": False, "off": False, "1": True, "true": True, "on": True}.get(word)
+
+
+def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: float) -> float:
+    """m per stored unit: S O W for fringes, a plain length otherwise (already scaled by Mx)."""
+    if "Unit" not in surface.attrs:
+        raise _missing(surface, "Unit")
+    unit = _text(np.asarray(surface.attrs["Unit"]).ravel()[0])
+    if unit.lower() in _LENGTHS:
+        return _LENGTHS[unit.lower()]
+    if unit.lower() != "fringes":
+        remark = "; the data are no height map" if unit.lower() == "nounits" else ""
+        raise MapFileError(f"{surface.name}: Unit = '{unit}': must be Fringes or a length such as NanoMeters{remark}")
+    scale_factor = _number(surface, "Interferometric Scale Factor")
+    if scale_factor is None:
+        raise _missing(surface, "Interferometric Scale Factor")
+    obliquity = _number(surface, "Obliquity Factor")
+    if obliquity is None:
+        obliquity = _extra_number(extra, "Obliquity")
+    if obliquity is None:
+        obliquity = 1.0
+    return (
+        check_factor("Interferometric Scale Factor", scale_factor)
+        * check_factor("Obliquity Factor", obliquity)
+        * wavelength
+    )
+
+
+def _converter_pitch(surface: h5py.Dataset, name: str) -> float | None:
+    """Parameters[1] of a converter compound (category, unit, parameters), m per pixel."""
+    if name not in surface.attrs:
+        return None
+    converter = np.asarray(surface.attrs[name]).ravel()
+    try:
+        return check_pitch(float(converter[0][2][1]))
+    except (IndexError, TypeError, ValueError):
+        raise MapFileError(f"{surface.name}: attribute '{name}': must hold category, unit and parameters") from None
+
+
+def _pitch(surface: h5py.Dataset, extra: dict[str, Any]) -> float | None:
+    x, y = _converter_pitch(surface, "X Converter"), _converter_pitch(surface, "Y Converter")
+    if x is not None and y is not None and abs(x - y) > _SQUARE_TOLERANCE * x:
+        raise MapFileError(f"{surface.name}: pixels of {x:g} m x {y:g} m: must be square")
+    if x is not None or y is not None:
+        return x if x is not None else y
+    return check_pitch(_extra_number(extra, "Lateral Resolution") or 0.0)
+
+
+def _origin(surface: h5py.Dataset) -> tuple[int, int]:
+    """First two entries of `Coordinates`, the map's corner on the camera; (0, 0) when absent."""
+    try:
+        corner = np.asarray(surface.attrs["Coordinates"]).ravel()[0]
+        return (int(corner[0]), int(corner[1]))
+    except (IndexError, KeyError, TypeError, ValueError):
+        return (0, 0)
+
+
+def _read(surface: h5py.Dataset) -> NDArray[np.float64]:
+    """The stored values as (height, width) float64.
+
+    Raises:
+        MapFileError: the values lie outside the file, or a compression filter is not available.
+    """
+    if surface.external or surface.is_virtual:
+        raise MapFileError(f"{surface.name}: its values lie in another file, which is not followed")
+    properties = surface.id.get_create_plist()
+    for index in range(properties.get_nfilters()):
+        identifier, _flags, _values, name = properties.get_filter(index)
+        if not h5py.h5z.filter_avail(identifier):
+            label = _FILTER_NAMES.get(identifier) or _text(name) or f"number {identifier}"
+            raise MapFileError(
+                f"{surface.name}: compressed with the HDF5 filter {label}, which this h5py lacks; "
+                "save the map uncompressed or as .dat, or install an HDF5 library with that filter"
+            )
+    return surface[()].astype(np.float64)

@@ -1,0 +1,145 @@
+"""A measured surface map, as every reader of this package returns it, and the checks they share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Counts from here up mean "no data" (MetroPro reference, phase data matrix).
+INVALID_COUNTS = 2147483640
+
+#: Counts per fringe by phase resolution code.
+COUNTS_PER_FRINGE = {0: 4096, 1: 32768, 2: 131072}
+
+#: Largest map that is read; the largest cameras of these instruments have 12 million pixels.
+MAX_PIXELS = 2**25
+
+_WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
+_PITCH_RANGE = (1e-9, 0.1)  # m per pixel
+
+
+class MapFileError(Exception):
+    """The file is not a whole, readable surface map; the message names the field, its value and what is allowed."""
+
+
+class NoValidPixelsError(MapFileError):
+    """The file is whole, but every pixel of its map is marked as having no data."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMap:
+    """Surface sag on the pixel grid of an interferometer.
+
+    Attributes:
+        sag: (height, width) float64, m of surface sag (not wavefront); row 0 = top, NaN = no data.
+        wavelength: m.
+        pitch: m per pixel; None when the file does not know it.
+        origin: column and row of the map's top left pixel on the camera.
+        format: "dat", "asc", "xyz" or "datx".
+        instrument: software and system type, as told by the file.
+        serial: serial number of the instrument; "" when not told.
+        part_name: name of the part; "" when not told.
+        time_stamp: Unix time of the measurement, s; None when not told.
+        system_error_subtracted: None when not told. Maps that differ in it must not be mixed.
+        file: where the map was read from.
+        sha256: of the file's bytes, hexadecimal.
+    """
+
+    sag: NDArray[np.float64]
+    wavelength: float
+    pitch: float | None
+    format: str
+    origin: tuple[int, int] = (0, 0)
+    instrument: str = ""
+    serial: str = ""
+    part_name: str = ""
+    time_stamp: float | None = None
+    system_error_subtracted: bool | None = None
+    file: str = ""
+    sha256: str = ""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(height, width), True where there is data."""
+        return np.isfinite(self.sag)
+
+
+def _outside(name: str, value: object, allowed: str) -> MapFileError:
+    return MapFileError(f"{name} = {value}: must be {allowed}")
+
+
+def check_wavelength(wavelength: float) -> float:
+    """Return the wavelength [m] or raise MapFileError."""
+    low, high = _WAVELENGTH_RANGE
+    if not low <= wavelength <= high:
+        raise _outside("wavelength", f"{wavelength:g} m", f"{low:g} to {high:g} m")
+    return wavelength
+
+
+def check_factor(name: str, value: float) -> float:
+    """Return an interferometric scale or obliquity factor or raise MapFileError; both are of the order of one."""
+    if not 0.01 <= value <= 100:
+        raise _outside(name, f"{value:g}", "0.01 to 100")
+    return value
+
+
+def check_pitch(pitch: float) -> float | None:
+    """Return the pitch [m per pixel], None for 0 (unknown), or raise MapFileError."""
+    low, high = _PITCH_RANGE
+    if pitch == 0:
+        return None
+    if not low <= pitch <= high:
+        raise _outside("lateral resolution", f"{pitch:g} m per pixel", f"0 (unknown) or {low:g} to {high:g} m")
+    return pitch
+
+
+def check_size(width: int, height: int) -> int:
+    """Return the number of pixels or raise MapFileError."""
+    if width < 1 or height < 1:
+        raise _outside("phase data", f"{width} x {height} pixels", "at least 1 x 1 (the file holds no map)")
+    if width * height > MAX_PIXELS:
+        raise _outside("phase data", f"{width} x {height} pixels", f"at most {MAX_PIXELS} pixels")
+    return width * height
+
+
+def sag_per_count(
+    scale_factor: float, wavelength: float, obliquity: float, resolution_code: int, data_sign: int
+) -> float:
+    """Return m of surface sag per count: S O W / R, negative when the data are inverted.
+
+    The interferometric scale factor S already turns double-pass fringes into surface height.
+
+    Raises:
+        MapFileError: a factor that makes heights meaningless (0, NaN, absurd) or a code of unknown meaning.
+    """
+    check_factor("interferometric scale factor", scale_factor)
+    check_factor("obliquity factor", obliquity)
+    check_wavelength(wavelength)
+    if resolution_code not in COUNTS_PER_FRINGE:
+        raise _outside("phase resolution code", resolution_code, "0, 1 or 2")
+    if data_sign not in (0, 1):
+        raise _outside("data sign", data_sign, "0 (normal) or 1 (inverted)")
+    sign = -1.0 if data_sign == 1 else 1.0
+    return sign * scale_factor * obliquity * wavelength / COUNTS_PER_FRINGE[resolution_code]
+
+
+def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> NDArray[np.float64]:
+    """Return sag [m] of the same shape, NaN where the counts say "no data".
+
+    Raises:
+        NoValidPixelsError: every pixel is invalid.
+    """
+    invalid = counts >= INVALID_COUNTS
+    if invalid.all():
+        raise no_valid_pixels(counts.shape)
+    sag = counts.astype(np.float64)
+    sag *= metres_per_count
+    sag[invalid] = math.nan
+    return sag
+
+
+def no_valid_pixels(shape: tuple[int, ...]) -> NoValidPixelsError:
+    return NoValidPixelsError(f"none of the {shape[1]} x {shape[0]} pixels is valid: the map holds no data")

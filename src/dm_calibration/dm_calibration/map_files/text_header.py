@@ -1,0 +1,113 @@
+"""The fourteen header lines that ZYGO's text formats `.asc` and `.xyz` share.
+
+Fields are found by line number and position: quotes around texts can be damaged in real files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .surface_map import MapFileError
+
+ASC_TITLE = b"Zygo ASCII Data File"
+XYZ_TITLE = b"Zygo XYZ Data File"
+LINES = 14
+_LONGEST_NUMBER = 40  # characters; bounds the memory that one absurd token can claim
+
+
+@dataclass(frozen=True)
+class TextHeader:
+    """What the header says; lengths in m, sizes in pixels."""
+
+    intensities: int
+    origin: tuple[int, int]
+    width: int
+    height: int
+    part_name: str
+    scale_factor: float
+    wavelength: float
+    obliquity: float
+    lateral_resolution: float
+    time_stamp: float | None
+    system_type: int
+    system_serial: int
+    phase_resolution: int
+    data_sign: int
+    system_error_subtracted: bool | None
+
+
+def is_text(start: bytes) -> bool:
+    """Whether the first bytes of a file are the title of one of the text formats."""
+    return start.lstrip().startswith((ASC_TITLE, XYZ_TITLE))
+
+
+def split_header(content: bytes) -> tuple[TextHeader, bytes]:
+    """Return the header and the body, which begins with the `#` after the header.
+
+    Raises:
+        MapFileError: too few lines, a number missing or unreadable, or no `#` after the header.
+    """
+    lines = content.split(b"\n", LINES)
+    if len(lines) <= LINES:
+        raise MapFileError(f"header: {len(lines)} lines, must be {LINES} and a '#'; the file is truncated")
+    body = lines.pop().lstrip()
+    if not body.startswith(b"#"):
+        raise MapFileError(f"line {LINES + 1}: must be '#', the end of the header")
+    words = [line.decode("latin-1").split() for line in lines]
+
+    def number(line: int, position: int, name: str) -> float:
+        try:
+            return float(words[line - 1][position - 1])
+        except (IndexError, ValueError):
+            raise MapFileError(f"{name}: no number at position {position} of header line {line}") from None
+
+    def integer(line: int, position: int, name: str) -> int:
+        value = number(line, position, name)
+        if not (abs(value) < 2**53 and value == int(value)):
+            raise MapFileError(f"{name} = {value:g} in header line {line}: must be an integer")
+        return int(value)
+
+    time_stamp = integer(8, 8, "time stamp")
+    header = TextHeader(
+        intensities=integer(3, 3, "intensity width")
+        * integer(3, 4, "intensity height")
+        * integer(3, 5, "intensity buckets"),
+        origin=(integer(4, 1, "phase origin x"), integer(4, 2, "phase origin y")),
+        width=integer(4, 3, "phase width"),
+        height=integer(4, 4, "phase height"),
+        part_name=lines[6].decode("latin-1").replace('"', "").strip(),
+        scale_factor=number(8, 2, "interferometric scale factor"),
+        wavelength=number(8, 3, "wavelength"),
+        obliquity=number(8, 5, "obliquity factor"),
+        lateral_resolution=number(8, 7, "lateral resolution"),
+        time_stamp=float(time_stamp) if time_stamp > 0 else None,
+        system_type=integer(9, 3, "system type"),
+        system_serial=integer(9, 5, "system serial number"),
+        phase_resolution=integer(11, 1, "phase resolution code"),
+        data_sign=integer(11, 8, "data sign"),
+        system_error_subtracted={0: False, 1: True}.get(integer(12, 1, "system error subtracted")),
+    )
+    return header, body
+
+
+def numbers(text: bytes, name: str, expected: int, dtype: type) -> NDArray[Any]:
+    """Return the whitespace-separated numbers of `text`, exactly `expected` of them.
+
+    Raises:
+        MapFileError: another count, or something that is no number.
+    """
+    if 2 * expected > len(text) + 1:  # a number takes a digit and a separator
+        raise MapFileError(f"{name}: {len(text)} characters cannot hold {expected} values; the file is truncated")
+    tokens = text.split()
+    if len(tokens) != expected:
+        raise MapFileError(f"{name}: {len(tokens)} values, must be {expected}")
+    if max(map(len, tokens), default=0) > _LONGEST_NUMBER:
+        raise MapFileError(f"{name}: holds a word of more than {_LONGEST_NUMBER} characters, must be numbers")
+    try:
+        return np.array(tokens, dtype=np.bytes_).astype(dtype)
+    except (ValueError, OverflowError) as error:
+        raise MapFileError(f"{name}: {error}") from None

@@ -1,0 +1,18 @@
+"""Names that nobody knows, answered with those that come near."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class UnknownNameError(ValueError):
+    """No such name; the message lists the near ones."""
+
+
+def unknown_name(what: str, name: str, known: Iterable[str]) -> UnknownNameError:
+    """The error for `name`, listing the known names nearest to it, or all of them when there are few."""
+    names = list(known)
+    near = difflib.get_close_matches(name, names, n=4, cutoff=0.5) or (names if len(names) <= 12 else [])
+    hint = f"; did you mean {', '.join(near)}?" if near else f"; known are {', '.join(names[:3])} to {names[-1]}"
+    return UnknownNameError(f"{what} {name!r} is unknown" + (hint if names else ""))

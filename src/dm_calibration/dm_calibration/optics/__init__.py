@@ -1,0 +1,1 @@
+"""Optics of a mirror surface on a circular aperture: polynomials, sampling, fits. Knows no ROS."""

@@ -1,0 +1,146 @@
+"""The circular aperture on a map: found from the valid pixels, or configured."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, optimize
+
+#: Scatter of the rim about the fitted circle, relative to its radius, up to which the region counts as a disc.
+_ROUND = 0.02
+
+#: Fewest rim points for a circle fit.
+_FEWEST_RIM_POINTS = 16
+
+
+class InsufficientDataError(Exception):
+    """Too few valid pixels for what is asked; the message has the figures."""
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """A circle on a map.
+
+    Attributes:
+        centre_x_px: from the left edge, pixel centres at integers.
+        centre_y_px: from the top edge.
+        radius_px: pixels.
+    """
+
+    centre_x_px: float
+    centre_y_px: float
+    radius_px: float
+
+    def squared_distance(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """(height, width): squared distance of each pixel from the centre, in units of the radius."""
+        x = (np.arange(shape[1]) - self.centre_x_px) / self.radius_px
+        y = (np.arange(shape[0]) - self.centre_y_px) / self.radius_px
+        return x**2 + y[:, None] ** 2
+
+    def disc(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """(height, width): True for pixels whose centre lies inside or on the circle."""
+        return self.squared_distance(shape) <= 1
+
+    def pixels(self) -> int:
+        """Number of pixel centres inside or on the circle, counted also where the circle leaves the map."""
+        rows = np.arange(
+            math.ceil(self.centre_y_px - self.radius_px), math.floor(self.centre_y_px + self.radius_px) + 1
+        )
+        half = np.sqrt(np.maximum(self.radius_px**2 - (rows - self.centre_y_px) ** 2, 0))
+        columns = np.floor(self.centre_x_px + half) - np.ceil(self.centre_x_px - half) + 1
+        return int(columns.sum())
+
+
+def configured_aperture(
+    shape: tuple[int, int], pitch: float, radius: float, centre_x: float = 0.0, centre_y: float = 0.0
+) -> Aperture:
+    """Aperture from lengths in m: radius, and centre from the map's centre (x right, y up)."""
+    return Aperture(
+        (shape[1] - 1) / 2 + centre_x / pitch,
+        (shape[0] - 1) / 2 - centre_y / pitch,
+        radius / pitch,
+    )
+
+
+def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
+    """Find the aperture that the valid pixels fill.
+
+    The largest connected region of valid pixels, its holes filled, is taken for the mirror. A circle is fitted to its
+    rim (halfway between valid and invalid neighbours) with a loss that dropouts and bumps at the rim cannot pull; where
+    the map's border cuts the region off there is no rim. A region that is not round (a rectangular field, say) gets
+    its largest inscribed circle instead.
+
+    Args:
+        valid: (height, width), True where there is data.
+
+    Raises:
+        InsufficientDataError: no valid pixels to speak of.
+    """
+    region = _filled_largest_region(valid)
+    x, y = _rim(region)
+    if len(x) >= _FEWEST_RIM_POINTS:
+        circle, scatter = _fit_circle(x, y)
+        if scatter <= _ROUND * circle.radius_px and _is_disc(region, circle):
+            return circle
+    return _inscribed_circle(region)
+
+
+def _filled_largest_region(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    labels, count = ndimage.label(valid)
+    if count == 0:
+        raise InsufficientDataError("the map has no valid pixel, so no aperture can be found")
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    region = labels == sizes.argmax()
+    # Holes are the parts outside the region that do not touch the border; much quicker than binary_fill_holes.
+    gaps, _count = ndimage.label(np.pad(~region, 1, constant_values=True))
+    return gaps[1:-1, 1:-1] != gaps[0, 0]
+
+
+def _rim(region: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points halfway between a pixel of the region and a neighbour outside it, in pixels."""
+    row_x, column_x = np.nonzero(region[:, 1:] != region[:, :-1])
+    row_y, column_y = np.nonzero(region[1:] != region[:-1])
+    return (
+        np.concatenate([column_x + 0.5, column_y]).astype(float),
+        np.concatenate([row_x, row_y + 0.5]).astype(float),
+    )
+
+
+def _fit_circle(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Aperture, float]:
+    """Robust circle through points, and the scatter of the points about it (median absolute distance, pixels)."""
+    # Algebraic fit (Kasa) as the start, then geometric distances under a loss that flattens first beyond 5 % of the
+    # radius, then beyond one pixel.
+    centre = np.array([x.mean(), y.mean()])
+    dx, dy = x - centre[0], y - centre[1]
+    a, b, c = np.linalg.lstsq(np.column_stack([2 * dx, 2 * dy, np.ones_like(dx)]), dx**2 + dy**2, rcond=None)[0]
+    solution = np.array([a, b, math.sqrt(max(c + a**2 + b**2, 1.0))])
+    for scale in (max(0.05 * solution[2], 1.0), 1.0):
+        solution = optimize.least_squares(
+            lambda p: np.hypot(dx - p[0], dy - p[1]) - p[2], solution, loss="cauchy", f_scale=scale
+        ).x
+    distance = np.abs(np.hypot(dx - solution[0], dy - solution[1]) - solution[2])
+    circle = Aperture(float(centre[0] + solution[0]), float(centre[1] + solution[1]), float(abs(solution[2])))
+    return circle, float(np.median(distance))
+
+
+def _is_disc(region: NDArray[np.bool_], circle: Aperture) -> bool:
+    """Whether region and circle cover about the same pixels."""
+    disc = circle.disc(region.shape)
+    union = np.count_nonzero(disc | region)
+    return bool(np.count_nonzero(disc & region) >= 0.8 * union)
+
+
+def _inscribed_circle(region: NDArray[np.bool_]) -> Aperture:
+    distance = ndimage.distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
+    radius = distance.max()
+    # A rectangle has a whole line of best centres: take their middle.
+    rows, columns = np.nonzero(distance >= radius - 0.5)
+    row, column = rows.mean(), columns.mean()
+    if distance[round(row), round(column)] < radius - 1:  # several separate best places
+        row, column = np.unravel_index(distance.argmax(), distance.shape)
+    # The distance reaches to the centre of the first pixel outside; the rim lies half a pixel before it.
+    return Aperture(float(column), float(row), float(max(distance[round(row), round(column)] - 0.5, 0.5)))

@@ -1,0 +1,201 @@
+"""Least-squares fit of the 21 Zernike terms to every valid pixel of a map, through moments.
+
+On a Cartesian grid the moments of a map Z against products of Legendre polynomials are two thin matrix products,
+L^T Z L. The 21 products P_a(x) P_b(y) with a + b <= 5 span the same polynomials as the 21 Zernike terms, and their
+masked Gram matrix follows from moments of the mask to degree 10, because a product of two Legendre polynomials is a
+short sum of others. Solving the 21 x 21 system gives the exact least-squares answer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+from scipy import linalg
+
+from .aperture import Aperture, InsufficientDataError
+from .zernike import MAX_ORDER, TERM_RMS, TERMS, basis
+
+Array = NDArray[np.float64]
+
+#: Exponents (a, b) of the products P_a(x) P_b(y).
+_PRODUCTS = [(a, b) for a in range(MAX_ORDER + 1) for b in range(MAX_ORDER + 1 - a)]
+_A = np.array([a for a, _b in _PRODUCTS])
+_B = np.array([b for _a, b in _PRODUCTS])
+
+#: Smallest over largest eigenvalue of the normalised Gram matrix below which the pixels cannot tell the terms apart.
+_SINGULAR = 1e-8
+
+#: Share of the map's energy below which the residual is computed pixel by pixel: the difference of two large sums
+#: would have lost its digits.
+_CANCELLATION = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class MapFit:
+    """Result of a fit, in the unit of the sag.
+
+    Attributes:
+        coefficients: (21,), Born & Wolf.
+        sigma: (21,), one standard deviation each, estimated from the residual as if it were independent from pixel to
+            pixel. Print-through and air turbulence are correlated, so the true uncertainty is larger.
+        residual_rms: what the terms leave unexplained over the valid pixels.
+        valid_fraction: valid pixels / pixels inside the aperture.
+        valid_pixels: number of pixels used.
+    """
+
+    coefficients: Array
+    sigma: Array
+    residual_rms: float
+    valid_fraction: float
+    valid_pixels: int
+
+
+@cache
+def _linearisation() -> Array:
+    """(11, 6, 6): coefficients c of P_a P_b = sum over k of c[k, a, b] P_k."""
+    degree = MAX_ORDER + 1
+    result = np.zeros((2 * MAX_ORDER + 1, degree, degree))
+    unit = np.eye(degree)
+    for a in range(degree):
+        for b in range(degree):
+            product = legendre.legmul(unit[a], unit[b])
+            result[: len(product), a, b] = product
+    return result
+
+
+@cache
+def _zernike_from_products() -> Array:
+    """(21, 21) matrix T with Zernike = T times products, exact for polynomials of this degree."""
+    nodes = np.cos(np.pi * (np.arange(12) + 0.5) / 12)
+    x, y = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
+    products = legendre.legvander(x, MAX_ORDER)[:, _A] * legendre.legvander(y, MAX_ORDER)[:, _B]
+    return np.linalg.lstsq(products, basis(x, y), rcond=None)[0].T
+
+
+class MapFitter:
+    """Fits maps that share one mask of valid pixels and one aperture.
+
+    Making it costs a few times as much as a fit: keep it as long as the mask repeats.
+    """
+
+    def __init__(self, mask: NDArray[np.bool_], centre_x_px: float, centre_y_px: float, radius_px: float) -> None:
+        """Prepare the Gram matrix.
+
+        Args:
+            mask: (height, width), True where there is data; pixels outside the aperture are ignored.
+            centre_x_px, centre_y_px: from the left and top pixel's centre.
+            radius_px: normalisation radius of the terms.
+
+        Raises:
+            InsufficientDataError: fewer valid pixels than terms, or so placed that they cannot tell the terms apart.
+        """
+        self.aperture = Aperture(centre_x_px, centre_y_px, radius_px)
+        self._shape = mask.shape
+        self._rows = _span(centre_y_px, radius_px, mask.shape[0])
+        self._columns = _span(centre_x_px, radius_px, mask.shape[1])
+        self._disc = self.aperture.disc(mask.shape)[self._rows, self._columns]
+        self._used = mask[self._rows, self._columns] & self._disc
+        self._unused = np.flatnonzero(~self._used)
+        self.valid_pixels = int(np.count_nonzero(self._used))
+        self.valid_fraction = self.valid_pixels / max(self.aperture.pixels(), 1)
+        if self.valid_pixels < len(TERMS):
+            raise InsufficientDataError(
+                f"{self.valid_pixels} valid pixels inside the aperture: {len(TERMS)} terms need at least {len(TERMS)}"
+            )
+        x = (np.arange(mask.shape[1])[self._columns] - centre_x_px) / radius_px
+        y = (centre_y_px - np.arange(mask.shape[0])[self._rows]) / radius_px
+        self._legendre_x = np.ascontiguousarray(legendre.legvander(x, 2 * MAX_ORDER))
+        self._legendre_y = np.ascontiguousarray(legendre.legvander(y, 2 * MAX_ORDER))
+        self._workspace = np.empty(self._used.shape)
+        self._solve_with(self._gram())
+
+    def _gram(self) -> Array:
+        """Masked Gram matrix of the Zernike terms."""
+        moments = self._legendre_y.T @ (self._used.astype(float) @ self._legendre_x)  # [degree of y, degree of x]
+        c = _linearisation()
+        in_x = c[:, _A[:, None], _A]  # (11, 21, 21)
+        in_y = c[:, _B[:, None], _B]
+        products = np.einsum("kij,lij,lk->ij", in_x, in_y, moments, optimize=True)
+        transform = _zernike_from_products()
+        return transform @ products @ transform.T
+
+    def _solve_with(self, gram: Array) -> None:
+        scale = TERM_RMS * math.sqrt(self.valid_pixels)  # a full disc gives the unit matrix
+        eigenvalues = np.linalg.eigvalsh(gram / np.outer(scale, scale))
+        if eigenvalues[0] < _SINGULAR * eigenvalues[-1]:
+            raise InsufficientDataError(
+                f"{self.valid_pixels} valid pixels ({100 * self.valid_fraction:.1f} % of the aperture) are placed so "
+                f"that they cannot tell the {len(TERMS)} terms apart"
+            )
+        self._scale = scale
+        self._factor = linalg.cho_factor(gram / np.outer(scale, scale))
+        inverse = linalg.cho_solve(self._factor, np.eye(len(TERMS)))
+        self._sigma_per_pixel_noise = np.sqrt(np.diag(inverse)) / scale
+        # The thin bases of the fit itself: moments[b, a] against P_b(y) P_a(x).
+        self._thin_x = np.ascontiguousarray(self._legendre_x[:, : MAX_ORDER + 1])
+        self._thin_y = np.ascontiguousarray(self._legendre_y[:, : MAX_ORDER + 1])
+
+    def fits(self, mask: NDArray[np.bool_], aperture: Aperture) -> bool:
+        """Whether this fitter was made for that aperture and mask (as far as it lies inside the aperture)."""
+        if aperture != self.aperture or mask.shape != self._shape:
+            return False
+        return bool(np.array_equal(mask[self._rows, self._columns] & self._disc, self._used))
+
+    def fit(self, sag: Array) -> MapFit:
+        """Fit the terms to a map.
+
+        Args:
+            sag: (height, width), finite wherever the mask is True.
+
+        Raises:
+            ValueError: another shape, or a value that is not finite under the mask.
+        """
+        if sag.shape != self._shape:
+            raise ValueError(f"map of shape {sag.shape}: the mask has {self._shape}")
+        work = self._workspace
+        work[...] = sag[self._rows, self._columns]
+        work.ravel()[self._unused] = 0
+        energy = float(np.vdot(work, work))
+        if not math.isfinite(energy):
+            missing = np.count_nonzero(~np.isfinite(work))
+            raise ValueError(f"the map has {missing} pixels without data where the mask says there are")
+        moments = (self._thin_y.T @ (work @ self._thin_x))[_B, _A]
+        right = _zernike_from_products() @ moments
+        coefficients = linalg.cho_solve(self._factor, right / self._scale) / self._scale
+        squares = energy - float(coefficients @ right)
+        if squares < _CANCELLATION * energy:
+            work -= self._evaluate(coefficients)
+            work.ravel()[self._unused] = 0
+            squares = float(np.vdot(work, work))
+        squares = max(squares, 0.0)
+        freedom = max(self.valid_pixels - len(TERMS), 1)
+        return MapFit(
+            coefficients=coefficients,
+            sigma=self._sigma_per_pixel_noise * math.sqrt(squares / freedom),
+            residual_rms=math.sqrt(squares / self.valid_pixels),
+            valid_fraction=self.valid_fraction,
+            valid_pixels=self.valid_pixels,
+        )
+
+    def residual(self, sag: Array, coefficients: Array) -> Array:
+        """(height, width): the map minus the sag of these coefficients; NaN outside mask and aperture."""
+        result = np.full(self._shape, np.nan)
+        inner = sag[self._rows, self._columns] - self._evaluate(coefficients)
+        np.copyto(result[self._rows, self._columns], inner, where=self._used)
+        return result
+
+    def _evaluate(self, coefficients: Array) -> Array:
+        """Sag of these coefficients on the square around the aperture."""
+        in_products = np.zeros((MAX_ORDER + 1, MAX_ORDER + 1))
+        in_products[_B, _A] = coefficients @ _zernike_from_products()
+        return self._thin_y @ in_products @ self._thin_x.T
+
+
+def _span(centre: float, radius: float, size: int) -> slice:
+    """Pixels of one axis that the circle reaches."""
+    return slice(max(math.ceil(centre - radius), 0), max(min(math.floor(centre + radius) + 1, size), 0))

@@ -1,0 +1,149 @@
+"""The 21 Zernike terms to order 5 in the convention of Born & Wolf, and converters to Noll and OSA/ANSI.
+
+Born & Wolf (Principles of Optics, section 9.2.1): peak-normalised, every term is 1 at most on the unit disc. The order
+is the paper's: n rising, m rising, cosine before sine. x points right, y up, the angle counts from x to y. Coefficients
+have the unit of the sag they describe (m).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MAX_ORDER = 5
+
+#: Indices of piston and the two tilts, which no interferometer can attribute to the mirror.
+PISTON_TILT = (0, 1, 2)
+
+
+class Term(NamedTuple):
+    """R_n^m(r) cos(m theta) or R_n^m(r) sin(m theta)."""
+
+    n: int
+    m: int
+    kind: str  # "" for m = 0, else "cos" or "sin"
+
+    @property
+    def name(self) -> str:
+        """For example `Z_2^0` or `Z_2^2 cos`."""
+        return f"Z_{self.n}^{self.m} {self.kind}".strip()
+
+    @property
+    def rms(self) -> float:
+        """Root mean square over the unit disc of the peak-normalised term."""
+        return 1 / math.sqrt((self.n + 1) * (1 if self.m == 0 else 2))
+
+    @property
+    def noll_index(self) -> int:
+        """Noll's index j = 1, 2, 3, ... (J. Opt. Soc. Am. 66, 207, 1976): cosine terms are even, sine terms odd."""
+        first = self.n * (self.n + 1) // 2 + self.m  # of the pair; the only one for m = 0
+        if self.m == 0:
+            return first + 1
+        return first + (first % 2 != (0 if self.kind == "cos" else 1))
+
+    @property
+    def ansi_index(self) -> int:
+        """OSA/ANSI index j = 0, 1, 2, ... (ANSI Z80.28): sine terms have negative azimuthal order."""
+        azimuthal = -self.m if self.kind == "sin" else self.m
+        return (self.n * (self.n + 2) + azimuthal) // 2
+
+
+TERMS: tuple[Term, ...] = tuple(
+    Term(n, m, kind)
+    for n in range(MAX_ORDER + 1)
+    for m in range(n % 2, n + 1, 2)
+    for kind in (("",) if m == 0 else ("cos", "sin"))
+)
+
+NAMES: tuple[str, ...] = tuple(term.name for term in TERMS)
+
+#: Root mean square of each term over the unit disc.
+TERM_RMS: NDArray[np.float64] = np.array([term.rms for term in TERMS])
+TERM_RMS.flags.writeable = False
+
+
+def index_of(n: int, m: int, kind: str = "") -> int:
+    """Return the position of a term in TERMS; ValueError when there is none."""
+    return TERMS.index(Term(n, m, kind))
+
+
+def _radial_factor(n: int, m: int) -> list[float]:
+    """Coefficients of P in R_n^m(r) = r^m P(r^2), lowest power first."""
+    top = (n - m) // 2
+    return [(-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, top - s) for s in range(top, -1, -1)]
+
+
+def basis(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+    """Evaluate all terms.
+
+    Args:
+        x, y: of any one shape S, in units of the aperture's radius. Outside the unit disc the polynomials continue.
+
+    Returns:
+        S + (21,), in the order of TERMS.
+    """
+    z = np.asarray(x, dtype=float) + 1j * np.asarray(y, dtype=float)
+    r2 = z.real**2 + z.imag**2
+    result = np.empty((*z.shape, len(TERMS)))
+    angular = [z**m for m in range(MAX_ORDER + 1)]  # r^m (cos m theta + i sin m theta)
+    for k, (n, m, kind) in enumerate(TERMS):
+        radial = np.polynomial.polynomial.polyval(r2, _radial_factor(n, m))
+        result[..., k] = radial * (angular[m].imag if kind == "sin" else angular[m].real)
+    return result
+
+
+def rms_of(coefficients: ArrayLike, exclude: Collection[int] = PISTON_TILT) -> NDArray[np.float64] | float:
+    """Root mean square over the full disc of the sag with these Born & Wolf coefficients.
+
+    Args:
+        coefficients: (..., 21).
+        exclude: indices of terms that do not count; piston and tilt unless told otherwise.
+
+    Returns:
+        (...), in the unit of the coefficients.
+    """
+    weights = TERM_RMS.copy()
+    weights[list(exclude)] = 0
+    return np.sqrt(((_checked(coefficients) * weights) ** 2).sum(axis=-1))
+
+
+def _checked(coefficients: ArrayLike) -> NDArray[np.float64]:
+    values = np.asarray(coefficients, dtype=float)
+    if values.ndim < 1 or values.shape[-1] != len(TERMS):
+        raise ValueError(f"coefficients of shape {values.shape}: the last axis must have {len(TERMS)} terms")
+    return values
+
+
+_FROM_NOLL = np.array([term.noll_index - 1 for term in TERMS])
+_FROM_ANSI = np.array([term.ansi_index for term in TERMS])
+
+
+def born_wolf_to_noll(coefficients: ArrayLike) -> NDArray[np.float64]:
+    """(..., 21) peak-normalised in the paper's order to (..., 21) rms-normalised, Noll index 1 to 21."""
+    return _to_rms_normalised(coefficients, _FROM_NOLL)
+
+
+def noll_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
+    """Inverse of :func:`born_wolf_to_noll`."""
+    return _checked(coefficients)[..., _FROM_NOLL] / TERM_RMS
+
+
+def born_wolf_to_ansi(coefficients: ArrayLike) -> NDArray[np.float64]:
+    """(..., 21) peak-normalised in the paper's order to (..., 21) rms-normalised, OSA/ANSI index 0 to 20."""
+    return _to_rms_normalised(coefficients, _FROM_ANSI)
+
+
+def ansi_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
+    """Inverse of :func:`born_wolf_to_ansi`."""
+    return _checked(coefficients)[..., _FROM_ANSI] / TERM_RMS
+
+
+def _to_rms_normalised(coefficients: ArrayLike, position: NDArray[np.intp]) -> NDArray[np.float64]:
+    values = _checked(coefficients)
+    result = np.empty_like(values)
+    result[..., position] = values * TERM_RMS
+    return result

@@ -1,0 +1,174 @@
+"""What a calibration measures, in order: degauss, reference frames, pokes, surfaces of Table 1."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence import surfaces
+from dm_calibration.influence.mirror import Mirror, scale_to_limits
+
+Floats = NDArray[np.float64]
+
+
+class PlanKind(IntEnum):
+    """What to measure; the values are those of dm_msgs/Calibrate."""
+
+    FULL = 0
+    POKES = 1
+    SURFACES = 2
+    POKE_CHECK = 3
+
+
+class StepKind(Enum):
+    """What a step does; the measured kinds are those of :mod:`dm_calibration.influence.maps`."""
+
+    DEGAUSS = "degauss"
+    REFERENCE = "reference"
+    POKE = "poke"
+    SURFACE = "surface"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a plan.
+
+    Attributes:
+        label: unique in the plan.
+        kind: see StepKind.
+        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes.
+        nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
+    """
+
+    label: str
+    kind: StepKind
+    signals: Floats | None = None
+    nominal: Floats | None = None
+
+    @property
+    def needs_model(self) -> bool:
+        """Whether the signals must be solved from an influence function first."""
+        return self.kind is StepKind.SURFACE and self.signals is None
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """How to measure.
+
+    Attributes:
+        poke_amplitude: half-swing of a push-pull poke, normalised.
+        reference_every: steps between two reference frames.
+        surfaces: names of Table 1; empty = all.
+        degauss: whether to start with a degauss.
+    """
+
+    poke_amplitude: float = 0.5
+    reference_every: int = 10
+    surfaces: Sequence[str] = ()
+    degauss: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.poke_amplitude <= 1.0:
+            raise ValueError(f"poke_amplitude = {self.poke_amplitude}: must be above 0, at most 1")
+        if self.reference_every < 1:
+            raise ValueError(f"reference_every = {self.reference_every}: must be at least 1")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The steps in order, and what differs from what was asked, in words."""
+
+    kind: PlanKind
+    steps: tuple[Step, ...]
+    remarks: tuple[str, ...] = field(default=())
+
+    @property
+    def needs_model(self) -> bool:
+        return any(step.needs_model for step in self.steps)
+
+
+def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None) -> Plan:
+    """The plan of one calibration run.
+
+    Raises:
+        UnknownNameError: a surface that Table 1 does not have, naming the near ones.
+        ValueError: a surface asked for by name that this mirror cannot have, or an option out of its range.
+    """
+    options = options or PlanOptions()
+    remarks: list[str] = []
+    states: list[Step] = []
+    names = surfaces.check_names(options.surfaces)
+    if kind is not PlanKind.SURFACES:
+        states += _pokes(mirror, options.poke_amplitude, remarks)
+    if kind in (PlanKind.FULL, PlanKind.SURFACES):
+        states += _surfaces(names, mirror, bool(options.surfaces), remarks)
+    steps = _with_references(states, mirror, options.reference_every)
+    if options.degauss:
+        steps.insert(0, Step("degauss", StepKind.DEGAUSS))
+    return Plan(kind, tuple(steps), tuple(remarks))
+
+
+def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple[Step, str]:
+    """`step` with the signals and nominal coefficients that `model` gives it, and a remark."""
+    surface = surfaces.model_surface(step.label, model, mirror)
+    return Step(step.label, step.kind, surface.signals, surface.nominal), surface.remark
+
+
+def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
+    """Push and pull of each actuator about mid range, pushed first; the two directions follow each other at once."""
+    half_range = 0.5 * (mirror.signal_max - mirror.signal_min)
+    steps = []
+    smallest = 1.0
+    for k in range(mirror.actuators):
+        for sign, mark in ((1.0, "+"), (-1.0, "-")):
+            signals = mirror.rest
+            signals[k] += sign * amplitude * half_range
+            # A poke scaled about the mean would move every actuator; shrinking the poke keeps the others at rest.
+            _, factor = scale_to_limits(signals, mirror)
+            if factor < 1.0:  # and a hair less: the driver checks the limit exactly
+                signals[k] = mirror.rest[k] + factor * (1.0 - 1e-12) * (signals[k] - mirror.rest[k])
+            smallest = min(smallest, factor)
+            steps.append(Step(f"poke{mark}{k + 1:02d}", StepKind.POKE, signals))
+    if smallest < 1.0:
+        remarks.append(f"pokes reduced to {smallest:.0%} of +-{amplitude:g} to keep the mirror's limits")
+    return steps
+
+
+def _surfaces(names: Sequence[str], mirror: Mirror, asked: bool, remarks: list[str]) -> list[Step]:
+    steps = []
+    for name in names:
+        if reason := surfaces.missing_on(name, mirror):
+            if asked:
+                raise ValueError(f"surface {reason}")
+            remarks.append(f"left out: {reason}")
+        elif name in surfaces.MODEL_NAMES:
+            steps.append(Step(name, StepKind.SURFACE))
+        else:
+            surface = surfaces.signal_surface(name, mirror)
+            steps.append(Step(name, StepKind.SURFACE, surface.signals))
+            if surface.remark:
+                remarks.append(surface.remark)
+    if mirror.actuators > surfaces.TABLE_CHANNELS and not asked:
+        remarks.append(f"Table 1 has a surface of their own for channels 1 to {surfaces.TABLE_CHANNELS} only")
+    return steps
+
+
+def _with_references(states: Sequence[Step], mirror: Mirror, every: int) -> list[Step]:
+    """`states` with a reference frame before, after each `every` steps, and after the last."""
+    steps: list[Step] = []
+    frames = 0
+
+    def reference() -> Step:
+        nonlocal frames
+        frames += 1
+        return Step(f"reference {frames}", StepKind.REFERENCE, mirror.rest)
+
+    for i, state in enumerate(states):
+        if i % every == 0:
+            steps.append(reference())
+        steps.append(state)
+    return [*steps, reference()]

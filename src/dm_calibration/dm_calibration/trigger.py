@@ -1,0 +1,81 @@
+"""Running the command that makes the interferometer take a map. Knows no ROS."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO
+
+#: In an argument of the command: the file the instrument is expected to write.
+PLACEHOLDER = "{path}"
+
+_OUTPUT_SHOWN = 500  # characters of the command's output in an error message
+_POLL_S = 0.05
+
+
+class TriggerError(Exception):
+    """The command could not be started, failed, or took too long; the message has the end of its output."""
+
+
+def run_trigger(
+    command: Sequence[str], output: Path | None, timeout_s: float, cancelled: threading.Event | None = None
+) -> None:
+    """Run the command (an argument list; no shell is involved) and wait for its end.
+
+    The command runs in its own process group, which is killed as a whole on time-out or cancellation.
+
+    Args:
+        output: replaces PLACEHOLDER in the arguments.
+
+    Raises:
+        TriggerError: it cannot be started, ends with a status other than 0, or does not end in time.
+    """
+    arguments = [argument.replace(PLACEHOLDER, str(output)) for argument in command]
+    # Output goes to a file, not a pipe: nothing it leaves running can keep this call waiting.
+    with tempfile.TemporaryFile() as log:
+        try:
+            process = subprocess.Popen(
+                arguments, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        except (OSError, ValueError) as error:
+            raise TriggerError(f"trigger command {arguments[0]!r} cannot be started: {error}") from error
+        deadline = time.monotonic() + timeout_s
+        try:
+            while True:
+                try:
+                    status = process.wait(min(_POLL_S, max(deadline - time.monotonic(), 0.001)))
+                    break
+                except subprocess.TimeoutExpired:
+                    if cancelled is not None and cancelled.is_set():
+                        raise TriggerError(f"trigger command {arguments[0]!r} was cancelled") from None
+                    if time.monotonic() >= deadline:
+                        raise TriggerError(
+                            f"trigger command {arguments[0]!r} did not end within {timeout_s:g} s{_tail(log)}"
+                        ) from None
+        finally:
+            _kill(process)
+        if status != 0:
+            raise TriggerError(f"trigger command {arguments[0]!r} ended with status {status}{_tail(log)}")
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End a command that still runs, with all it started."""
+    if process.poll() is None:
+        try:
+            os.killpg(process.pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+        process.wait()
+
+
+def _tail(log: IO[bytes]) -> str:
+    size = log.seek(0, os.SEEK_END)
+    log.seek(max(size - 4 * _OUTPUT_SHOWN, 0))
+    text = log.read().decode(errors="replace").strip()
+    return f"; its output ends: {text[-_OUTPUT_SHOWN:]}" if text else ""

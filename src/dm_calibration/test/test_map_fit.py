@@ -1,0 +1,196 @@
+"""The moment fit against plain least squares over the pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dm_calibration.optics.aperture import Aperture, InsufficientDataError
+from dm_calibration.optics.map_fit import MapFitter
+from dm_calibration.optics.orientation import Orientation
+from dm_calibration.optics.piston_tilt import fit_plane, remove_piston_tilt
+from dm_calibration.optics.regions import ConcentricRegions
+from dm_calibration.optics.zernike import basis
+
+
+def unit_coordinates(shape: tuple[int, int], x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return (columns - x) / radius, (y - rows) / radius
+
+
+def plain_fit(sag: np.ndarray, x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coefficients, residual and (A^T A)^-1 by least squares over the valid pixels."""
+    u, v = unit_coordinates(sag.shape, x, y, radius)
+    used = (u**2 + v**2 <= 1) & np.isfinite(sag)
+    terms = basis(u[used], v[used])
+    coefficients = np.linalg.lstsq(terms, sag[used], rcond=None)[0]
+    return coefficients, sag[used] - terms @ coefficients, np.linalg.inv(terms.T @ terms)
+
+
+def rough_map(shape: tuple[int, int], seed: int, dropout: float = 0.05) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    u, v = unit_coordinates(shape, shape[1] / 2, shape[0] / 2, max(shape) / 2)
+    sag = basis(u, v) @ rng.normal(size=21) * 1e-6 + 40e-9 * np.cos(9 * u + 3 * v) + rng.normal(size=shape) * 1e-9
+    return np.where(rng.random(shape) < dropout, np.nan, sag)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    x=st.floats(40, 80),
+    y=st.floats(30, 70),
+    radius=st.floats(15, 60),
+    dropout=st.floats(0, 0.6),
+)
+def test_equals_plain_least_squares(seed: int, x: float, y: float, radius: float, dropout: float) -> None:
+    sag = rough_map((100, 120), seed, dropout)
+    expected, residual, inverse = plain_fit(sag, x, y, radius)
+    found = MapFitter(np.isfinite(sag), x, y, radius).fit(sag)
+    np.testing.assert_allclose(found.coefficients, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    assert found.residual_rms == pytest.approx(np.sqrt((residual**2).mean()), rel=1e-6)
+    noise = np.sqrt((residual**2).sum() / (residual.size - 21))
+    np.testing.assert_allclose(found.sigma, noise * np.sqrt(np.diag(inverse)), rtol=1e-6)
+    assert found.valid_pixels == residual.size
+    assert found.valid_fraction == residual.size / Aperture(x, y, radius).pixels()
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-3])
+def test_exact_surface_leaves_no_residual(offset: float) -> None:
+    u, v = unit_coordinates((200, 200), 99.5, 99.5, 100)
+    coefficients = np.linspace(-1e-6, 1e-6, 21)
+    coefficients[0] += offset
+    sag = basis(u, v) @ coefficients
+    found = MapFitter(np.ones(sag.shape, dtype=bool), 99.5, 99.5, 100).fit(sag)
+    np.testing.assert_allclose(found.coefficients, coefficients, atol=1e-12 * max(offset, 1e-6))
+    assert found.residual_rms < 1e-12 * max(offset, 1e-6)
+
+
+def test_small_residual_under_a_large_piston_keeps_its_digits() -> None:
+    rng = np.random.default_rng(0)
+    sag = 5e-3 + rng.normal(size=(150, 150)) * 1e-9  # one part in five million
+    _coefficients, residual, _inverse = plain_fit(sag - 5e-3, 74.5, 74.5, 75)
+    found = MapFitter(np.ones(sag.shape, dtype=bool), 74.5, 74.5, 75).fit(sag)
+    assert found.residual_rms == pytest.approx(np.sqrt((residual**2).mean()), rel=1e-6)
+
+
+def test_sigma_covers_the_scatter_of_repeated_fits() -> None:
+    rng = np.random.default_rng(5)
+    fitter = MapFitter(np.ones((60, 60), dtype=bool), 29.5, 29.5, 30)
+    fits = [fitter.fit(rng.normal(size=(60, 60))) for _ in range(200)]
+    scatter = np.std([fit.coefficients for fit in fits], axis=0)
+    np.testing.assert_allclose(scatter / fits[0].sigma, 1, atol=0.25)  # 5 standard errors of a scatter of 200
+
+
+def test_workspace_keeps_nothing_from_one_map_to_the_next() -> None:
+    sag = rough_map((90, 90), 1)
+    fitter = MapFitter(np.isfinite(sag), 44.5, 44.5, 45)
+    first = fitter.fit(sag)
+    fitter.fit(np.where(np.isfinite(sag), sag * 3 + 1e-6, 77.0))
+    np.testing.assert_array_equal(fitter.fit(sag).coefficients, first.coefficients)
+
+
+def test_too_few_or_badly_placed_pixels_are_refused() -> None:
+    mask = np.zeros((50, 50), dtype=bool)
+    mask[25, 10:30] = True
+    with pytest.raises(InsufficientDataError, match=r"20 valid pixels .* need at least 21"):
+        MapFitter(mask, 24.5, 24.5, 25)
+    mask[25] = True  # enough pixels, but all on one line
+    with pytest.raises(InsufficientDataError, match="cannot tell the 21 terms apart"):
+        MapFitter(mask, 24.5, 24.5, 25)
+    with pytest.raises(InsufficientDataError, match="0 valid pixels"):
+        MapFitter(np.ones((50, 50), dtype=bool), 500, 500, 25)
+
+
+def test_value_missing_under_the_mask_is_refused_and_the_fitter_goes_on() -> None:
+    sag = rough_map((60, 60), 2, dropout=0)
+    fitter = MapFitter(np.isfinite(sag), 29.5, 29.5, 30)
+    good = fitter.fit(sag)
+    hole = sag.copy()
+    hole[30, 30] = np.nan
+    with pytest.raises(ValueError, match="1 pixels without data"):
+        fitter.fit(hole)
+    with pytest.raises(ValueError, match="shape"):
+        fitter.fit(sag[:50])
+    np.testing.assert_array_equal(fitter.fit(sag).coefficients, good.coefficients)
+
+
+def test_fitter_knows_what_it_was_made_for() -> None:
+    mask = np.isfinite(rough_map((60, 60), 3))
+    fitter = MapFitter(mask, 29.5, 29.5, 20)
+    assert fitter.fits(mask, Aperture(29.5, 29.5, 20))
+    outside = mask.copy()
+    outside[0, 0] ^= True  # beyond the aperture
+    assert fitter.fits(outside, Aperture(29.5, 29.5, 20))
+    inside = mask.copy()
+    inside[30, 30] ^= True
+    assert not fitter.fits(inside, Aperture(29.5, 29.5, 20))
+    assert not fitter.fits(mask, Aperture(29.5, 29.5, 21))
+
+
+def test_residual_map_and_its_regions() -> None:
+    sag = rough_map((80, 80), 4)
+    aperture = Aperture(40.2, 39.1, 35.0)
+    fitter = MapFitter(np.isfinite(sag), aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
+    residual = fitter.residual(sag, fitter.fit(sag).coefficients)
+    _coefficients, expected, _inverse = plain_fit(sag, 40.2, 39.1, 35.0)
+    np.testing.assert_allclose(residual[np.isfinite(residual)], expected, atol=1e-15)
+    found = ConcentricRegions((80, 80), aperture).rms(residual)
+    u, v = unit_coordinates((80, 80), 40.2, 39.1, 35.0)
+    for share, rms in zip(np.arange(1, 11) / 10, found, strict=True):
+        inside = (u**2 + v**2 <= share) & np.isfinite(residual)
+        assert rms == pytest.approx(np.sqrt((residual[inside] ** 2).mean()), rel=1e-9)
+
+
+def test_regions_have_the_stated_share_of_the_area() -> None:
+    aperture = Aperture(149.5, 149.5, 150)
+    step = np.where(aperture.squared_distance((300, 300)) <= 0.3, 1.0, 0.0)
+    found = ConcentricRegions((300, 300), aperture).rms(step)
+    np.testing.assert_allclose(found**2, np.minimum(1, 0.3 / (np.arange(1, 11) / 10)), rtol=2e-3)
+    assert np.isnan(ConcentricRegions((300, 300), aperture).rms(np.full((300, 300), np.nan))).all()
+    with pytest.raises(ValueError, match="must rise within 0 to 1"):
+        ConcentricRegions((3, 3), aperture, [0.5, 0.4])
+
+
+def test_piston_and_tilt_are_removed_and_nothing_else() -> None:
+    rows, columns = np.mgrid[:40, :50]
+    bump = np.where(np.random.default_rng(0).random((40, 50)) < 0.1, np.nan, np.sin(columns / 3.0) * np.cos(rows / 5.0))
+    flat = remove_piston_tilt(bump)
+    tilted = remove_piston_tilt(bump + 5 + 0.3 * columns - 0.2 * rows)
+    np.testing.assert_allclose(tilted, flat, atol=1e-12)
+    np.testing.assert_allclose(fit_plane(flat), 0, atol=1e-13)
+    np.testing.assert_allclose(fit_plane(5 + 0.3 * (columns - 24.5) - 0.2 * (rows - 19.5)), [5, 0.3, -0.2])
+
+
+def test_plane_of_a_single_row_does_not_fail() -> None:
+    sag = np.full((5, 6), np.nan)
+    sag[2] = np.arange(6)
+    np.testing.assert_allclose(remove_piston_tilt(sag)[2], 0, atol=1e-12)
+    with pytest.raises(ValueError, match="no valid pixel"):
+        fit_plane(np.full((2, 2), np.nan))
+
+
+LETTER_F = np.array([[1, 1, 1], [1, 0, 0], [1, 1, 0], [1, 0, 0]], dtype=float)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "expected"),
+    [
+        (Orientation(), ["###", "#..", "##.", "#.."]),
+        (Orientation(flip_x=True), ["###", "..#", ".##", "..#"]),
+        (Orientation(flip_y=True), ["#..", "##.", "#..", "###"]),
+        (Orientation(rotate_deg=90), ["#...", "#.#.", "####"]),
+        (Orientation(rotate_deg=180), ["..#", ".##", "..#", "###"]),
+        (Orientation(rotate_deg=270), ["####", ".#.#", "...#"]),
+        (Orientation(flip_x=True, rotate_deg=90), ["####", "#.#.", "#..."]),
+    ],
+)
+def test_orientation_of_a_letter(orientation: Orientation, expected: list[str]) -> None:
+    found = ["".join("#" if value else "." for value in row) for row in orientation.apply(LETTER_F)]
+    assert found == expected
+
+
+def test_other_rotations_are_refused() -> None:
+    with pytest.raises(ValueError, match="rotate_deg = 45"):
+        Orientation(rotate_deg=45)

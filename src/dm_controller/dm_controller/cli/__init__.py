@@ -1,0 +1,41 @@
+"""The `dm` command: one module per subcommand, imported only when it is used."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from dm_controller.cli.calibrate import calibrate
+from dm_controller.cli.checks import check
+from dm_controller.cli.demo import demo
+from dm_controller.cli.doctor import doctor
+from dm_controller.cli.focus import focus
+from dm_controller.cli.output import fail
+from dm_controller.cli.up import up
+
+app = typer.Typer(
+    name="dm",
+    help="Open-loop focus with a deformable mirror: calibrate once, then ask for a curvature.",
+    no_args_is_help=True,
+    add_completion=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+for command in (demo, up, calibrate, focus, doctor):
+    app.command()(command)
+app.command(name="test", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(check)
+
+
+def main() -> None:
+    """Entry point of `dm`."""
+    from dm_controller.client import DeformableMirrorError
+    from dm_controller.suite import ConfigError
+
+    try:
+        app(prog_name="dm")
+    except (DeformableMirrorError, ConfigError, RuntimeError, OSError, ValueError) as error:
+        fail(str(error))
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,111 @@
+"""`dm calibrate`: measure and store a calibration on the running suite."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+import typer
+
+from dm_controller.cli.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
+
+
+class CalibrationPlan(StrEnum):
+    """What to measure."""
+
+    full = "full"
+    pokes = "pokes"
+    surfaces = "surfaces"
+    poke_check = "poke-check"
+
+
+def run_calibration(client: Any, goal: Any) -> Any:
+    """Run a Calibrate goal with a progress bar; returns the action's result."""
+    phases = ("degauss", "pokes", "surfaces", "fit", "store")
+    with progress_bar() as progress:
+        task = progress.add_task("calibration", total=None)
+
+        def show(feedback: Any) -> None:
+            dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
+            name = phases[feedback.phase] if feedback.phase < len(phases) else "?"
+            progress.update(
+                task,
+                total=feedback.steps or None,
+                completed=feedback.step,
+                description=f"calibration: {name} {feedback.label}{dropped}",
+            )
+
+        result = client.calibrate(goal, show)
+        progress.update(task, description="calibration: done", completed=progress.tasks[0].total or 0)
+    return result
+
+
+def show_result(result: Any) -> None:
+    """Print a calibration's figures and everything a person should know about it."""
+    if result.id:
+        console.print(
+            f"calibration [bold]{result.id}[/]: {result.maps} maps in {result.duration:.0f} s, residual "
+            f"{nanometres(result.in_sample_rms):.2f} nm rms in-sample, {nanometres(result.held_out_rms):.2f} nm held "
+            f"out, condition number {result.condition_number:.1f}"
+        )
+    for entry in result.dropped:
+        console.print(f"[yellow]dropped[/] {entry}")
+    for entry in result.poke_findings:
+        console.print(f"[yellow]poke check[/] {entry}")
+    if result.poke_check_passed:
+        console.print("poke check: wiring and orientation are as configured")
+
+
+def figures_of(result: Any) -> dict[str, Any]:
+    """A calibration's figures for JSON."""
+    return {
+        "id": result.id,
+        "maps": result.maps,
+        "maps_dropped": result.maps_dropped,
+        "seconds": result.duration,
+        "in_sample_rms_nm": nanometres(result.in_sample_rms),
+        "held_out_rms_nm": nanometres(result.held_out_rms),
+        "condition_number": result.condition_number,
+        "poke_findings": list(result.poke_findings),
+    }
+
+
+def calibrate(
+    plan: Annotated[CalibrationPlan, typer.Option(help="What to measure.")] = CalibrationPlan.full,
+    surfaces: Annotated[
+        str, typer.Option(help="Names from Table 1, comma separated, such as p01,pz02; empty = all.")
+    ] = "",
+    amplitude: Annotated[float, typer.Option(help="Half-swing of a poke, normalised; 0 = configured.")] = 0.0,
+    settle: Annotated[float, typer.Option(help="Seconds between command and map; 0 = configured.")] = 0.0,
+    maps_per_state: Annotated[int, typer.Option(min=1, help="Maps averaged per state.")] = 1,
+    activate: Annotated[bool, typer.Option(help="Use the new calibration at once.")] = True,
+    note: Annotated[str, typer.Option(help="Stored with the calibration.")] = "",
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Calibrate the mirror on the bench: command, settle, measure, fit, store.
+
+    Needs the running suite (`dm up`). Ctrl-C cancels and leaves the mirror at mid range.
+    """
+    from dm_msgs.action import Calibrate
+
+    from dm_controller.client import DeformableMirrorClient, DeformableMirrorError
+
+    goal = Calibrate.Goal(
+        plan=list(CalibrationPlan).index(plan),
+        surfaces=[name.strip() for name in surfaces.split(",") if name.strip()],
+        poke_amplitude=amplitude,
+        settle_time=settle,
+        maps_per_state=maps_per_state,
+        activate=activate,
+        note=note,
+    )
+    with DeformableMirrorClient(namespace) as client:
+        try:
+            result = run_calibration(client, goal)
+        except DeformableMirrorError as error:
+            if error.response is not None:
+                show_result(error.response)
+            raise
+    show_result(result)
+    write_json(json, {"calibration": figures_of(result)})

@@ -1,0 +1,248 @@
+"""`dm demo`: the whole chain on the virtual bench, from the first poke to re-measured spheres."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+import socket
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dm_controller.cli.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
+
+#: Curvatures of the sweep [1/m]: the paper's range (section 3.2).
+CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
+
+
+class Hysteresis(StrEnum):
+    """Laws of the twin's piezo actuators."""
+
+    off = "off"
+    prandtl_ishlinskii = "prandtl_ishlinskii"
+    preisach = "preisach"
+    bouc_wen = "bouc_wen"
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that are free on loopback now, for TCP and UDP alike."""
+    sockets: list[socket.socket] = []
+    while len(sockets) < count:
+        stream = socket.create_server(("127.0.0.1", 0))
+        datagram = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            datagram.bind(stream.getsockname())
+        except OSError:
+            stream.close()
+            continue
+        finally:
+            datagram.close()
+        sockets.append(stream)
+    ports = [item.getsockname()[1] for item in sockets]
+    for item in sockets:
+        item.close()
+    return ports
+
+
+def bench_config(folder: Path, law: str, creep: float, seed: int, speed: float) -> dict[str, dict[str, Any]]:
+    """The shipped bench configuration with ports and folders of this run's own, and time running `speed` times fast."""
+    from dm_controller.cli.up import shared_config
+    from dm_controller.suite import load_config
+
+    config = copy.deepcopy(load_config(shared_config("bench.yaml")))
+    tcp, udp, discovery, trigger = free_ports(4)
+    config["virtual_bench"] |= {
+        "seed": seed,
+        "piezo.law": "none" if law == "off" else law,
+        "piezo.creep": creep,
+        "electronics.tcp_port": tcp,
+        "electronics.udp_port": udp,
+        "electronics.discovery_port": discovery,
+        "trigger.port": trigger,
+        "clock.speed": speed,
+        "output_folder": str(folder / "maps"),
+    }
+    config["pdm_driver"]["electronics.port"] = tcp
+    command = [str(trigger) if part == "12343" else part for part in config["interferometer"]["trigger_command"]]
+    config["interferometer"] |= {"watch_folder": str(folder / "maps"), "trigger_command": command}
+    config["calibration"] |= {"calibration_folder": str(folder / "calibrations"), "load_on_start": ""}
+    (folder / "maps").mkdir(parents=True, exist_ok=True)
+    if speed > 0:
+        for name in config:
+            config[name]["use_sim_time"] = name != "virtual_bench"
+    return config
+
+
+def sample_map() -> Path | None:
+    """A real ZYGO map at hand beside the checkout, if there is one."""
+    folder = Path(os.environ.get("DM_ROOT", ".")).resolve().parent / "shared" / "samples"
+    return next(iter(sorted(folder.glob("*.dat"))), None)
+
+
+def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
+    """Read a real map through an interferometer node of its own; returns the figures for JSON."""
+    from dm_controller.client import DeformableMirrorClient
+    from dm_controller.suite import Suite
+
+    nodes = ("interferometer",)
+    with (
+        Suite({"interferometer": {}}, folder / "ingest", domain, namespace="ingest", nodes=nodes),
+        DeformableMirrorClient("ingest", domain) as client,
+    ):
+        answer = client.ingest(str(path.resolve()))
+    console.print(
+        f"real map [bold]{path.name}[/]: {answer.info.width} x {answer.info.height}, "
+        f"PV {nanometres(answer.info.pv):.1f} nm, rms {nanometres(answer.info.rms):.1f} nm, "
+        f"21-term residual {nanometres(answer.zernike.residual_rms):.1f} nm"
+    )
+    return {
+        "file": path.name,
+        "pv_nm": nanometres(answer.info.pv),
+        "rms_nm": nanometres(answer.info.rms),
+        "valid_fraction": answer.info.valid_fraction,
+    }
+
+
+def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
+    """Ask for each curvature, measure what came, and compare."""
+    import numpy as np
+
+    from dm_controller.target import FocusTarget
+    from dm_controller.verify import map_of, surface_error
+
+    rows = []
+    with progress_bar() as progress:
+        task = progress.add_task("focus", total=len(CURVATURES))
+        for curvature in CURVATURES:
+            prediction = client.focus(curvature, dry_run=True)
+            client.move_focus(curvature, settle_time=settle)
+            measurement, image = client.measure_map(f"focus {curvature:+.3f}")
+            sag = map_of(image)
+            error = surface_error(sag, measurement.info, FocusTarget(curvature))
+            rows.append(
+                {
+                    "curvature": curvature,
+                    "prediction": prediction,
+                    "signals": np.asarray(prediction.signals),
+                    "sag": np.array(sag),
+                    "info": measurement.info,
+                    "error": error,
+                }
+            )
+            progress.advance(task)
+    return rows
+
+
+def show_sweep(rows: list[dict[str, Any]], fitting_limit: float) -> None:
+    """Print the table: predicted, re-measured, limit."""
+    from rich.table import Table
+
+    table = Table(title="open-loop focus: predicted before the move, re-measured after it")
+    for heading in (
+        "curvature 1/m",
+        "dioptre",
+        "predicted rms nm",
+        "measured rms nm",
+        "largest coeff. nm",
+        "",
+        "saturated",
+    ):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(
+            f"{row['curvature']:+.2f}",
+            f"{2 * row['curvature']:+.2f}",
+            f"{nanometres(row['prediction'].predicted_rms):.1f}",
+            f"{nanometres(row['error'].rms):.1f}",
+            f"{nanometres(row['error'].max_zernike):.2f}",
+            as_wavelengths(row["error"].max_zernike),
+            "yes" if row["prediction"].saturated else "no",
+        )
+    console.print(table)
+    worst = max(row["error"].max_zernike for row in rows)
+    console.print(
+        f"fitting limit of this mirror at 0.05 1/m: {nanometres(fitting_limit):.1f} nm rms; "
+        f"largest coefficient error of the sweep: {nanometres(worst):.2f} nm ({as_wavelengths(worst)})"
+    )
+
+
+def demo(
+    hysteresis: Annotated[
+        Hysteresis, typer.Option(help="Law of the twin's actuators; `off` = ideal ones, without creep too.")
+    ] = Hysteresis.prandtl_ishlinskii,
+    creep: Annotated[
+        float | None, typer.Option(min=0.0, max=0.2, help="Creep per decade of time; default 0.01.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the twin.")] = 1,
+    speed: Annotated[float, typer.Option(min=0.0, help="How much faster than real time; 0 = real time.")] = 20.0,
+    map_file: Annotated[Path | None, typer.Option("--map", help="A real ZYGO file to ingest first.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for logs, calibration and picture.")] = Path("runs/demo"),
+    keep_maps: Annotated[bool, typer.Option(help="Keep the map files (about 4 MB each).")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Calibrate a virtual PDM30-37 through the real nodes, wire protocol and file formats, then focus it."""
+    from dm_msgs.action import Calibrate
+
+    from dm_controller.cli.calibrate import figures_of, run_calibration, show_result
+    from dm_controller.client import DeformableMirrorClient
+    from dm_controller.figures import save_sweep_figure
+    from dm_controller.suite import Suite, own_domain
+
+    started = time.monotonic()
+    folder = out.resolve()
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+    actual_creep = creep if creep is not None else (0.0 if hysteresis is Hysteresis.off else 0.01)
+    config = bench_config(folder, hysteresis.value, actual_creep, seed, speed)
+    figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": actual_creep, "seed": seed}
+    with own_domain() as domain:
+        real = map_file if map_file is not None else sample_map()
+        if real is not None:
+            figures["real_map"] = ingest_real_map(real, folder, domain)
+        else:
+            console.print("no real ZYGO map at hand; give one with --map FILE")
+        console.print(
+            f"virtual bench: PDM30-37, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
+            f"seed {seed}; logs in {os.path.relpath(folder)}"
+        )
+        with Suite(config, folder, domain) as suite, DeformableMirrorClient(domain=domain) as client:
+            try:
+                client.latest("mirror_info", 20.0)
+                result = run_calibration(client, Calibrate.Goal(activate=True, note="demo"))
+                show_result(result)
+                if not client.wait(lambda: client.capabilities.calibration_id == result.id):
+                    raise RuntimeError("the focus controller did not take the new calibration")
+                console.print(f"reachable: {client.capabilities.message}")
+                mirror = client.mirror_info
+                rows = sweep(client, settle=float(config["calibration"]["settle_time"]))
+            except Exception:
+                suite.check()  # a node that died explains more than the request that failed
+                raise
+    fitting_limit = max(row["prediction"].predicted_rms for row in rows)
+    show_sweep(rows, fitting_limit)
+    picture = save_sweep_figure(rows, folder / "demo.png", f"PDM30-37 twin, hysteresis: {hysteresis.value}", mirror)
+    console.print(f"picture: {os.path.relpath(picture)}")
+    if not keep_maps:
+        shutil.rmtree(folder / "maps")
+    figures |= {
+        "calibration": figures_of(result),
+        "focus": [
+            {
+                "curvature": row["curvature"],
+                "predicted_rms_nm": nanometres(row["prediction"].predicted_rms),
+                "measured_rms_nm": nanometres(row["error"].rms),
+                "max_zernike_nm": nanometres(row["error"].max_zernike),
+                "saturated": row["prediction"].saturated,
+            }
+            for row in rows
+        ],
+        "fitting_limit_nm": nanometres(fitting_limit),
+        "seconds": time.monotonic() - started,
+    }
+    write_json(json, figures)
+    console.print(f"done in {time.monotonic() - started:.0f} s")

@@ -1,0 +1,72 @@
+"""What the subcommands share: the console, figures as JSON, progress bars."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+#: The wavelength that coefficients are compared with on screens [m].
+WAVELENGTH = 632.8e-9
+
+JsonOption = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.", metavar="FILE")]
+NamespaceOption = Annotated[str, typer.Option("--namespace", help="Namespace of the mirror, one per mirror.")]
+
+
+def fail(message: str) -> None:
+    """Say what went wrong on standard error."""
+    errors.print(f"[bold red]error:[/] {message}", soft_wrap=True, markup=True)
+
+
+def progress_bar() -> Progress:
+    """A progress bar with step i of n and the time left."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        refresh_per_second=4,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: unknown numbers become null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def write_json(path: Path | None, figures: dict[str, Any]) -> None:
+    """Write figures whole or not at all; None writes nothing."""
+    if path is None:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n")
+    temporary.replace(path)
+    console.print(f"figures: {path}")
+
+
+def nanometres(length: float) -> float:
+    """A length in nm, for screens and reports."""
+    return length * 1e9
+
+
+def as_wavelengths(length: float) -> str:
+    """A length as a fraction of the wavelength, such as λ/50."""
+    return f"λ/{WAVELENGTH / length:.0f}" if length > 0 else "0"

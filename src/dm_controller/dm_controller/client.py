@@ -1,0 +1,261 @@
+"""A plain Python face of the suite, for vision stacks and scripts: no callbacks, no executors.
+
+from dm_controller.client import DeformableMirrorClient
+
+with DeformableMirrorClient() as mirror:
+    print(mirror.capabilities.message)
+    state = mirror.focus(curvature=0.02)        # 1/m of the surface; optical power = 2 x curvature
+    print(f"{state.predicted_rms * 1e9:.1f} nm rms expected")
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from dm_msgs.action import Calibrate, MoveFocus
+from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
+from dm_msgs.srv import (
+    Degauss,
+    Flatten,
+    IngestFile,
+    ListCalibrations,
+    LoadCalibration,
+    Measure,
+    SetFocus,
+    SetSignals,
+)
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Image
+
+from dm_runtime import qos
+from dm_runtime.executor import BackgroundExecutor
+from dm_runtime.worker import ServiceCallError, call
+
+
+class DeformableMirrorError(Exception):
+    """The suite refused or could not carry out a request.
+
+    Attributes:
+        error_code: dm_msgs/ErrorCode.
+        response: the whole response or result, when there is one.
+    """
+
+    def __init__(self, error_code: int, message: str, response: Any = None) -> None:
+        super().__init__(message)
+        self.error_code = error_code
+        self.response = response
+
+
+class DeformableMirrorClient:
+    """Talk to one mirror's nodes. Use as a context manager.
+
+    Args:
+        namespace: of the mirror, "" for none.
+        domain: ROS domain; None = the environment's.
+        timeout_s: how long to wait for a service that should answer at once.
+    """
+
+    def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node("dm_client", namespace=namespace, context=self._context)
+        self._timeout_s = timeout_s
+        self._latest: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
+        for message_type, topic, profile in (
+            (MirrorInfo, "mirror_info", qos.LATCHED),
+            (Calibration, "calibration", qos.LATCHED),
+            (Capabilities, "capabilities", qos.LATCHED),
+            (ActuatorState, "actuator_state", qos.STATE),
+        ):
+            self._keep_latest(message_type, topic, profile)
+        self._background = BackgroundExecutor(self.node)
+
+    def _keep_latest(self, message_type: Any, topic: str, profile: Any) -> None:
+        self.node.create_subscription(message_type, topic, lambda m: self._latest.__setitem__(topic, m), profile)
+
+    def __enter__(self) -> DeformableMirrorClient:
+        return self
+
+    def __exit__(
+        self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the ROS graph; the mirror keeps its shape."""
+        self._background.destroy_node()
+        self._context.try_shutdown()
+
+    # --- what is known ---
+
+    def latest(self, topic: str, timeout_s: float | None = None) -> Any:
+        """The latest message of `mirror_info`, `calibration`, `capabilities` or `actuator_state`.
+
+        Raises:
+            DeformableMirrorError: none came within the time.
+        """
+        if not self.wait(lambda: topic in self._latest, timeout_s):
+            raise DeformableMirrorError(599, f"no message on {topic}: are the nodes running (./dm up)?")
+        return self._latest[topic]
+
+    def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
+        """Wait until `condition()` is true; False when it was not in time."""
+        deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.005)
+        return True
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """Reachable range, calibration quality and error bound."""
+        return self.latest("capabilities")
+
+    @property
+    def mirror_info(self) -> MirrorInfo:
+        """Geometry and limits of the mirror."""
+        return self.latest("mirror_info")
+
+    @property
+    def actuator_state(self) -> ActuatorState:
+        """What stands at the electronics."""
+        return self.latest("actuator_state")
+
+    # --- services ---
+
+    def call(self, service_type: Any, name: str, request: Any, timeout_s: float | None = None) -> Any:
+        """Call any service of the suite; raise DeformableMirrorError when it refuses or does not answer."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_type, name)
+        try:
+            response = call(self._clients[name], request, self._timeout_s if timeout_s is None else timeout_s)
+        except ServiceCallError as error:
+            raise DeformableMirrorError(503, str(error)) from error
+        if response.error_code != 0:
+            raise DeformableMirrorError(response.error_code, response.message, response)
+        return response
+
+    def focus(
+        self,
+        curvature: float,
+        conic_constant: float = 0.0,
+        zernike: Sequence[float] = (),
+        *,
+        dry_run: bool = False,
+    ) -> FocusState:
+        """Set the surface curvature [1/m] (concave positive) and return the prediction; `dry_run` moves nothing."""
+        request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant), zernike=list(zernike))
+        return self.call(SetFocus, "set_focus", SetFocus.Request(request=request, dry_run=dry_run)).state
+
+    def focus_power(self, power: float, *, dry_run: bool = False) -> FocusState:
+        """Set the optical power [dioptre] = 2 x surface curvature."""
+        return self.focus(power / 2.0, dry_run=dry_run)
+
+    def flatten(self, *, dry_run: bool = False) -> FocusState:
+        """Make the surface as flat as the mirror can."""
+        return self.call(Flatten, "flatten", Flatten.Request(dry_run=dry_run)).state
+
+    def set_signals(self, signals: Sequence[float], *, wait: bool = True) -> SetSignals.Response:
+        """Set all actuator signals (normalised, -1..+1)."""
+        return self.call(SetSignals, "set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait))
+
+    def degauss(self, timeout_s: float = 120.0) -> Degauss.Response:
+        """Wipe the hysteresis memory and end at mid range."""
+        return self.call(Degauss, "degauss", Degauss.Request(), timeout_s)
+
+    def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:
+        """Take one map with the interferometer."""
+        return self.call(Measure, "measure", Measure.Request(label=label), timeout_s)
+
+    def ingest(self, path: str, timeout_s: float = 60.0) -> IngestFile.Response:
+        """Read one map file."""
+        return self.call(IngestFile, "ingest_file", IngestFile.Request(path=path), timeout_s)
+
+    def measure_map(self, label: str = "", timeout_s: float = 60.0) -> tuple[Measure.Response, Image]:
+        """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
+        if "surface_map" not in self._latest:
+            self._keep_latest(Image, "surface_map", qos.MAP)
+            self._keep_latest(SurfaceMapInfo, "surface_map_info", qos.MAP)
+            self._latest["surface_map"] = None
+            self.wait(lambda: self.node.count_publishers("surface_map") > 0)
+            time.sleep(0.3)  # the publisher must have discovered this subscription too
+        response = self.measure(label, timeout_s)
+
+        def arrived() -> bool:
+            image = self._latest["surface_map"]
+            return image is not None and image.header.stamp == response.info.header.stamp
+
+        if not self.wait(arrived):
+            raise DeformableMirrorError(302, "the map did not arrive on surface_map")
+        return response, self._latest["surface_map"]
+
+    def list_calibrations(self) -> ListCalibrations.Response:
+        """Calibrations in the store, newest first."""
+        return self.call(ListCalibrations, "list_calibrations", ListCalibrations.Request())
+
+    def load_calibration(self, name: str = "") -> LoadCalibration.Response:
+        """Load a stored calibration; "" = the newest that fits."""
+        return self.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=name))
+
+    # --- actions ---
+
+    def run_action(
+        self, action_type: Any, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float
+    ) -> Any:
+        """Run a goal to its end. Ctrl-C cancels it first, so that the mirror is left safe."""
+        if name not in self._clients:
+            self._clients[name] = ActionClient(self.node, action_type, name)
+        client = self._clients[name]
+        if not self.wait(client.server_is_ready):
+            raise DeformableMirrorError(503, f"{name}: no such action; is its node running?")
+        accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
+        if not self.wait(accepted.done):
+            raise DeformableMirrorError(503, f"{name}: no answer to the goal")
+        handle = accepted.result()
+        if not handle.accepted:
+            raise DeformableMirrorError(405, f"{name}: refused, another goal is running")
+        finished = handle.get_result_async()
+        try:
+            if not self.wait(finished.done, timeout_s):
+                raise DeformableMirrorError(503, f"{name}: not finished within {timeout_s:g} s")
+        except BaseException:
+            handle.cancel_goal_async()
+            self.wait(finished.done, 20.0)
+            raise
+        result = finished.result().result
+        if result.error_code != 0:
+            raise DeformableMirrorError(result.error_code, result.message, result)
+        return result
+
+    def move_focus(
+        self,
+        curvature: float,
+        conic_constant: float = 0.0,
+        *,
+        tolerance: float = 0.0,
+        settle_time: float = 0.0,
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 30.0,
+    ) -> MoveFocus.Result:
+        """Move to a curvature and return when the shape stands."""
+        request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
+        goal = MoveFocus.Goal(request=request, tolerance=float(tolerance), settle_time=float(settle_time))
+        return self.run_action(MoveFocus, "move_focus", goal, on_feedback, timeout_s)
+
+    def calibrate(
+        self,
+        goal: Calibrate.Goal | None = None,
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 7200.0,
+    ) -> Calibrate.Result:
+        """Measure and store a calibration; by default the full plan, used at once."""
+        goal = goal if goal is not None else Calibrate.Goal(activate=True)
+        return self.run_action(Calibrate, "calibrate", goal, on_feedback, timeout_s)

@@ -1,0 +1,57 @@
+"""Between messages and the plain arrays of the library."""
+
+from __future__ import annotations
+
+import array
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dm_controller.model import InfluenceModel
+from dm_controller.solvers.bounded import Limits
+from dm_controller.target import FocusTarget
+
+
+def doubles(values: ArrayLike) -> array.array[float]:
+    """A float64[] field: message fields take an `array.array` as it is, where a list is checked element by element."""
+    result = array.array("d")
+    result.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return result
+
+
+def target_of(request: Any) -> FocusTarget:
+    """The target of a dm_msgs/FocusRequest. Raises TargetError."""
+    return FocusTarget(request.curvature, request.conic_constant, tuple(request.zernike))
+
+
+def model_of(calibration: Any) -> InfluenceModel:
+    """The influence model of a dm_msgs/Calibration. Raises ValueError when its arrays do not fit together."""
+    actuators, terms, points = calibration.actuators, calibration.terms, calibration.points
+
+    def matrix(name: str, rows: int) -> NDArray[np.float64]:
+        values = np.asarray(getattr(calibration, name), dtype=float)
+        if values.size != rows * actuators:
+            raise ValueError(f"calibration: {name} has {values.size} values, must be {rows} x {actuators}")
+        return values.reshape(rows, actuators)
+
+    return InfluenceModel(
+        aperture_radius=calibration.aperture_radius,
+        influence_zernike=matrix("influence_zernike", terms),
+        zernike_offset=np.asarray(calibration.zernike_offset, dtype=float),
+        sample_x=np.asarray(calibration.sample_x, dtype=float),
+        sample_y=np.asarray(calibration.sample_y, dtype=float),
+        sample_weight=np.asarray(calibration.sample_weight, dtype=float),
+        influence_sag=matrix("influence_sag", points),
+        sag_offset=np.asarray(calibration.sag_offset, dtype=float),
+        in_sample_rms=calibration.in_sample_rms,
+        held_out_rms=calibration.held_out_rms,
+        held_out_max_zernike=calibration.held_out_max_zernike,
+        maps_used=calibration.maps_used,
+    )
+
+
+def limits_of(mirror: Any) -> Limits:
+    """The limits of a dm_msgs/MirrorInfo."""
+    pairs = np.column_stack([np.asarray(mirror.neighbour_a, dtype=np.intp), np.asarray(mirror.neighbour_b, np.intp)])
+    return Limits(mirror.signal_min, mirror.signal_max, pairs, mirror.neighbour_difference_max)

@@ -1,0 +1,163 @@
+"""A calibrated mirror: predicts the surface of a command and finds the command of a surface, before anything moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.optics.zernike import basis
+from dm_controller.solvers.bounded import BoundedProgramme, Limits
+from dm_controller.target import FocusTarget
+
+#: Piston and the two tilts are free: focus does not care, and an interferometer cannot see piston.
+FREE_TERMS = 3
+#: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
+#: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
+COEFFICIENT_WEIGHT = 100.0
+
+
+@dataclass(frozen=True)
+class InfluenceModel:
+    """What a calibration says of a mirror; see dm_msgs/Calibration for the fields.
+
+    Shapes: N actuators, K Zernike terms, P sampling points.
+
+    Raises:
+        ValueError: shapes disagree or a number is not finite.
+    """
+
+    aperture_radius: float
+    influence_zernike: NDArray[np.float64]  # (K, N) m per unit signal
+    zernike_offset: NDArray[np.float64]  # (K,) m
+    sample_x: NDArray[np.float64]  # (P,)
+    sample_y: NDArray[np.float64]
+    sample_weight: NDArray[np.float64]  # (P,) sums to 1
+    influence_sag: NDArray[np.float64]  # (P, N) m per unit signal
+    sag_offset: NDArray[np.float64]  # (P,) m
+    in_sample_rms: float  # m
+    held_out_rms: float  # m
+    held_out_max_zernike: float  # m
+    maps_used: int
+
+    def __post_init__(self) -> None:
+        terms, actuators = self.influence_zernike.shape
+        points = len(self.sample_x)
+        expected = {
+            "zernike_offset": (terms,),
+            "sample_y": (points,),
+            "sample_weight": (points,),
+            "influence_sag": (points, actuators),
+            "sag_offset": (points,),
+        }
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"calibration: {name} has shape {getattr(self, name).shape}, must be {shape}")
+        for name in ("influence_zernike", "sample_x", *expected):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"calibration: {name} holds values that are not finite")
+        if not self.aperture_radius > 0:
+            raise ValueError(f"calibration: aperture_radius = {self.aperture_radius:g}: must be positive")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A command and what it is expected to do.
+
+    Lengths in m; `upper` are 95 % bounds that include the calibration's held-out error.
+    """
+
+    signals: NDArray[np.float64]
+    rms: float
+    rms_upper: float
+    max_zernike: float
+    max_zernike_upper: float
+    saturated: NDArray[np.bool_]
+
+
+class CalibratedMirror:
+    """Solves focus targets on an influence model inside limits.
+
+    The command makes the coefficients beyond tilt equal to the wanted ones and the sag beyond the terms as small as
+    possible, with piston and tilt free, inside the limits; where the limits forbid equality it is the closest in the
+    weighted least-squares sense. A ridge of the influence function's own uncertainty keeps actuators that the aperture
+    hardly sees from running to their limits for nothing.
+    """
+
+    def __init__(self, model: InfluenceModel, limits: Limits) -> None:
+        self.model = model
+        self.limits = limits
+        weights = np.sqrt(model.sample_weight)
+        weighted_basis = weights[:, None] * basis(model.sample_x, model.sample_y)
+        orthogonal = np.linalg.qr(weighted_basis)[0]
+        self._weights = weights
+        self._tilt_free = orthogonal[:, :FREE_TERMS]
+        self._beyond_terms = orthogonal
+        uncertainty = model.in_sample_rms / np.sqrt(max(model.maps_used, 1))
+        matrix = np.vstack(
+            [
+                COEFFICIENT_WEIGHT * model.influence_zernike[FREE_TERMS:],
+                self._reduce(model.influence_sag, self._beyond_terms),
+            ]
+        )
+        self._programme = BoundedProgramme(matrix, limits, ridge=max(uncertainty, 1e-11) ** 2)
+        self._range_cached = lru_cache(maxsize=64)(self._find_range)
+
+    def _reduce(self, sag: NDArray[np.float64], removed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weighted sag (P,) or (P, N) with the span of `removed` (P, k, orthonormal) projected out."""
+        weighted = (sag.T * self._weights).T
+        result: NDArray[np.float64] = weighted - removed @ (removed.T @ weighted)
+        return result
+
+    def plan(self, target: FocusTarget) -> Plan:
+        """Find the command for `target` and predict its error.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        model = self.model
+        coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
+        sag = target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
+        wanted = np.concatenate([COEFFICIENT_WEIGHT * coefficients[FREE_TERMS:], self._reduce(sag, self._beyond_terms)])
+        signals = self._programme.solve(wanted)
+        zernike_error = model.influence_zernike[FREE_TERMS:] @ signals - coefficients[FREE_TERMS:]
+        sag_error = self._reduce(model.influence_sag @ signals - sag, self._tilt_free)
+        rms = float(np.linalg.norm(sag_error))
+        largest = float(np.abs(zernike_error).max())
+        return Plan(
+            signals=signals,
+            rms=rms,
+            rms_upper=float(np.hypot(rms, 1.96 * model.held_out_rms)),
+            max_zernike=largest,
+            max_zernike_upper=largest + model.held_out_max_zernike,
+            saturated=self.limits.at_limit(signals),
+        )
+
+    def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
+        """Smallest and largest curvature [1/m] with the target's conic constant and added terms that the limits permit.
+
+        Reachable means: the model's largest coefficient error stays below `tolerance` [m]. Returns (nan, nan) when not
+        even curvature 0 is (for example with large added terms).
+        """
+        return self._range_cached(target.with_curvature(0.0), tolerance)
+
+    def _find_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
+        if self.plan(target).max_zernike > tolerance:
+            return (float("nan"), float("nan"))
+        # Beyond this the stroke of all actuators together could not follow (defocus of a sphere is c r^2 / 4).
+        defocus_stroke = float(np.abs(self.model.influence_zernike[3]).sum())
+        far = 4.0 * (self.limits.high - self.limits.low) * defocus_stroke / self.model.aperture_radius**2
+        return (self._bisect(target, -far, tolerance), self._bisect(target, far, tolerance))
+
+    def _bisect(self, target: FocusTarget, far: float, tolerance: float) -> float:
+        """The largest reachable curvature between 0 and `far`: one edge, since the programme is convex."""
+        near = 0.0
+        while abs(far - near) > 1e-5:
+            middle = 0.5 * (near + far)
+            if self.plan(target.with_curvature(middle)).max_zernike <= tolerance:
+                near = middle
+            else:
+                far = middle
+        return near

@@ -1,0 +1,1 @@
+"""Solvers: from a wanted surface to actuator signals."""

@@ -1,0 +1,143 @@
+"""Least squares inside the actuator limits: the range of every signal and the difference between neighbours.
+
+    minimise   |M s - b|^2 + ridge |s|^2
+    subject to low <= s_i <= high,   |s_i - s_j| <= d for neighbours i, j
+
+M is factored once (M = Q R), so that a solve works on N x N numbers however many rows M has. Three methods, cheapest
+first; each result satisfies the optimality conditions of the whole programme:
+
+1. the unconstrained solution, when it lies inside all limits;
+2. bounded-variable least squares (Stark and Parker 1995, `scipy.optimize.lsq_linear`), when only the range binds;
+3. least distance programming by non-negative least squares (Lawson and Hanson 1974, ch. 23), when neighbours bind.
+
+Clipping the unconstrained solution instead doubles the residual of a saturated sphere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear, nnls
+
+#: Signals closer to a limit than this count as standing at it.
+AT_LIMIT = 1e-6
+#: Violations below this are rounding, far below a DAC step (1.5e-5).
+SLACK = 1e-9
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the signals of one mirror.
+
+    Attributes:
+        low, high: range of every signal (normalised).
+        pairs: (M, 2) indices of neighbouring actuators; may be empty.
+        neighbour_difference: largest allowed difference between the two of a pair (normalised).
+    """
+
+    low: float
+    high: float
+    pairs: NDArray[np.intp]
+    neighbour_difference: float
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError(f"signal range {self.low:g} to {self.high:g}: the lower limit must be below the upper")
+        if not self.neighbour_difference > 0:
+            raise ValueError(f"neighbour_difference = {self.neighbour_difference:g}: must be positive")
+
+    def allow(self, signals: NDArray[np.float64]) -> bool:
+        """Whether `signals` (N,) break none of the limits."""
+        return self.allow_range(signals) and self.allow_neighbours(signals)
+
+    def allow_range(self, signals: NDArray[np.float64]) -> bool:
+        return bool(signals.min() >= self.low - SLACK and signals.max() <= self.high + SLACK)
+
+    def allow_neighbours(self, signals: NDArray[np.float64]) -> bool:
+        if len(self.pairs) == 0 or self.neighbour_difference >= self.high - self.low:
+            return True
+        differences = signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]]
+        return bool(np.abs(differences).max() <= self.neighbour_difference + SLACK)
+
+    def at_limit(self, signals: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(N,) which actuators stand at a limit."""
+        result = (signals <= self.low + AT_LIMIT) | (signals >= self.high - AT_LIMIT)
+        if len(self.pairs) and self.neighbour_difference < self.high - self.low:
+            differences = np.abs(signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]])
+            result[self.pairs[differences >= self.neighbour_difference - AT_LIMIT].ravel()] = True
+        return result
+
+
+class BoundedProgramme:
+    """The quadratic programme above for one matrix and one set of limits.
+
+    Args:
+        matrix: (M, N), M >= N rows, or fewer with `ridge` > 0.
+        limits: what the signals must satisfy.
+        ridge: weight of |s|^2, in the squared unit of `matrix`.
+
+    Raises:
+        ValueError: the matrix is not finite or does not determine the signals.
+    """
+
+    def __init__(self, matrix: ArrayLike, limits: Limits, ridge: float = 0.0) -> None:
+        rows = np.asarray(matrix, dtype=float)
+        if rows.ndim != 2 or not np.isfinite(rows).all():
+            raise ValueError(f"matrix of shape {rows.shape}: must be two-dimensional and finite")
+        count = rows.shape[1]
+        # In the matrix's own scale, so that metres and nanometres give the same numerics.
+        self._scale = float(np.abs(rows).max()) or 1.0
+        stacked = np.vstack([rows / self._scale, np.sqrt(ridge) / self._scale * np.eye(count)])
+        orthogonal, self._triangle = np.linalg.qr(stacked)
+        self._projection = orthogonal[: len(rows)].T / self._scale
+        diagonal = np.abs(np.diag(self._triangle))
+        if len(stacked) < count or diagonal.min() < 1e-12 * diagonal.max():
+            raise ValueError("the matrix does not determine every signal; an actuator has no influence: use a ridge")
+        self.limits = limits
+        self._constraints, self._constraint_limits = self._linear_constraints(count)
+
+    def _linear_constraints(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(C, c) of C y >= c0 - C d in terms of y = R s - d, see `_least_distance`."""
+        limits, identity = self.limits, np.eye(count)
+        differences = identity[limits.pairs[:, 0]] - identity[limits.pairs[:, 1]] if len(limits.pairs) else identity[:0]
+        constraints = np.vstack([identity, -identity, differences, -differences])
+        bounds = np.concatenate(
+            [
+                np.full(count, limits.low),
+                np.full(count, -limits.high),
+                np.full(2 * len(differences), -limits.neighbour_difference),
+            ]
+        )
+        return solve_triangular(self._triangle, constraints.T, trans="T").T, bounds
+
+    def solve(self, wanted: ArrayLike) -> NDArray[np.float64]:
+        """Return the best signals (N,) for the right-hand side `wanted` (M,).
+
+        Raises:
+            ValueError: `wanted` has another length than the matrix has rows, or is not finite.
+        """
+        target = np.asarray(wanted, dtype=float)
+        if target.shape != (self._projection.shape[1],) or not np.isfinite(target).all():
+            raise ValueError(f"right-hand side: must be {self._projection.shape[1]} finite numbers")
+        projected = self._projection @ target
+        signals: NDArray[np.float64] = solve_triangular(self._triangle, projected)
+        if self.limits.allow(signals):
+            return signals
+        signals = lsq_linear(self._triangle, projected, (self.limits.low, self.limits.high), method="bvls").x
+        if not self.limits.allow_neighbours(signals):
+            signals = self._least_distance(projected)
+        return np.clip(signals, self.limits.low, self.limits.high)
+
+    def _least_distance(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Lawson and Hanson's problem LDP: the shortest y = R s - d that satisfies all constraints."""
+        right = self._constraint_limits - self._constraints @ projected
+        system = np.vstack([self._constraints.T, right])
+        unit = np.zeros(len(system))
+        unit[-1] = 1.0
+        multipliers, _norm = nnls(system, unit, maxiter=20 * len(right))
+        residual = system @ multipliers - unit
+        signals: NDArray[np.float64] = solve_triangular(self._triangle, projected - residual[:-1] / residual[-1])
+        return signals

@@ -1,0 +1,70 @@
+"""What is asked of the mirror: a conic of some curvature with Zernike terms on top."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.optics.conic import conic_coefficients, conic_sag
+from dm_calibration.optics.zernike import TERMS, basis
+
+
+class TargetError(ValueError):
+    """A request that no mirror could follow; the message names field, value and allowed range."""
+
+
+@dataclass(frozen=True)
+class FocusTarget:
+    """A wanted surface.
+
+    Attributes:
+        curvature: of the surface at the vertex [1/m], positive = concave. Optical power = 2 x curvature.
+        conic_constant: 0 = sphere, -1 = paraboloid (Eq. 2 of the paper).
+        zernike: added sag [m], Born & Wolf terms in the paper's order over the working aperture; empty = none.
+    """
+
+    curvature: float
+    conic_constant: float = 0.0
+    zernike: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, value in (("curvature", self.curvature), ("conic_constant", self.conic_constant)):
+            if not math.isfinite(value):
+                raise TargetError(f"{name} = {value}: must be a finite number")
+        if len(self.zernike) not in (0, len(TERMS)):
+            raise TargetError(f"zernike has {len(self.zernike)} terms: must be empty or {len(TERMS)} (Born & Wolf, m)")
+        if not all(math.isfinite(value) for value in self.zernike):
+            raise TargetError(f"zernike = {list(self.zernike)}: every term must be finite")
+
+    def check_aperture(self, radius: float) -> None:
+        """Raise TargetError when a conic of this curvature does not reach the edge of the aperture."""
+        reach = (1.0 + self.conic_constant) * (self.curvature * radius) ** 2
+        if reach >= 1.0:
+            raise TargetError(
+                f"curvature = {self.curvature:g} 1/m with conic_constant = {self.conic_constant:g}: no such surface "
+                f"reaches the edge of the aperture (radius {radius * 1e3:g} mm); "
+                f"(1 + conic_constant) (curvature x radius)^2 = {reach:g} must be below 1"
+            )
+
+    def coefficients(self, radius: float) -> NDArray[np.float64]:
+        """(21,) Born & Wolf coefficients of the sag over an aperture of `radius` [m]."""
+        self.check_aperture(radius)
+        result = np.array(conic_coefficients(self.curvature, self.conic_constant, radius), dtype=float)
+        if self.zernike:
+            result += self.zernike
+        return result
+
+    def sag(self, x: NDArray[np.float64], y: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+        """Sag [m] at points of the unit disc of an aperture of `radius` [m]."""
+        self.check_aperture(radius)
+        result: NDArray[np.float64] = conic_sag(x * radius, y * radius, self.curvature, self.conic_constant)
+        if self.zernike:
+            result = result + basis(x, y) @ np.asarray(self.zernike)
+        return result
+
+    def with_curvature(self, curvature: float) -> FocusTarget:
+        """The same target at another curvature."""
+        return FocusTarget(curvature, self.conic_constant, self.zernike)

@@ -1,0 +1,97 @@
+"""The bounded programme against optimality conditions, a general-purpose solver and clipping."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from dm_controller.solvers.bounded import BoundedProgramme, Limits
+
+NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
+
+
+def chain(count: int) -> np.ndarray[Any, Any]:
+    return np.column_stack([np.arange(count - 1), np.arange(1, count)])
+
+
+def test_inside_the_limits_it_is_least_squares() -> None:
+    generator = np.random.default_rng(1)
+    matrix = generator.normal(size=(40, 8))
+    wanted = matrix @ generator.uniform(-0.5, 0.5, 8) + 1e-3 * generator.normal(size=40)
+    solved = BoundedProgramme(matrix, Limits(-1, 1, NO_PAIRS, 2.0)).solve(wanted)
+    np.testing.assert_allclose(solved, np.linalg.lstsq(matrix, wanted, rcond=None)[0], atol=1e-12)
+
+
+def test_metres_and_nanometres_give_the_same_signals() -> None:
+    generator = np.random.default_rng(2)
+    matrix, wanted = generator.normal(size=(30, 6)), 3 * generator.normal(size=30)
+    limits = Limits(-1, 1, chain(6), 0.5)
+    metres = BoundedProgramme(1e-9 * matrix, limits, 1e-21).solve(1e-9 * wanted)
+    np.testing.assert_allclose(metres, BoundedProgramme(matrix, limits, 1e-3).solve(wanted), atol=1e-8)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), demand=st.floats(0.1, 20.0), difference=st.floats(0.05, 2.5))
+def test_result_is_feasible_and_optimal(seed: int, demand: float, difference: float) -> None:
+    """No feasible direction improves: compare with many feasible points and a general solver's answer."""
+    generator = np.random.default_rng(seed)
+    matrix, wanted = generator.normal(size=(14, 6)), demand * generator.normal(size=14)
+    limits = Limits(-1.0, 1.0, chain(6), difference)
+    signals = BoundedProgramme(matrix, limits).solve(wanted)
+    assert limits.allow(signals)
+
+    def cost(s: np.ndarray[Any, Any]) -> float:
+        return float(np.sum((matrix @ s - wanted) ** 2))
+
+    constraints = [
+        {"type": "ineq", "fun": lambda s: difference - (s[:-1] - s[1:])},
+        {"type": "ineq", "fun": lambda s: difference + (s[:-1] - s[1:])},
+    ]
+    other = minimize(cost, np.zeros(6), method="SLSQP", bounds=[(-1, 1)] * 6, constraints=constraints, tol=1e-12)
+    assert cost(signals) <= cost(np.clip(other.x, -1, 1)) * (1 + 1e-6) + 1e-6
+
+
+def test_it_beats_clipping_when_saturated() -> None:
+    # Overlapping bumps on a line, asked for a parabola that is too deep for them.
+    points, centres = np.linspace(-1, 1, 80), np.linspace(-1.1, 1.1, 12)
+    matrix = np.exp(-(((points[:, None] - centres) / 0.25) ** 2))
+    wanted = 3.0 * points**2
+    limits = Limits(-1, 1, NO_PAIRS, 2.0)
+    signals = BoundedProgramme(matrix, limits).solve(wanted)
+    clipped = np.clip(np.linalg.lstsq(matrix, wanted, rcond=None)[0], -1, 1)
+    assert np.linalg.norm(matrix @ signals - wanted) < 0.9 * np.linalg.norm(matrix @ clipped - wanted)
+    assert limits.at_limit(signals).any()
+
+
+def test_neighbours_at_their_limit_are_marked() -> None:
+    programme = BoundedProgramme(np.eye(3), Limits(-1, 1, chain(3), 0.4))
+    signals = programme.solve([0.9, -0.9, -0.5])
+    assert abs(signals[0] - signals[1]) == pytest.approx(0.4)
+    assert programme.limits.at_limit(signals).tolist() == [True, True, False]
+
+
+def test_unreached_actuator_needs_a_ridge() -> None:
+    matrix = np.eye(3)[:, [0, 1, 1]] * [1.0, 1.0, 0.0]
+    with pytest.raises(ValueError, match="ridge"):
+        BoundedProgramme(matrix, Limits(-1, 1, NO_PAIRS, 2.0))
+    assert BoundedProgramme(matrix, Limits(-1, 1, NO_PAIRS, 2.0), ridge=1e-6).solve([0.5, 0.5, 0])[2] == pytest.approx(
+        0
+    )
+
+
+@pytest.mark.parametrize("wanted", [[1.0], [1.0, np.nan, 0.0], [1.0, 2.0, np.inf]])
+def test_bad_right_hand_sides_are_refused(wanted: list[float]) -> None:
+    with pytest.raises(ValueError, match="must be 3 finite numbers"):
+        BoundedProgramme(np.eye(3), Limits(-1, 1, NO_PAIRS, 2.0)).solve(wanted)
+
+
+def test_bad_limits_are_refused() -> None:
+    with pytest.raises(ValueError, match="below the upper"):
+        Limits(1.0, -1.0, NO_PAIRS, 2.0)
+    with pytest.raises(ValueError, match="must be positive"):
+        Limits(-1.0, 1.0, NO_PAIRS, 0.0)

@@ -1,0 +1,130 @@
+"""From parameter values to the parts of the driver; everything that can contradict itself is found here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_driver.electronics import BACK_ENDS, DriveElectronics, ElectronicsSettings, make_electronics
+from dm_driver.geometry import hexagonal_positions, neighbour_pairs
+from dm_driver.output_stage import OutputStage
+from dm_driver.refusal import Refusal
+from dm_driver.safety_limiter import Limits, SafetyLimiter, Shape
+from dm_driver.volts import VoltScale
+from dm_driver.wiring import wiring_table
+
+
+@dataclass(frozen=True)
+class DriverConfiguration:
+    """A checked configuration.
+
+    Attributes:
+        x, y: (N,) actuator positions, m.
+        limiter: with the limits and neighbour pairs.
+        output: wiring and volts.
+        safe_shape: (N,) legal signals.
+        settings: how the electronics are reached.
+        kind: name of the back end.
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    limiter: SafetyLimiter
+    output: OutputStage
+    safe_shape: Shape
+    settings: ElectronicsSettings
+    kind: str
+
+    def make_electronics(self) -> DriveElectronics:
+        """Return a new back end, not yet opened."""
+        return make_electronics(self.kind, self.settings)
+
+
+def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
+    """Check the values of `driver_parameters.PARAMETERS` against each other and build the parts.
+
+    Raises:
+        ValueError: naming the parameter, its value and what is allowed.
+    """
+    if not values["mirror.serial"].strip():
+        raise ValueError("mirror.serial is empty: must be the mirror's serial number")
+    actuators = values["mirror.actuators"]
+    kind = values["electronics.kind"]
+    settings = ElectronicsSettings(
+        address=values["electronics.address"],
+        port=values["electronics.port"],
+        discovery_port=values["electronics.discovery_port"],
+        serial_port=values["electronics.serial_port"],
+        timeout_s=values["electronics.timeout"],
+    )
+    make_electronics(kind, settings)  # finds a missing setting now
+    back_end = BACK_ENDS[kind]
+    channel_of_actuator = wiring_table(values["mirror.wiring"], values["mirror.channels"], actuators, back_end.channels)
+    scale = VoltScale(
+        max_code=back_end.max_code,
+        dac_volts_at_zero=values["volts.dac_at_zero"],
+        dac_volts_at_full=values["volts.dac_at_full"],
+        amplifier_gain=values["volts.amplifier_gain"],
+        volts_min=values["volts.min"],
+        volts_max=values["volts.max"],
+    )
+    x, y = _positions(values, actuators)
+    if values["mirror.working_aperture_diameter"] > values["mirror.full_aperture_diameter"]:
+        raise ValueError(
+            f"mirror.working_aperture_diameter = {values['mirror.working_aperture_diameter']:g} m: must be at most"
+            f" mirror.full_aperture_diameter = {values['mirror.full_aperture_diameter']:g} m"
+        )
+    neighbour_a, neighbour_b = neighbour_pairs(x, y)
+    limits = Limits(
+        actuators=actuators,
+        signal_min=values["limits.signal_min"],
+        signal_max=values["limits.signal_max"],
+        neighbour_difference=values["limits.neighbour_difference"],
+        neighbour_a=neighbour_a,
+        neighbour_b=neighbour_b,
+        step=values["limits.step"],
+        slew_rate=values["limits.slew_rate"],
+        command_age=values["limits.command_age"],
+        command_lead=values["limits.command_lead"],
+    )
+    if limits.step < scale.resolution:
+        raise ValueError(
+            f"limits.step = {limits.step:g}: must be at least {scale.resolution:.3g}, the signal of one DAC code"
+        )
+    limiter = SafetyLimiter(limits)
+    try:
+        safe_shape = limiter.check_shape(values["safe_signals"] or np.full(actuators, -1.0), "safe_signals")
+    except Refusal as refusal:
+        raise ValueError(str(refusal)) from refusal
+    return DriverConfiguration(
+        x=x,
+        y=y,
+        limiter=limiter,
+        output=OutputStage(scale, channel_of_actuator, back_end.channels),
+        safe_shape=safe_shape,
+        settings=settings,
+        kind=kind,
+    )
+
+
+def _positions(values: Mapping[str, Any], actuators: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x = np.array(values["mirror.actuator_x"], dtype=np.float64)
+    y = np.array(values["mirror.actuator_y"], dtype=np.float64)
+    if x.size == 0 and y.size == 0:
+        return hexagonal_positions(
+            actuators,
+            values["mirror.pitch"],
+            values["mirror.start_angle"],
+            values["mirror.clockwise"],
+            values["mirror.reflected"],
+        )
+    for name, ordinates in (("mirror.actuator_x", x), ("mirror.actuator_y", y)):
+        if ordinates.size != actuators:
+            raise ValueError(
+                f"{name} has {ordinates.size} values: must have {actuators} (mirror.actuators), or both be empty"
+            )
+    return x, y

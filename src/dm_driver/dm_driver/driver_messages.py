@@ -1,0 +1,114 @@
+"""The messages of `pdm_driver`, from the ROS-free parts."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorState, MirrorInfo
+from numpy.typing import NDArray
+
+from dm_driver.driver_configuration import DriverConfiguration
+from dm_driver.moves import Kind, WriterState
+from dm_driver.refusal import Reason
+
+
+@dataclass(frozen=True)
+class Complaint:
+    """Why the last command was not carried out; reason OK when it was."""
+
+    reason: Reason = Reason.OK
+    message: str = ""
+    actuators: NDArray[np.bool_] | None = None
+
+
+def _floats(values: NDArray[np.float64]) -> array.array[float]:
+    return array.array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+def _indices(values: NDArray[np.intp]) -> array.array[int]:
+    return array.array("I", values.astype(np.uint32).tobytes())
+
+
+def driver_state(state: WriterState) -> int:
+    """The ActuatorState constant for a configured driver."""
+    if not state.link_up:
+        return int(ActuatorState.STATE_LINK_LOST)
+    if state.moving is Kind.SAFE:
+        return int(ActuatorState.STATE_SAFING)
+    return int(ActuatorState.STATE_ACTIVE if state.enabled else ActuatorState.STATE_INACTIVE)
+
+
+def unconfigured_message(frame_id: str, complaint: Complaint) -> ActuatorState:
+    """The state of a driver that has no valid configuration."""
+    message = ActuatorState(driver_state=ActuatorState.STATE_UNCONFIGURED)
+    message.header.frame_id = frame_id
+    message.error_code = int(complaint.reason)
+    message.message = complaint.message
+    return message
+
+
+def state_message(
+    state: WriterState, complaint: Complaint, configuration: DriverConfiguration, frame_id: str
+) -> ActuatorState:
+    """The state of a configured driver."""
+    message = ActuatorState(driver_state=driver_state(state))
+    message.header.frame_id = frame_id
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(state.stamp_ns, 1_000_000_000)
+    message.sequence = state.sequence
+    message.moving = state.moving is not None
+    message.history_known = state.history_known
+    if state.link_up or not state.enabled:
+        message.error_code, message.message = int(complaint.reason), complaint.message
+    else:
+        message.error_code, message.message = int(Reason.ELECTRONICS_UNREACHABLE), state.fault
+    flags = np.zeros(configuration.limiter.limits.actuators, dtype=np.uint8)
+    flags[~configuration.output.connected] |= ActuatorState.FLAG_UNUSED
+    if complaint.actuators is not None:
+        flags[complaint.actuators] |= ActuatorState.FLAG_REFUSED
+    if state.requested is not None and state.applied is not None and state.volts is not None:
+        message.requested = _floats(state.requested)
+        message.applied = _floats(state.applied)
+        message.volts = _floats(state.volts)
+        limits = configuration.limiter.limits
+        # Quantisation may leave a signal up to one code short of its limit.
+        code = configuration.output.scale.resolution
+        at_limit = (state.applied <= limits.signal_min + code) | (state.applied >= limits.signal_max - code)
+        flags[at_limit] |= ActuatorState.FLAG_AT_LIMIT
+        if message.moving:
+            flags[np.abs(state.requested - state.applied) > code] |= ActuatorState.FLAG_RAMPING
+    message.flags = array.array("B", flags.tobytes())
+    return message
+
+
+def mirror_info_message(
+    values: Mapping[str, Any], configuration: DriverConfiguration, frame_id: str, now: Any
+) -> MirrorInfo:
+    """Geometry and limits, for calibration and control. `now` is a time message."""
+    limits = configuration.limiter.limits
+    message = MirrorInfo(
+        name=values["mirror.name"],
+        serial=values["mirror.serial"],
+        actuators=limits.actuators,
+        actuator_x=_floats(configuration.x),
+        actuator_y=_floats(configuration.y),
+        neighbour_a=_indices(limits.neighbour_a),
+        neighbour_b=_indices(limits.neighbour_b),
+        full_aperture_diameter=values["mirror.full_aperture_diameter"],
+        working_aperture_diameter=values["mirror.working_aperture_diameter"],
+        signal_min=limits.signal_min,
+        signal_max=limits.signal_max,
+        neighbour_difference_max=limits.neighbour_difference,
+        slew_rate_max=limits.slew_rate,
+        volts_min=configuration.output.scale.volts_min,
+        volts_max=configuration.output.scale.volts_max,
+        safe_signals=_floats(configuration.safe_shape),
+        wiring=values["mirror.wiring"],
+        electronics=configuration.kind,
+    )
+    message.header.frame_id = frame_id
+    message.header.stamp = now
+    return message

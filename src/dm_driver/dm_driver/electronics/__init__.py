@@ -1,0 +1,28 @@
+"""Drive electronics behind one small class, chosen by name.
+
+A further drive unit is one subclass of :class:`~dm_driver.electronics.base.DriveElectronics` and one line in
+`BACK_ENDS`.
+"""
+
+from __future__ import annotations
+
+from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
+from dm_driver.electronics.edac40 import Edac40Tcp, Edac40Udp
+from dm_driver.electronics.usb_dac40 import UsbDac40
+
+BACK_ENDS: dict[str, type[DriveElectronics]] = {
+    "edac40_tcp": Edac40Tcp,
+    "edac40_udp": Edac40Udp,
+    "usb_dac40": UsbDac40,
+}
+
+
+def make_electronics(kind: str, settings: ElectronicsSettings) -> DriveElectronics:
+    """Return the back end named `kind`, not yet opened.
+
+    Raises:
+        ValueError: no such back end, or a setting it needs is missing.
+    """
+    if kind not in BACK_ENDS:
+        raise ValueError(f"electronics.kind = {kind!r}: must be one of {', '.join(BACK_ENDS)}")
+    return BACK_ENDS[kind].from_settings(settings)

@@ -1,0 +1,184 @@
+"""What every drive unit offers: a number of output channels that take integer codes, and a link that can break."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class ElectronicsError(Exception):
+    """Something about the drive electronics failed; the message says what, for a person."""
+
+
+class LinkError(ElectronicsError):
+    """The unit cannot be reached, closed the link, or does not take data in time. The link is closed afterwards."""
+
+
+class NotOpenError(ElectronicsError):
+    """The link was never opened, or was closed (by the user or after a `LinkError`)."""
+
+
+class CodeError(ElectronicsError, ValueError):
+    """The codes handed to `write` are not what the unit takes; nothing was sent."""
+
+
+@dataclass(frozen=True)
+class ElectronicsSettings:
+    """Where a unit is. Each back end takes what it needs.
+
+    Attributes:
+        address: host name or IPv4 address.
+        port: TCP or UDP port.
+        discovery_port: UDP port on which the unit answers discovery; 0 = not used.
+        serial_port: device file.
+        timeout_s: longest wait for the unit to take a frame or to answer.
+    """
+
+    address: str = ""
+    port: int = 1234
+    discovery_port: int = 0
+    serial_port: str = ""
+    timeout_s: float = 1.0
+
+
+class DriveElectronics(ABC):
+    """A drive unit. Public methods validate and keep track of the link, `_do_*` hooks touch the hardware.
+
+    Outputs hold their last values when the link closes, and no supported unit can be read back: what was written is
+    all that is known. One thread uses an object at a time.
+
+    Hooks raise `OSError` (pySerial's exceptions are) or `LinkError` for a broken link.
+    """
+
+    #: Number of output channels at the connector.
+    channels: ClassVar[int]
+    #: Code of full scale.
+    max_code: ClassVar[int]
+
+    def __init__(self) -> None:
+        self._open = False
+
+    @classmethod
+    @abstractmethod
+    def from_settings(cls, settings: ElectronicsSettings) -> Self:
+        """Make the unit described by `settings`; ValueError names a setting that is missing."""
+
+    @property
+    @abstractmethod
+    def where(self) -> str:
+        """The unit and its place, for messages."""
+
+    @property
+    def is_open(self) -> bool:
+        return self._open
+
+    def open(self) -> None:
+        """Open the link. Opening an open link does nothing; no output changes.
+
+        Raises:
+            LinkError: the unit cannot be reached.
+        """
+        if self._open:
+            return
+        try:
+            self._do_open()
+        except (OSError, LinkError) as error:
+            self._abandon()
+            raise LinkError(f"cannot open {self.where}: {error}") from error
+        self._open = True
+
+    def write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+        """Set the outputs, all of them at once.
+
+        Args:
+            codes: (channels,) unsigned integers 0..max_code, by connector channel.
+            wired: (channels,) True where an actuator is connected. Units that can, leave the other outputs alone;
+                the others set them to their `codes` too.
+
+        Raises:
+            CodeError: wrong shape, type or range; nothing was sent.
+            NotOpenError: the link is closed.
+            LinkError: the unit did not take the frame; it may or may not have changed its outputs.
+        """
+        self._check_codes(codes, wired)
+        self._require_open()
+        self._guard(lambda: self._do_write(codes, wired), "writing to")
+
+    def check(self) -> None:
+        """Find out cheaply (microseconds, without waiting for an answer) whether the link still stands.
+
+        Raises:
+            NotOpenError: the link is closed.
+            LinkError: the unit went away.
+        """
+        self._require_open()
+        self._guard(self._do_check, "checking")
+
+    def close(self) -> None:
+        """Close the link; outputs keep their values. Closing a closed link does nothing."""
+        if self._open:
+            self._abandon()
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _check_codes(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+        if codes.shape != (self.channels,) or codes.dtype.kind != "u":
+            raise CodeError(
+                f"codes: shape {codes.shape}, type {codes.dtype}; must be ({self.channels},) unsigned integers"
+            )
+        if wired.shape != (self.channels,) or wired.dtype != np.bool_:
+            raise CodeError(f"wired: shape {wired.shape}, type {wired.dtype}; must be ({self.channels},) bool")
+        if not wired.any():
+            raise CodeError("wired: no channel is set")
+        # An over-range code would wrap to a small one or spill into its neighbour's bits on the wire.
+        if int(codes.max()) > self.max_code:
+            channel = int(codes.argmax())
+            raise CodeError(f"codes[{channel}] = {int(codes[channel])}: must be 0 to {self.max_code}")
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise NotOpenError(f"{self.where} is not open")
+
+    def _guard(self, action: Callable[[], None], what: str) -> None:
+        """Run `action`; a broken link is closed, because a stream cut inside a frame has lost its framing."""
+        try:
+            action()
+        except (OSError, LinkError) as error:
+            self._abandon()
+            raise LinkError(f"{what} {self.where}: {error}") from error
+
+    def _abandon(self) -> None:
+        self._open = False
+        try:
+            self._do_close()
+        except OSError:
+            pass  # it is gone either way
+
+    @abstractmethod
+    def _do_open(self) -> None:
+        """Open the link."""
+
+    @abstractmethod
+    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+        """Encode and send one frame."""
+
+    @abstractmethod
+    def _do_check(self) -> None:
+        """Raise when the link is broken."""
+
+    @abstractmethod
+    def _do_close(self) -> None:
+        """Close the link; called also after a failed `_do_open`: the link may be half made or absent."""

@@ -1,0 +1,171 @@
+"""EDAC40: 40 channels, 16 bit, over Ethernet (hardware notes, section 2).
+
+The unit acknowledges nothing and cannot be read back. Only command 0 (value) is ever sent: offset, gain and global
+offset live in its non-volatile memory and shift every voltage.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from serial.urlhandler import protocol_socket
+
+from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings, LinkError
+from dm_driver.electronics.discovery import Probe
+
+CHANNELS: Final = 40
+MAX_CODE: Final = 0xFFFF
+COMMAND_VALUE: Final = 0
+
+#: Connector channel -> physical channel, both 0-based. The permutation is its own inverse.
+PHYSICAL_CHANNEL: Final[NDArray[np.intp]] = np.array(
+    [
+        *(6, 7, 4, 5, 2, 3, 0, 1, 22, 23, 20, 21, 18, 19, 16, 17, 14, 15, 12, 13),
+        *(10, 11, 8, 9, 38, 39, 36, 37, 34, 35, 32, 33, 30, 31, 28, 29, 26, 27, 24, 25),
+    ]
+)
+
+
+def encode_frame(codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> bytes:
+    """Return the frame that sets the `wired` channels to `codes`.
+
+    Args:
+        codes: (40,) 0..65535 by connector channel.
+        wired: (40,) bool by connector channel.
+
+    Returns:
+        8 to 86 bytes: channel mask (40 bit, little-endian, by physical channel), the command byte, then one u16
+        little-endian per set bit in order of rising physical channel.
+    """
+    mask = wired[PHYSICAL_CHANNEL]
+    values = codes[PHYSICAL_CHANNEL][mask].astype("<u2")
+    return np.packbits(mask, bitorder="little").tobytes() + bytes([COMMAND_VALUE]) + values.tobytes()
+
+
+class _Edac40(DriveElectronics):
+    channels = CHANNELS
+    max_code = MAX_CODE
+    _protocol: str
+
+    def __init__(self, address: str, port: int = 1234, discovery_port: int = 0, timeout_s: float = 1.0) -> None:
+        super().__init__()
+        self._address = address
+        self._port = port
+        self._discovery_port = discovery_port
+        self._timeout_s = timeout_s
+
+    @classmethod
+    def from_settings(cls, settings: ElectronicsSettings) -> Self:
+        if not settings.address:
+            raise ValueError("electronics.address is empty: must be the EDAC40's host name or IPv4 address")
+        return cls(settings.address, settings.port, settings.discovery_port, settings.timeout_s)
+
+    @property
+    def where(self) -> str:
+        return f"EDAC40 at {self._address}:{self._port} ({self._protocol})"
+
+
+class Edac40Tcp(_Edac40):
+    """EDAC40 over TCP. The unit takes one client at a time."""
+
+    _protocol = "TCP"
+
+    def __init__(self, address: str, port: int = 1234, discovery_port: int = 0, timeout_s: float = 1.0) -> None:
+        super().__init__(address, port, discovery_port, timeout_s)
+        self._link: protocol_socket.Serial | None = None
+
+    def _do_open(self) -> None:
+        self._link = protocol_socket.Serial(
+            f"socket://{self._address}:{self._port}", timeout=0, write_timeout=self._timeout_s
+        )
+        # A duplicate of the descriptor shares its options, which pySerial does not offer.
+        with socket.socket(fileno=os.dup(self._link.fileno())) as options:
+            # Nagle's algorithm would hold back a frame until the one before is acknowledged (up to 40 ms), then send
+            # several in one segment.
+            options.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # A pulled cable closes nothing: let the kernel find out while idle, and give up on unacknowledged frames.
+            options.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            options.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+            options.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+            options.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+            options.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, max(1, round(self._timeout_s * 1000)))
+
+    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+        self._do_check()  # the first frame after the unit closed would be swallowed without an error
+        assert self._link is not None
+        self._link.write(encode_frame(codes, wired))
+
+    def _do_check(self) -> None:
+        # The unit never sends: a readable link is one that has ended (read raises), or a stray byte (dropped).
+        assert self._link is not None
+        while self._link.in_waiting:
+            self._link.read(1)
+
+    def _do_close(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+
+class Edac40Udp(_Edac40):
+    """EDAC40 over UDP.
+
+    A datagram to a unit that is off is lost without an error. A connected socket at least notices a host that is up
+    but has no such port; with `discovery_port` the unit must answer discovery when the link is opened and, while it
+    stands, within `timeout_s`.
+    """
+
+    _protocol = "UDP"
+
+    def __init__(self, address: str, port: int = 1234, discovery_port: int = 0, timeout_s: float = 1.0) -> None:
+        super().__init__(address, port, discovery_port, timeout_s)
+        self._socket: socket.socket | None = None
+        self._probe: Probe | None = None
+        self._unanswered_since: float | None = None
+
+    def _do_open(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.settimeout(self._timeout_s)
+        self._socket.connect((self._address, self._port))
+        self._unanswered_since = None
+        if self._discovery_port:
+            self._probe = Probe(self._address, self._discovery_port)
+            self._probe.ask()
+            if not self._probe.answered(self._timeout_s):
+                raise LinkError(
+                    f"no answer to discovery on UDP port {self._discovery_port} within {self._timeout_s:g} s"
+                )
+
+    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+        assert self._socket is not None
+        self._socket.send(encode_frame(codes, wired))
+
+    def _do_check(self) -> None:
+        assert self._socket is not None
+        pending = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if pending:
+            raise OSError(pending, os.strerror(pending))
+        if self._probe is None:
+            return
+        # The answer to one question is looked for at the next check, so that a frame never waits for the network.
+        now = time.monotonic()
+        if self._probe.answered(0.0):
+            self._unanswered_since = None
+        if self._unanswered_since is None:
+            self._unanswered_since = now
+        elif now - self._unanswered_since > self._timeout_s:
+            raise LinkError(f"no answer to discovery for {now - self._unanswered_since:.2f} s")
+        self._probe.ask()
+
+    def _do_close(self) -> None:
+        link, self._socket = self._socket, None
+        probe, self._probe = self._probe, None
+        if link is not None:
+            link.close()
+        if probe is not None:
+            probe.close()

@@ -1,0 +1,97 @@
+"""USB DAC-40: 40 channels, 12 bit, behind an FTDI virtual serial port (hardware notes, section 3)."""
+
+from __future__ import annotations
+
+from typing import Final, Self
+
+import numpy as np
+import serial
+from numpy.typing import NDArray
+
+from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
+
+CHANNELS: Final = 40
+MAX_CODE: Final = 0xFFF
+FRAME_LENGTH: Final = 130
+
+_GROUPS: Final = 8
+_CHIPS: Final = 5
+_BITS: Final = 12
+_GROUP_LENGTH: Final = 16
+
+#: Channel of DAC chip c in group g at index 5 g + c.
+CHANNEL_ORDER: Final[NDArray[np.intp]] = np.array(
+    [
+        *(7, 15, 23, 31, 39, 6, 14, 22, 30, 38, 5, 13, 21, 29, 37, 4, 12, 20, 28, 36),
+        *(3, 11, 19, 27, 35, 2, 10, 18, 26, 34, 1, 9, 17, 25, 33, 0, 8, 16, 24, 32),
+    ]
+)
+_CHIP_BIT: Final = (1 << np.arange(_CHIPS)).astype(np.uint8)
+_BIT_SHIFT: Final = np.arange(_BITS - 1, -1, -1, dtype=np.uint16)
+
+
+def _empty_frame() -> NDArray[np.uint8]:
+    """The frame with start byte and group addresses, all data bits 0."""
+    frame = np.zeros(FRAME_LENGTH, dtype=np.uint8)
+    frame[0] = 0xFF
+    for group in range(_GROUPS):
+        for position, bit in enumerate((2, 1, 0)):
+            frame[1 + _GROUP_LENGTH * group + 1 + position] = 0x1F if group >> bit & 1 else 0x00
+    return frame
+
+
+_EMPTY_FRAME: Final = _empty_frame()
+
+
+def encode_frame(codes: NDArray[np.uint16]) -> bytes:
+    """Return the 130-byte frame that sets all 40 channels.
+
+    Args:
+        codes: (40,) 0..4095 by connector channel.
+    """
+    chips = codes[CHANNEL_ORDER].reshape(_GROUPS, 1, _CHIPS)
+    bits = (chips >> _BIT_SHIFT[:, None] & 1).astype(np.uint8)  # group, bit from the most significant, chip
+    frame = _EMPTY_FRAME.copy()
+    frame[1:-1].reshape(_GROUPS, _GROUP_LENGTH)[:, -_BITS:] = bits @ _CHIP_BIT
+    return frame.tobytes()
+
+
+class UsbDac40(DriveElectronics):
+    """USB DAC-40. Every frame sets all 40 channels, connected or not."""
+
+    channels = CHANNELS
+    max_code = MAX_CODE
+
+    def __init__(self, serial_port: str, timeout_s: float = 1.0) -> None:
+        super().__init__()
+        self._serial_port = serial_port
+        self._timeout_s = timeout_s
+        self._link: serial.Serial | None = None
+
+    @classmethod
+    def from_settings(cls, settings: ElectronicsSettings) -> Self:
+        if not settings.serial_port:
+            raise ValueError("electronics.serial_port is empty: must be a device file such as /dev/ttyUSB0")
+        return cls(settings.serial_port, settings.timeout_s)
+
+    @property
+    def where(self) -> str:
+        return f"USB DAC-40 at {self._serial_port}"
+
+    def _do_open(self) -> None:
+        # Exclusive: two writers on one unit would tear each other's frames.
+        self._link = serial.Serial(self._serial_port, timeout=0, write_timeout=self._timeout_s, exclusive=True)
+        self._link.write(bytes(FRAME_LENGTH))  # ends any frame that an earlier program left half sent
+
+    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+        assert self._link is not None
+        self._link.write(encode_frame(codes))
+
+    def _do_check(self) -> None:
+        assert self._link is not None
+        _ = self._link.in_waiting  # fails on a device that has been unplugged
+
+    def _do_close(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()

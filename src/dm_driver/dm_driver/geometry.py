@@ -1,0 +1,85 @@
+"""Where the actuators are, in the mirror surface frame (x right, y up, metres), and which are neighbours."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid the nearest six, whose
+#: next ones are sqrt(3) away.
+NEIGHBOUR_DISTANCE_RATIO = 1.2
+
+
+def ring_count(actuators: int) -> int:
+    """Return the number of rings around the centre of a full hexagonal pattern of `actuators` actuators.
+
+    Raises:
+        ValueError: no full pattern has that number (1, 7, 19, 37, 61, ...).
+    """
+    rings = round((math.sqrt(max(0.0, 12 * actuators - 3)) - 3) / 6)
+    if actuators < 1 or 1 + 3 * rings * (rings + 1) != actuators:
+        raise ValueError(
+            f"mirror.actuators = {actuators}: no full hexagonal pattern has that number (1, 7, 19, 37, 61, ...);"
+            " give mirror.actuator_x and mirror.actuator_y"
+        )
+    return rings
+
+
+def hexagonal_positions(
+    actuators: int = 37,
+    pitch: float = 4.3e-3,
+    start_angle: float = 0.0,
+    clockwise: bool = False,
+    reflected: bool = False,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the positions of a full hexagonal pattern, numbered as OKO's PDM mirrors are.
+
+    Actuator 1 is the centre, 2-7 the first ring, 8-19 the second, 20-37 the third; sequential in angle within a ring.
+    Angle of the first one, sense and reflection differ from unit to unit.
+
+    Args:
+        actuators: 1, 7, 19, 37, ...
+        pitch: distance of neighbours, m.
+        start_angle: direction from the centre to the first actuator of every ring (a corner of its hexagon),
+            counter-clockwise from x, rad.
+        clockwise: numbers rise clockwise instead of counter-clockwise.
+        reflected: the finished pattern is mirrored left-right (x to -x), as when seen from behind.
+
+    Returns:
+        (N,) x and (N,) y in m.
+    """
+    x, y = [np.zeros(1)], [np.zeros(1)]
+    corner_angle = np.arange(7) * (math.pi / 3) * (-1.0 if clockwise else 1.0) + start_angle
+    corner_x, corner_y = np.cos(corner_angle), np.sin(corner_angle)
+    for ring in range(1, ring_count(actuators) + 1):
+        along = np.arange(ring) / ring  # the sites of a side, from its first corner on
+        for corners, ordinates in ((corner_x, x), (corner_y, y)):
+            sides = corners[:-1, None] + (corners[1:] - corners[:-1])[:, None] * along
+            ordinates.append(ring * pitch * sides.ravel())
+    all_x, all_y = np.concatenate(x), np.concatenate(y)
+    return (-all_x if reflected else all_x), all_y
+
+
+def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return index arrays (a, b), a < b, of all pairs closer than 1.2 times the smallest distance.
+
+    Args:
+        x, y: (N,) positions in m.
+
+    Raises:
+        ValueError: two actuators at the same place.
+    """
+    a, b = np.triu_indices(x.size, k=1)
+    if a.size == 0:
+        return a, b
+    distance = np.hypot(x[a] - x[b], y[a] - y[b])
+    smallest = distance.min()
+    if smallest <= 0.0:
+        pair = int(distance.argmin())
+        raise ValueError(
+            f"mirror.actuator_x and mirror.actuator_y: actuators {a[pair] + 1} and {b[pair] + 1} are at the same place"
+        )
+    near = distance < NEIGHBOUR_DISTANCE_RATIO * smallest
+    return a[near], b[near]

@@ -1,0 +1,97 @@
+"""What the actuator writer is asked to do, and what it tells about itself."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_driver.safety_limiter import Shape
+
+
+class Kind(Enum):
+    """What a move is for."""
+
+    COMMAND = "command"
+    DEGAUSS = "degauss"
+    SAFE = "safe shape"
+
+
+class Outcome(Enum):
+    """How a move ended."""
+
+    REACHED = "reached"
+    SUPERSEDED = "superseded by a newer command"
+    LINK_LOST = "abandoned: the link to the electronics was lost"
+    STOPPED = "abandoned: the driver stopped"
+
+
+class Move:
+    """A way through legal shapes; its end can be waited for.
+
+    Attributes:
+        kind: what it is for.
+        waypoints: shapes to pass; straight lines between them.
+        target: the last of them.
+    """
+
+    def __init__(self, kind: Kind, waypoints: Iterable[Shape], target: Shape) -> None:
+        self.kind = kind
+        self.waypoints = waypoints
+        self.target = target
+        self._ended = threading.Event()
+        self._outcome: Outcome | None = None
+
+    def wait(self, timeout_s: float | None = None) -> Outcome | None:
+        """Wait for the end; None when it has not come in time."""
+        self._ended.wait(timeout_s)
+        return self._outcome
+
+    def finish(self, outcome: Outcome) -> None:
+        """Mark the end; only the first call counts."""
+        if not self._ended.is_set():
+            self._outcome = outcome
+            self._ended.set()
+
+
+@dataclass
+class Counters:
+    """What happened since the writer was made."""
+
+    frames: int = 0
+    link_losses: int = 0
+    reconnects: int = 0
+    overruns: int = 0  #: writes of a ramp that came more than one step interval late
+
+
+@dataclass(frozen=True)
+class WriterState:
+    """One consistent look at the writer. Arrays are never changed after they were handed out.
+
+    Attributes:
+        link_up: the electronics are open.
+        enabled: writes are allowed.
+        moving: kind of the move under way; None when the mirror rests.
+        requested: (N,) where the last accepted move leads; None before the first write.
+        applied: (N,) what stands at the actuators, after quantisation; None before the first write.
+        volts: (N,) V at the actuators for `applied`.
+        stamp_ns: when `applied` was written, in the caller's clock.
+        sequence: writes since the writer was enabled.
+        history_known: every write since a completed degauss went through.
+        fault: why the link is down, in words; empty when it is up.
+    """
+
+    link_up: bool
+    enabled: bool
+    moving: Kind | None
+    requested: Shape | None
+    applied: Shape | None
+    volts: NDArray[np.float64] | None
+    stamp_ns: int
+    sequence: int
+    history_known: bool
+    fault: str

@@ -1,0 +1,274 @@
+"""Node `pdm_driver`: takes actuator commands and drives the mirror's electronics within the limits.
+
+Lifecycle: `configure` reads the parameters and opens the electronics, `activate` writes the safe shape and accepts
+commands, `deactivate` ramps to the safe shape. A unit that cannot be reached does not fail a transition: the driver
+reports the lost link and keeps trying, so that the order in which things are switched on does not matter.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
+from dm_msgs.srv import Degauss, SetSignals
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import ParameterException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.time import Time
+
+from dm_driver.actuator_writer import ActuatorWriter
+from dm_driver.driver_configuration import DriverConfiguration, build_configuration
+from dm_driver.driver_health import driver_health
+from dm_driver.driver_messages import Complaint, mirror_info_message, state_message, unconfigured_message
+from dm_driver.driver_parameters import PARAMETERS
+from dm_driver.moves import Move, Outcome, WriterState
+from dm_driver.refusal import Reason, Refusal
+from dm_runtime import diagnostics, parameters, qos
+from dm_runtime.executor import run_node
+from dm_runtime.worker import WorkerService
+
+#: Shortest time between two state messages in the middle of a ramp.
+STATE_INTERVAL_S = 0.02
+#: Time for the electronics beyond what a ramp takes.
+MARGIN_S = 2.0
+
+_REASON_OF_OUTCOME = {
+    Outcome.SUPERSEDED: Reason.PREEMPTED,
+    Outcome.LINK_LOST: Reason.ELECTRONICS_UNREACHABLE,
+    Outcome.STOPPED: Reason.DRIVER_INACTIVE,
+}
+
+
+class PdmDriver(LifecycleNode):
+    """The node; see the head of this module."""
+
+    def __init__(self) -> None:
+        super().__init__("pdm_driver")
+        self._values: dict[str, Any] = {}
+        self._problem = ""  # what is wrong with the parameters, in words
+        try:
+            self._values = parameters.declare(self, PARAMETERS)
+        except (parameters.ParameterError, ParameterException) as error:
+            self._problem = str(error)
+        self._frame_id: str = self._values.get("frame_id", "mirror")
+        self._configuration: DriverConfiguration | None = None
+        self._writer: ActuatorWriter | None = None
+        self._refused: Counter[str] = Counter()
+        # Guards complaint and publishing: state leaves the executor's, the writer's and the services' threads.
+        self._state_lock = threading.Lock()
+        self._complaint = Complaint()
+        self._published_at = 0.0
+        # Plain publishers: the state must be seen in every lifecycle state.
+        self._state_publisher = self.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+        self._info_publisher = self.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
+        self.create_subscription(ActuatorCommand, "actuator_command", self._on_command, qos.COMMAND)
+        WorkerService(self, SetSignals, "set_signals", self._on_set_signals)
+        WorkerService(self, Degauss, "degauss", self._on_degauss)
+        self._diagnostics = diagnostics.Diagnostics(
+            self, f"{self._values.get('mirror.name', '?')} {self._values.get('mirror.serial', '?')}", self._health
+        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self._values.get("state_period", 0.5), self._publish_state, clock=steady)
+        if self._values.get("autostart", True):
+            self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
+
+    # Lifecycle
+
+    def _autostart(self) -> None:
+        self._autostart_timer.cancel()
+        if self._state_machine.current_state[1] != "unconfigured":
+            return  # somebody was quicker
+        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            if self._problem:
+                raise ValueError(self._problem)
+            configuration = build_configuration(self._values)
+        except ValueError as error:
+            self.get_logger().error(f"configuration refused: {error}")
+            self._complain(Complaint(Reason.INVALID_ARGUMENT, f"configuration refused: {error}"))
+            return TransitionCallbackReturn.FAILURE
+        self._configuration = configuration
+        self._complaint = Complaint()
+        self._writer = ActuatorWriter(
+            configuration.make_electronics(),
+            configuration.output,
+            configuration.limiter,
+            configuration.safe_shape,
+            listener=self._on_writer,
+            watchdog_s=self._values["limits.watchdog"],
+            stamp_ns=lambda: int(self.get_clock().now().nanoseconds),
+        )
+        self._writer.start()
+        self._writer.wait_for_link(self._values["electronics.timeout"])
+        self._info_publisher.publish(
+            mirror_info_message(self._values, configuration, self._frame_id, self.get_clock().now().to_msg())
+        )
+        self._publish_state()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        writer = self._writer
+        assert writer is not None
+        self._complaint = Complaint()
+        if writer.enable(MARGIN_S if writer.state().link_up else 0.0):
+            self.get_logger().info("active; the safe shape is written")
+        else:
+            self.get_logger().warning(
+                f"active, but the electronics are unreachable: {writer.state().fault}; the safe shape is written as"
+                " soon as they answer"
+            )
+        self._publish_state()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._to_safe_shape("deactivate")
+        self._publish_state()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._release("cleanup")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._release("shutdown")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._release("error")
+        return TransitionCallbackReturn.SUCCESS
+
+    def make_safe(self) -> None:
+        """Ramp to the safe shape and close the electronics; runs when the process ends (SIGINT, SIGTERM)."""
+        self._release("end of the process")
+
+    def _to_safe_shape(self, why: str) -> None:
+        writer, configuration = self._writer, self._configuration
+        if writer is None or configuration is None or not writer.state().enabled:
+            return
+        ramp_time = writer.ramp_time(configuration.safe_shape)
+        outcome = writer.disable(ramp_time + self._values["electronics.timeout"] + MARGIN_S)
+        if outcome is Outcome.REACHED:
+            self.get_logger().info(f"{why}: the mirror stands in the safe shape")
+        else:
+            self.get_logger().error(
+                f"{why}: the safe shape was not reached ({outcome.value}); the outputs probably hold their last values"
+            )
+
+    def _release(self, why: str) -> None:
+        self._to_safe_shape(why)
+        writer, self._writer, self._configuration = self._writer, None, None
+        if writer is not None and not writer.stop():
+            self.get_logger().error(f"{why}: the electronics' thread hangs; it ends with the process")
+        self._publish_state()
+
+    # Commands
+
+    def _on_command(self, message: ActuatorCommand) -> None:
+        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
+            stamp = Time.from_msg(message.header.stamp, self.get_clock().clock_type)
+            if stamp.nanoseconds:
+                configuration.limiter.check_age((self.get_clock().now() - stamp).nanoseconds * 1e-9)
+            return writer.command(configuration.limiter.check_shape(message.signals))
+
+        self._attempt("actuator_command", carry_out)
+
+    def _on_set_signals(self, request: Any, response: Any) -> Any:
+        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move | None:
+            target = configuration.limiter.check_shape(request.signals)
+            response.ramp_time = writer.ramp_time(target)
+            return None if request.dry_run else writer.command(target)
+
+        self._answer(response, self._attempt("set_signals", carry_out, dry_run=request.dry_run), wait=request.wait)
+        writer = self._writer
+        if writer is not None and (applied := writer.state().applied) is not None:
+            response.applied.frombytes(applied.tobytes())
+        return response
+
+    def _on_degauss(self, request: Any, response: Any) -> Any:
+        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
+            limits = configuration.limiter.limits
+            middle = np.full(limits.actuators, 0.5 * (limits.signal_min + limits.signal_max))
+            end = configuration.limiter.check_shape(request.end_signals or middle, "end_signals")
+            return writer.degauss(request.amplitude, request.steps or self._values["degauss.steps"], end)
+
+        begun = time.monotonic()
+        self._answer(response, self._attempt("degauss", carry_out), wait=True)
+        response.duration = time.monotonic() - begun
+        return response
+
+    def _attempt(
+        self,
+        source: str,
+        carry_out: Callable[[ActuatorWriter, DriverConfiguration], Move | None],
+        dry_run: bool = False,
+    ) -> Move | Refusal | None:
+        """Carry out a request, or return and report why not. A refused dry run is the caller's business only."""
+        writer, configuration = self._writer, self._configuration
+        if not dry_run:
+            self._complaint = Complaint()  # before the writer's thread tells of the first write
+        try:
+            if writer is None or configuration is None:
+                raise Refusal(Reason.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first")
+            move = carry_out(writer, configuration)
+        except Refusal as refusal:
+            if not dry_run:
+                self._refused[refusal.reason.name] += 1
+                self.get_logger().warning(f"{source} refused: {refusal}", throttle_duration_sec=1.0)
+                self._complain(Complaint(refusal.reason, f"{source} refused: {refusal}", refusal.actuators))
+            return refusal
+        return move
+
+    @staticmethod
+    def _answer(response: Any, result: Move | Refusal | None, wait: bool) -> None:
+        if isinstance(result, Refusal):
+            response.error_code, response.message = int(result.reason), str(result)
+        elif result is not None and wait:
+            outcome = result.wait()
+            if outcome is not None and outcome is not Outcome.REACHED:
+                response.error_code, response.message = int(_REASON_OF_OUTCOME[outcome]), outcome.value
+
+    # State
+
+    def _on_writer(self, state: WriterState, edge: bool) -> None:
+        """Runs in the writer's thread after every write and every change of the link."""
+        if edge and state.fault and state.fault != "closed":
+            self.get_logger().error(f"{state.fault}; trying again", throttle_duration_sec=5.0)
+        if edge or time.monotonic() - self._published_at >= STATE_INTERVAL_S:
+            self._publish_state()
+
+    def _complain(self, complaint: Complaint) -> None:
+        self._complaint = complaint
+        self._publish_state()
+
+    def _publish_state(self) -> None:
+        with self._state_lock:
+            if not self.context.ok():  # on the way out there is nobody left to tell
+                return
+            writer, configuration = self._writer, self._configuration
+            if writer is None or configuration is None:
+                message = unconfigured_message(self._frame_id, self._complaint)
+            else:
+                message = state_message(writer.state(), self._complaint, configuration, self._frame_id)
+            self._state_publisher.publish(message)
+            self._published_at = time.monotonic()
+
+    def _health(self) -> diagnostics.Health:
+        return driver_health(self._writer, self._complaint, self._refused)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(PdmDriver, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

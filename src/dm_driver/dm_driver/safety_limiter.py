@@ -1,0 +1,228 @@
+"""What a command must satisfy before it reaches the electronics, and how a large move is cut into small writes.
+
+The legal shapes are those with every signal in range and no two neighbours further apart than allowed. Both conditions
+are convex: a straight line between two legal shapes stays legal. A move is therefore a straight line cut into equal
+steps, may be left for a new target at any of them, and every shape on the way is as safe as its ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dm_driver.refusal import Reason, Refusal
+
+Shape = NDArray[np.float64]
+
+#: A value this far beyond a limit is rounding, not a mistake.
+SLACK = 1e-9
+#: Interpolation rounds once more, so the check in front of the write is wider by this.
+_ROUNDING = 1e-12
+
+
+def _no_pairs() -> NDArray[np.intp]:
+    return np.zeros(0, dtype=np.intp)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The limits of one mirror; signals are normalised.
+
+    Attributes:
+        actuators: number of signals N.
+        signal_min, signal_max: range of every signal, inside -1..+1.
+        neighbour_difference: largest difference between the signals of neighbouring actuators.
+        neighbour_a, neighbour_b: (P,) indices of the neighbours.
+        step: largest change of a signal from one write to the next.
+        slew_rate: largest mean rate of change of a signal, 1/s.
+        command_age: a command older than this is refused, s.
+        command_lead: a command stamped this far in the future is refused, s.
+
+    Raises:
+        ValueError: naming the parameter that is wrong.
+    """
+
+    actuators: int
+    signal_min: float = -1.0
+    signal_max: float = 1.0
+    neighbour_difference: float = 1.0
+    neighbour_a: NDArray[np.intp] = field(default_factory=_no_pairs)
+    neighbour_b: NDArray[np.intp] = field(default_factory=_no_pairs)
+    step: float = 0.1
+    slew_rate: float = 40.0
+    command_age: float = 1.0
+    command_lead: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not -1.0 <= self.signal_min < self.signal_max <= 1.0:
+            raise ValueError(
+                f"limits.signal_min = {self.signal_min:g}, limits.signal_max = {self.signal_max:g}: must be rising and"
+                " in -1 to 1"
+            )
+        for name in ("neighbour_difference", "step", "slew_rate", "command_age", "command_lead"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"limits.{name} = {value:g}: must be finite and above 0")
+
+
+class SafetyLimiter:
+    """Judge commands and plan moves within `Limits`. Holds no state: the caller says where the mirror stands."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
+
+    def check_shape(self, signals: ArrayLike, name: str = "signals") -> Shape:
+        """Return `signals` as a legal shape (a copy, rounding beyond the range cut off).
+
+        Raises:
+            Refusal: INVALID_LENGTH, NOT_FINITE, OUT_OF_RANGE or NEIGHBOUR_DIFFERENCE.
+        """
+        limits = self.limits
+        shape = np.array(signals, dtype=np.float64)
+        if shape.shape != (limits.actuators,):
+            raise Refusal(
+                Reason.INVALID_LENGTH, f"{name} has {shape.size} values: must have {limits.actuators}, one per actuator"
+            )
+        low, high = limits.signal_min, limits.signal_max
+        inside = (shape >= low - SLACK) & (shape <= high + SLACK)  # False for NaN
+        if not inside.all():
+            finite = np.isfinite(shape)
+            if not finite.all():
+                raise Refusal(Reason.NOT_FINITE, self._words(name, shape, ~finite, "must be a finite number"), ~finite)
+            raise Refusal(
+                Reason.OUT_OF_RANGE, self._words(name, shape, ~inside, f"must be {low:g} to {high:g}"), ~inside
+            )
+        self._check_neighbours(shape, name, SLACK)
+        return np.clip(shape, low, high, out=shape)
+
+    def check_age(self, age_s: float) -> None:
+        """Judge the age of a command's stamp (negative = in the future).
+
+        Raises:
+            Refusal: STALE.
+        """
+        if not age_s <= self.limits.command_age:
+            raise Refusal(
+                Reason.STALE,
+                f"header.stamp is {age_s:.3f} s old: must be at most {self.limits.command_age:g} s"
+                " (limits.command_age)",
+            )
+        if age_s < -self.limits.command_lead:
+            raise Refusal(
+                Reason.STALE,
+                f"header.stamp lies {-age_s:.3f} s in the future: must be at most {self.limits.command_lead:g} s"
+                " (limits.command_lead); do the clocks agree?",
+            )
+
+    def check_write(self, previous: Shape | None, shape: Shape) -> None:
+        """The last look before a write: a legal shape, and no step larger than allowed.
+
+        `previous` is what was written before; None when the outputs are unknown, so that no step can be judged.
+
+        Raises:
+            Refusal: each is a defect of the caller.
+        """
+        limits = self.limits
+        if shape.shape != (limits.actuators,):
+            self.check_shape(shape)
+        outside = ~((shape >= limits.signal_min) & (shape <= limits.signal_max))
+        if outside.any():
+            rule = f"must be {limits.signal_min:g} to {limits.signal_max:g}"
+            raise Refusal(Reason.INTERNAL, self._words("signals", shape, outside, rule), outside)
+        self._check_neighbours(shape, "signals", SLACK + _ROUNDING)
+        if previous is not None:
+            change = np.abs(shape - previous)
+            too_large = ~(change <= limits.step + _ROUNDING)
+            if too_large.any():
+                raise Refusal(
+                    Reason.INTERNAL,
+                    self._words("step", change, too_large, f"must be at most {limits.step:g} (limits.step)"),
+                    too_large,
+                )
+
+    def ramp(self, start: Shape, target: Shape) -> Iterator[Shape]:
+        """Yield the shapes to write on the way from `start` (excluded) to `target` (included, exactly).
+
+        Both must be legal. No signal changes by more than `limits.step` from one to the next, and every one is legal
+        (see the head of this module). At least one shape is yielded, also when nothing changes.
+        """
+        steps = max(1, math.ceil(_largest_change(start, target) / self.limits.step - SLACK))
+        difference = target - start
+        low, high = self.limits.signal_min, self.limits.signal_max
+        for number in range(1, steps):
+            # The last bit of an interpolated value may lie beyond the range.
+            yield np.clip(start + difference * (number / steps), low, high)
+        yield target
+
+    def path(self, start: Shape, waypoints: Iterable[Shape]) -> Iterator[Shape]:
+        """Yield the shapes to write on the way from `start` through all `waypoints` (legal but for rounding)."""
+        for waypoint in waypoints:
+            target = np.clip(waypoint, self.limits.signal_min, self.limits.signal_max)
+            yield from self.ramp(start, target)
+            start = target
+
+    def pause_after(self, previous: Shape, shape: Shape) -> float:
+        """Seconds that must pass after writing `shape` over `previous` before the next write."""
+        return _largest_change(previous, shape) / self.limits.slew_rate
+
+    def ramp_time(self, start: Shape, target: Shape) -> float:
+        """Seconds from the first to the last write of a move."""
+        change = _largest_change(start, target)
+        steps = max(1, math.ceil(change / self.limits.step - SLACK))
+        return change / self.limits.slew_rate * (steps - 1) / steps
+
+    def _check_neighbours(self, shape: Shape, name: str, slack: float) -> None:
+        limits = self.limits
+        difference = np.abs(shape[limits.neighbour_a] - shape[limits.neighbour_b])
+        too_far = difference > limits.neighbour_difference + slack
+        if not too_far.any():
+            return
+        at_fault = np.zeros(limits.actuators, dtype=np.bool_)
+        at_fault[limits.neighbour_a[too_far]] = True
+        at_fault[limits.neighbour_b[too_far]] = True
+        worst = int(difference.argmax())
+        a, b = int(limits.neighbour_a[worst]), int(limits.neighbour_b[worst])
+        others = int(too_far.sum()) - 1
+        raise Refusal(
+            Reason.NEIGHBOUR_DIFFERENCE,
+            f"{name} of the neighbouring actuators {a + 1} and {b + 1} ({shape[a]:g} and {shape[b]:g}) differ by"
+            f" {difference[worst]:g}: must be at most {limits.neighbour_difference:g} (limits.neighbour_difference)"
+            + (f"; {others} more pairs likewise" if others else ""),
+            at_fault,
+        )
+
+    @staticmethod
+    def _words(name: str, values: NDArray[np.float64], at_fault: NDArray[np.bool_], rule: str) -> str:
+        first = int(at_fault.argmax())
+        others = int(at_fault.sum()) - 1
+        return f"{name} of actuator {first + 1} = {values[first]:.6g}: {rule}" + (
+            f"; {others} more likewise" if others else ""
+        )
+
+
+class Watchdog:
+    """Expires when no fresh command came for `period_s`; 0 = never. Starts disarmed."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self.deadline = math.inf
+
+    def feed(self, now: float) -> None:
+        """A fresh command came at `now` (s of any steady clock)."""
+        if self._period_s > 0.0:
+            self.deadline = now + self._period_s
+
+    def disarm(self) -> None:
+        """Do not expire before the next command."""
+        self.deadline = math.inf
+
+    def expired(self, now: float) -> bool:
+        return now >= self.deadline
+
+
+def _largest_change(start: Shape, target: Shape) -> float:
+    return float(np.abs(target - start).max())

@@ -1,0 +1,148 @@
+"""Parameters of the node `virtual_bench`, and the bench configuration made of their values."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dm_driver.virtual.bench import BenchConfig, FilesConfig
+from dm_driver.virtual.drive_unit import DriveConfig
+from dm_driver.virtual.electronics import PortsConfig
+from dm_driver.virtual.hysteresis import LAWS
+from dm_driver.virtual.interferometer import InterferometerConfig
+from dm_driver.virtual.monitor import MonitorConfig
+from dm_driver.virtual.piezo import PiezoConfig
+from dm_driver.virtual.plate import PlateConfig
+from dm_driver.virtual.zygo_files import FORMATS, UNITS
+from dm_runtime.parameters import Parameter
+
+_PLATE, _PIEZO, _CAMERA = PlateConfig(), PiezoConfig(), InterferometerConfig()
+_DRIVE, _PORTS, _WATCH, _FILES = DriveConfig(), PortsConfig(), MonitorConfig(), FilesConfig()
+_PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
+
+TABLE = (
+    Parameter("seed", int, 1, "Fixes gains, initial figure and noise.", low=0, high=2**31),
+    Parameter("plate.diameter", float, _PLATE.diameter, "Diameter of the faceplate.", "m", 1e-3, 1.0),
+    Parameter("plate.thickness", float, _PLATE.thickness, "Thickness of the faceplate.", "m", 1e-5, 0.1),
+    Parameter("plate.youngs_modulus", float, _PLATE.youngs_modulus, "Young's modulus.", "Pa", 1e6, 1e13),
+    Parameter("plate.poisson_ratio", float, _PLATE.poisson_ratio, "Poisson's ratio.", "", 0.0, 0.49),
+    Parameter("plate.spring_stiffness", float, _PLATE.spring_stiffness, "Stiffness of one stack.", "N/m", 1.0, 1e12),
+    Parameter("plate.pitch", float, _PLATE.pitch, "Distance of neighbouring actuators.", "m", 1e-4, 0.1),
+    Parameter("plate.start_angle", float, _PLATE.start_angle, "Angle of actuator 2 from the x axis.", "rad", -7.0, 7.0),
+    Parameter("plate.clockwise", bool, _PLATE.clockwise, "Whether actuators are numbered clockwise in their rings."),
+    Parameter("plate.order", int, _PLATE.order, "Radial order of the Ritz solution.", low=12, high=60),
+    Parameter("piezo.stroke", float, _PIEZO.stroke, "Stroke of a stack from signal -1 to +1.", "m", 0.0, 1e-3),
+    Parameter("piezo.gain_spread", float, _PIEZO.gain_spread, "Standard deviation of relative gains.", "", 0.0, 0.3),
+    Parameter("piezo.law", str, _PIEZO.law, "Hysteresis law.", choices=LAWS),
+    Parameter("piezo.hysteresis", float, _PIEZO.hysteresis, "Widest loop opening over the full stroke.", "", 0.0, 0.3),
+    Parameter("piezo.creep", float, _PIEZO.creep, "Creep of a step per decade of time.", "", 0.0, 0.1),
+    Parameter("interferometer.pixels", int, _CAMERA.pixels, "Pixels along each side.", "px", 32, 4096),
+    Parameter(
+        "interferometer.field_diameter", float, _CAMERA.field_diameter, "Diameter of the field of view.", "m", 1e-3, 1.0
+    ),
+    Parameter("interferometer.wavelength", float, _CAMERA.wavelength, "Wavelength.", "m", 1e-7, 2e-5),
+    Parameter("interferometer.figure_rms", float, _CAMERA.figure_rms, "Initial figure, rms.", "m", 0.0, 1e-5),
+    Parameter("interferometer.pixel_noise", float, _CAMERA.pixel_noise, "Noise per pixel, rms.", "m", 0.0, 1e-6),
+    Parameter(
+        "interferometer.low_order_noise",
+        float,
+        _CAMERA.low_order_noise,
+        "Noise of all Zernike terms of orders 2-5 together, rms over the field.",
+        "m",
+        0.0,
+        1e-6,
+    ),
+    Parameter("interferometer.piston_spread", float, _CAMERA.piston_spread, "Spread of piston.", "m", 0.0, 1e-4),
+    Parameter("interferometer.tilt_spread", float, _CAMERA.tilt_spread, "Spread of edge sag by tilt.", "m", 0.0, 1e-4),
+    Parameter("interferometer.specks", int, _CAMERA.specks, "Mean number of dropped pixels.", "", 0, 1_000_000),
+    Parameter("interferometer.blobs", int, _CAMERA.blobs, "Dropped discs per map.", "", 0, 1000),
+    Parameter("interferometer.flip_x", bool, _CAMERA.flip_x, "Picture mirrored left-right, after turning."),
+    Parameter("interferometer.flip_y", bool, _CAMERA.flip_y, "Picture mirrored upside down, after turning."),
+    Parameter(
+        "interferometer.rotate_deg", int, _CAMERA.rotate_deg, "Picture turned anticlockwise by 0, 90, 180 or 270.",
+        "deg", 0, 270,
+    ),
+    Parameter("electronics.tcp_port", int, _PORTS.tcp_port, f"EDAC40 over TCP {_PORT_TEXT}", low=-1, high=65535),
+    Parameter("electronics.udp_port", int, _PORTS.udp_port, f"EDAC40 over UDP {_PORT_TEXT}", low=-1, high=65535),
+    Parameter(
+        "electronics.discovery_port", int, _PORTS.discovery_port, f"EDAC40 discovery {_PORT_TEXT}",
+        low=-1, high=65535,
+    ),
+    Parameter(
+        "electronics.pty_link", str, _PORTS.pty_link,
+        "Path of a symbolic link to the pseudo-terminal of the USB DAC-40; empty = not offered.",
+    ),
+    Parameter(
+        "electronics.dac_volts_at_zero", float, _DRIVE.dac_volts_at_zero, "DAC output at code 0.", "V", -100.0, 100.0
+    ),
+    Parameter(
+        "electronics.dac_volts_at_full", float, _DRIVE.dac_volts_at_full, "DAC output at full code.", "V", -100.0, 100.0
+    ),
+    Parameter("electronics.amplifier_gain", float, _DRIVE.amplifier_gain, "Actuator V per DAC V.", "", -1e4, 1e4),
+    Parameter("electronics.amplifier_min", float, _DRIVE.amplifier_min, "Lowest actuator volts.", "V", -1e4, 1e4),
+    Parameter("electronics.amplifier_max", float, _DRIVE.amplifier_max, "Highest actuator volts.", "V", -1e4, 1e4),
+    Parameter("volts.min", float, _DRIVE.volts_min, "Actuator volts at signal -1.", "V", -1e4, 1e4),
+    Parameter("volts.max", float, _DRIVE.volts_max, "Actuator volts at signal +1.", "V", -1e4, 1e4),
+    Parameter(
+        "wiring", "int[]", list(_DRIVE.wiring), "True connector channel (0-based) of actuators 1-37.", low=0, high=39
+    ),
+    Parameter("monitor.jump", float, _WATCH.jump, "Counted: change per frame above this; 0 = off.", "", 0.0, 4.0),
+    Parameter(
+        "monitor.neighbour_difference", float, _WATCH.neighbour_difference,
+        "Counted: difference of neighbouring signals above this; 0 = off.", "", 0.0, 4.0,
+    ),
+    Parameter("monitor.signal_min", float, _WATCH.signal_min, "Counted: signals below this.", "", -10.0, 10.0),
+    Parameter("monitor.signal_max", float, _WATCH.signal_max, "Counted: signals above this.", "", -10.0, 10.0),
+    Parameter("monitor.tolerance", float, _WATCH.tolerance, "Allowance for DAC steps.", "", 0.0, 1.0),
+    Parameter("trigger.port", int, 1235, f"Trigger {_PORT_TEXT}", low=-1, high=65535),
+    Parameter(
+        "output_folder", str, str(Path(tempfile.gettempdir()) / "virtual_bench"), "Folder of maps without a given path."
+    ),
+    Parameter("output_format", str, _FILES.format, "Format of maps without a given path.", choices=FORMATS),
+    Parameter("output_datx_unit", str, _FILES.datx_unit, "Unit of the heights in .datx files.", choices=UNITS),
+    Parameter("output_intensity", bool, _FILES.intensity, "Whether .dat files have an intensity frame."),
+    Parameter(
+        "output_slow_write", float, _FILES.slow_write, "Wall time over which a file grows; 0 = it appears whole.",
+        "s", 0.0, 60.0,
+    ),
+    Parameter(
+        "clock.speed", float, 0.0,
+        "Publish /clock at this multiple of the wall clock, and live by it; 0 = no /clock, the node's own time.",
+        "", 0.0, 1e4,
+    ),
+    Parameter("clock.period", float, 0.002, "Wall time between two messages on /clock.", "s", 1e-4, 1.0),
+)  # fmt: skip
+
+
+def bench_config(values: Mapping[str, Any]) -> BenchConfig:
+    """The configuration for the values of all parameters of TABLE."""
+
+    def group(prefix: str) -> dict[str, Any]:
+        return {name.partition(".")[2]: value for name, value in values.items() if name.startswith(prefix + ".")}
+
+    electronics = group("electronics")
+    ports = {name: electronics.pop(name) for name in ("tcp_port", "udp_port", "discovery_port", "pty_link")}
+    return BenchConfig(
+        seed=values["seed"],
+        plate=PlateConfig(**group("plate")),
+        piezo=PiezoConfig(**group("piezo")),
+        interferometer=InterferometerConfig(**group("interferometer")),
+        drive=DriveConfig(
+            **electronics,
+            volts_min=values["volts.min"],
+            volts_max=values["volts.max"],
+            wiring=tuple(values["wiring"]),
+        ),
+        ports=PortsConfig(**ports),
+        monitor=MonitorConfig(**group("monitor")),
+        files=FilesConfig(
+            folder=Path(values["output_folder"]),
+            format=values["output_format"],
+            datx_unit=values["output_datx_unit"],
+            intensity=values["output_intensity"],
+            slow_write=values["output_slow_write"],
+        ),
+        trigger_port=values["trigger.port"],
+    )

@@ -1,0 +1,129 @@
+"""From the normalised signal to the DAC code and back: signal - actuator volts - DAC volts - code.
+
+Signal -1 is `volts_min` at the actuator, +1 is `volts_max`, linear between (the vendor's code = max_code (u + 1) / 2
+holds when that range is the DAC's whole range). The amplifier divides by its gain to DAC volts, and the DAC is linear
+between its voltages at code 0 and at full scale.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Fewer codes than this between signal -1 and +1 is a mistake in the configuration, not a mirror.
+MIN_CODES = 100
+_CODE_SLACK = 1e-6
+
+
+@dataclass(frozen=True)
+class VoltScale:
+    """The voltages of one drive unit, amplifier and mirror.
+
+    Attributes:
+        max_code: DAC code of full scale.
+        dac_volts_at_zero: V at the DAC output for code 0.
+        dac_volts_at_full: V at the DAC output for `max_code`.
+        amplifier_gain: V at the actuator per V at the DAC.
+        volts_min: V at the actuator for signal -1.
+        volts_max: V at the actuator for signal +1.
+
+    Raises:
+        ValueError: the values contradict each other; the message names the driver's parameters.
+    """
+
+    max_code: int
+    dac_volts_at_zero: float
+    dac_volts_at_full: float
+    amplifier_gain: float
+    volts_min: float
+    volts_max: float
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("volts.dac_at_zero", self.dac_volts_at_zero),
+            ("volts.dac_at_full", self.dac_volts_at_full),
+            ("volts.amplifier_gain", self.amplifier_gain),
+            ("volts.min", self.volts_min),
+            ("volts.max", self.volts_max),
+        ):
+            if not math.isfinite(value):
+                raise ValueError(f"{name} = {value}: must be finite")
+        if self.max_code < 1:
+            raise ValueError(f"max_code = {self.max_code}: must be at least 1")
+        if self.dac_volts_at_zero == self.dac_volts_at_full:
+            raise ValueError(
+                f"volts.dac_at_zero = volts.dac_at_full = {self.dac_volts_at_zero:g} V: must differ, else no code"
+                " changes the output"
+            )
+        if self.amplifier_gain == 0.0:
+            raise ValueError("volts.amplifier_gain = 0: must not be zero")
+        if not self.volts_max > self.volts_min:
+            raise ValueError(f"volts.max = {self.volts_max:g} V: must be above volts.min = {self.volts_min:g} V")
+        low, high = sorted((self.dac_volts_at_zero, self.dac_volts_at_full))
+        slack = 1e-9 * (high - low)
+        for name, value in (("volts.min", self.volts_min), ("volts.max", self.volts_max)):
+            needed = value / self.amplifier_gain
+            if not low - slack <= needed <= high + slack:
+                reach = sorted((low * self.amplifier_gain, high * self.amplifier_gain))
+                raise ValueError(
+                    f"{name} = {value:g} V needs {needed:g} V at the DAC, which reaches {low:g} to {high:g} V;"
+                    f" with volts.amplifier_gain = {self.amplifier_gain:g} it must be {reach[0]:g} to {reach[1]:g} V"
+                )
+        codes = self._code_range[1] - self._code_range[0] + 1
+        if codes < MIN_CODES:
+            raise ValueError(
+                f"volts.min to volts.max ({self.volts_min:g} to {self.volts_max:g} V) spans only {codes} of"
+                f" {self.max_code} codes: must be at least {MIN_CODES}; check volts.amplifier_gain ="
+                f" {self.amplifier_gain:g}"
+            )
+
+    def volts(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Actuator volts of normalised signals."""
+        return self.volts_min + (signals + 1.0) * (0.5 * (self.volts_max - self.volts_min))
+
+    def signals(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Normalised signals of actuator volts."""
+        return (volts - self.volts_min) * (2.0 / (self.volts_max - self.volts_min)) - 1.0
+
+    def codes(self, signals: NDArray[np.float64]) -> NDArray[np.uint16]:
+        """Nearest codes of normalised signals; never one whose voltage lies outside volts_min..volts_max.
+
+        Raises:
+            ValueError: a signal is not finite or outside -1..+1.
+        """
+        if not bool((np.abs(signals) <= 1.0).all()):  # also false for NaN
+            raise ValueError(f"signals = {signals}: must be finite and in -1 to 1")
+        return np.clip(np.rint(self._exact_codes(signals)), *self._code_range).astype(np.uint16)
+
+    def signals_of_codes(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+        """Normalised signals that stand at the actuators for these codes."""
+        return self.signals(self.volts_of_codes(codes))
+
+    def volts_of_codes(self, codes: NDArray[np.uint16]) -> NDArray[np.float64]:
+        """Actuator volts for these codes."""
+        dac_volts = self.dac_volts_at_zero + codes * (self._dac_span / self.max_code)
+        return np.asarray(dac_volts * self.amplifier_gain, dtype=np.float64)
+
+    @property
+    def resolution(self) -> float:
+        """Normalised signal of one code; quantisation moves a signal by at most half of it at mid range."""
+        volts_per_code = abs(self._dac_span * self.amplifier_gain) / self.max_code
+        return 2.0 * volts_per_code / (self.volts_max - self.volts_min)
+
+    @property
+    def _dac_span(self) -> float:
+        return self.dac_volts_at_full - self.dac_volts_at_zero
+
+    def _exact_codes(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
+        dac_volts = self.volts(signals) / self.amplifier_gain
+        return np.asarray((dac_volts - self.dac_volts_at_zero) * (self.max_code / self._dac_span), dtype=np.float64)
+
+    @cached_property
+    def _code_range(self) -> tuple[int, int]:
+        """Smallest and largest code inside volts_min..volts_max."""
+        ends = np.sort(self._exact_codes(np.array([-1.0, 1.0])))
+        return math.ceil(ends[0] - _CODE_SLACK), math.floor(ends[1] + _CODE_SLACK)

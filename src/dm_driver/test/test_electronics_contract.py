@@ -1,0 +1,206 @@
+"""What every back end must do, against real sockets and a real pseudo-terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dm_driver.electronics import BACK_ENDS, DriveElectronics, ElectronicsSettings, make_electronics
+from dm_driver.electronics.base import CodeError, LinkError, NotOpenError
+from drive_unit_servers import UNITS, DriveUnit, Edac40TcpUnit, Edac40UdpUnit
+from support import wait_until
+
+CHANNELS = 40
+
+
+@pytest.fixture(params=sorted(BACK_ENDS))
+def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[DriveUnit]:
+    with UNITS[request.param](tmp_path) as server:
+        yield server
+
+
+@pytest.fixture
+def electronics(unit: DriveUnit) -> Iterator[DriveElectronics]:
+    back_end = make_electronics(unit.kind, settings_of(unit))
+    yield back_end
+    back_end.close()
+
+
+def settings_of(unit: DriveUnit) -> ElectronicsSettings:
+    values: dict[str, Any] = unit.settings
+    return ElectronicsSettings(timeout_s=1.0, **values)
+
+
+def random_frame(electronics: DriveElectronics, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    generator = np.random.default_rng(seed)
+    codes = generator.integers(0, electronics.max_code, CHANNELS, dtype=np.uint16, endpoint=True)
+    wired = generator.random(CHANNELS) < 0.8
+    wired[seed % CHANNELS] = True
+    return codes, wired
+
+
+def fail_soon(action: Any, timeout_s: float = 5.0) -> None:
+    """Repeat `action` until it raises LinkError."""
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        try:
+            action()
+        except LinkError:
+            return
+        time.sleep(0.02)
+    raise AssertionError("the broken link was not noticed")
+
+
+class TestContract:
+    def test_every_unit_takes_forty_channels(self, electronics: DriveElectronics) -> None:
+        assert electronics.channels == CHANNELS
+        assert electronics.max_code in (0xFFF, 0xFFFF)
+
+    def test_codes_arrive_on_their_channels_in_order(self, unit: DriveUnit, electronics: DriveElectronics) -> None:
+        sent = [random_frame(electronics, seed) for seed in range(25)]
+        with electronics:
+            for codes, wired in sent:
+                electronics.write(codes, wired)
+            wait_until(lambda: len(unit.frames) == len(sent), what="all frames")
+        for (codes, wired), frame in zip(sent, unit.frames, strict=True):
+            assert set(np.flatnonzero(wired)) <= set(frame)
+            for channel in np.flatnonzero(wired):
+                assert frame[int(channel)] == codes[channel]
+
+    def test_full_scale_and_zero(self, unit: DriveUnit, electronics: DriveElectronics) -> None:
+        every = np.ones(CHANNELS, dtype=np.bool_)
+        with electronics:
+            for code in (0, electronics.max_code):
+                electronics.write(np.full(CHANNELS, code, dtype=np.uint16), every)
+            wait_until(lambda: len(unit.frames) == 2)
+        assert set(unit.frames[0].values()) == {0}
+        assert set(unit.frames[1].values()) == {electronics.max_code}
+
+    def test_opening_and_closing_twice_is_harmless_and_writes_no_outputs(
+        self, unit: DriveUnit, electronics: DriveElectronics
+    ) -> None:
+        for _ in range(2):
+            electronics.open()
+            assert electronics.is_open
+        electronics.check()
+        for _ in range(2):
+            electronics.close()
+            assert not electronics.is_open
+        assert unit.frames == []
+
+    def test_bad_codes_are_refused_and_nothing_is_sent(self, unit: DriveUnit, electronics: DriveElectronics) -> None:
+        codes, wired = np.zeros(CHANNELS, dtype=np.uint16), np.ones(CHANNELS, dtype=np.bool_)
+        too_large = np.full(CHANNELS, electronics.max_code + 1, dtype=np.uint32)
+        with electronics:
+            cases: tuple[tuple[Any, Any], ...] = (
+                (codes[:-1], wired),
+                (codes.astype(np.int16), wired),
+                (codes.astype(np.float64), wired),
+                (too_large, wired),
+                (codes, wired[:-1]),
+                (codes, wired.astype(np.uint8)),
+                (codes, np.zeros(CHANNELS, dtype=np.bool_)),
+            )
+            for bad_codes, bad_wired in cases:
+                with pytest.raises(CodeError):
+                    electronics.write(bad_codes, bad_wired)
+            electronics.write(codes, wired)
+            wait_until(lambda: unit.frames)
+        assert len(unit.frames) == 1
+
+    def test_a_closed_link_is_not_written_to(self, electronics: DriveElectronics) -> None:
+        codes, wired = random_frame(electronics, 1)
+        with pytest.raises(NotOpenError):
+            electronics.write(codes, wired)
+        with pytest.raises(NotOpenError):
+            electronics.check()
+
+    @pytest.mark.parametrize("how", ["write", "check"])
+    def test_an_unplugged_unit_is_noticed_and_its_return_taken(
+        self, unit: DriveUnit, electronics: DriveElectronics, how: str
+    ) -> None:
+        codes, wired = random_frame(electronics, 2)
+        electronics.open()
+        electronics.write(codes, wired)
+        wait_until(lambda: unit.frames)
+        unit.unplug()
+        # A datagram alone never fails when discovery is there to tell.
+        fail_soon(
+            electronics.check
+            if how == "check" or unit.kind == "edac40_udp"
+            else lambda: electronics.write(codes, wired)
+        )
+        assert not electronics.is_open
+        with pytest.raises(NotOpenError):
+            electronics.write(codes, wired)
+        with pytest.raises(LinkError, match="cannot open"):
+            electronics.open()
+        unit.plug()
+        frames = len(unit.frames)
+        electronics.open()
+        electronics.write(codes, wired)
+        wait_until(lambda: len(unit.frames) > frames)
+
+    def test_a_unit_that_is_off_cannot_be_opened(self, unit: DriveUnit, electronics: DriveElectronics) -> None:
+        unit.unplug()
+        with pytest.raises(LinkError, match=r"cannot open .*(127\.0\.0\.1|ttyUSB)"):
+            electronics.open()
+
+    def test_a_standing_link_passes_every_check(self, unit: DriveUnit, electronics: DriveElectronics) -> None:
+        with electronics:
+            end = time.monotonic() + 1.5  # well beyond the time-out
+            while time.monotonic() < end:
+                electronics.check()
+                time.sleep(0.05)
+
+    def test_a_missing_setting_is_named(self, unit: DriveUnit) -> None:
+        with pytest.raises(ValueError, match=r"electronics\.(address|serial_port) is empty"):
+            make_electronics(unit.kind, ElectronicsSettings())
+
+
+def test_unknown_back_end_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"electronics\.kind = 'edac41'.*edac40_tcp, edac40_udp, usb_dac40"):
+        make_electronics("edac41", ElectronicsSettings(address="127.0.0.1"))
+
+
+def test_tcp_notices_between_writes_that_the_unit_closed() -> None:
+    with Edac40TcpUnit() as unit:
+        electronics = make_electronics("edac40_tcp", settings_of(unit))
+        codes, wired = random_frame(electronics, 3)
+        electronics.open()
+        electronics.write(codes, wired)
+        wait_until(lambda: unit.frames)
+        unit.drop_client()  # type: ignore[attr-defined]
+        fail_soon(electronics.check)
+        electronics.open()
+        electronics.write(codes, wired)
+        wait_until(lambda: len(unit.frames) == 2)
+        electronics.close()
+
+
+def test_a_second_tcp_client_finds_the_unit_taken() -> None:
+    with Edac40TcpUnit() as unit:
+        with make_electronics("edac40_tcp", settings_of(unit)) as first:
+            wait_until(lambda: unit.clients == 1)  # type: ignore[attr-defined]
+            second = make_electronics("edac40_tcp", settings_of(unit))
+            second.open()
+            fail_soon(second.check)
+            first.check()
+
+
+def test_udp_without_discovery_notices_a_closed_port() -> None:
+    with Edac40UdpUnit(discovery=False) as unit:
+        electronics = make_electronics("edac40_udp", settings_of(unit))
+        codes, wired = random_frame(electronics, 4)
+        with electronics:
+            electronics.write(codes, wired)
+            wait_until(lambda: unit.frames)
+            electronics.check()
+            unit.unplug()
+            fail_soon(lambda: electronics.write(codes, wired))
+            assert not electronics.is_open

@@ -1,0 +1,185 @@
+"""Wiring tables, actuator positions, and the way from signal to code."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dm_driver.geometry import hexagonal_positions, neighbour_pairs, ring_count
+from dm_driver.output_stage import OutputStage
+from dm_driver.volts import VoltScale
+from dm_driver.wiring import TABLES, wiring_table
+
+
+@pytest.mark.parametrize("name", sorted(TABLES))
+def test_named_tables_are_whole(name: str) -> None:
+    table = wiring_table(name, [], 37, 40)
+    assert len(set(table.tolist())) == 37
+    assert {0, 20}.isdisjoint(table.tolist())
+    assert table.min() >= 0 and table.max() < 40
+
+
+def test_first_and_last_channels_of_the_tables() -> None:
+    ends = {name: (table[0], table[1], table[-1]) for name, table in TABLES.items()}
+    assert ends == {"trihex": (14, 16, 12), "37ch_30mm": (10, 13, 31), "37ch_30mm_v2005": (10, 4, 2)}
+
+
+@pytest.mark.parametrize(
+    ("name", "custom", "actuators", "words"),
+    [
+        ("hexagon", [], 37, "'hexagon': unknown; must be one of trihex, 37ch_30mm, 37ch_30mm_v2005, custom"),
+        ("trihex", [], 19, "lists 37 channels: must be 19"),
+        ("trihex", [1, 2], 37, "mirror.channels is given but mirror.wiring = 'trihex'"),
+        ("custom", [1, 2, 3], 4, "mirror.channels lists 3 channels: must be 4"),
+        ("custom", [1, 2, 40], 3, "actuator 3 on channel 40; must be -1 to 39"),
+        ("custom", [1, -2, 4], 3, "actuator 2 on channel -2"),
+        ("custom", [5, 2, 5], 3, "channel 5 by actuators 1, 3"),
+        ("custom", [-1, -1], 2, "no actuator has a channel"),
+    ],
+)
+def test_wrong_wirings_are_refused(name: str, custom: Sequence[int], actuators: int, words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        wiring_table(name, custom, actuators, 40)
+
+
+def test_custom_wiring_with_an_unconnected_actuator() -> None:
+    stage = OutputStage(VoltScale(65535, 0, 12, 25, 0, 300), wiring_table("custom", [3, -1, 0], 3, 40), 40)
+    codes = stage.codes(np.array([1.0, 1.0, 0.0]))
+    assert codes[3] == 65535 and codes[0] in (32767, 32768)
+    assert np.delete(codes, [0, 3]).tolist() == [0] * 38
+    assert np.flatnonzero(stage.wired).tolist() == [0, 3]
+    signals, volts = stage.outcome(codes)
+    assert signals == pytest.approx([1, -1, 0], abs=2e-5)
+    assert volts == pytest.approx([300, 0, 150], abs=3e-3)
+
+
+def test_pdm30_37_pattern() -> None:
+    x, y = hexagonal_positions(37, 4.3e-3)
+    radius, angle = np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 360
+    assert radius[0] == 0
+    assert radius[1:7] == pytest.approx(4.3e-3)
+    assert sorted(set(np.round(radius[7:19] * 1e3, 3))) == [round(4.3 * math.sqrt(3), 3), 8.6]
+    assert radius[[19, 22, 25, 28, 31, 34]] == pytest.approx(12.9e-3)
+    assert radius.max() == pytest.approx(12.9e-3)
+    for ring in (slice(1, 7), slice(7, 19), slice(19, 37)):
+        assert (np.diff(angle[ring]) > 0).all()
+        assert angle[ring][0] == pytest.approx(0)
+    distance = np.hypot(x[:, None] - x, y[:, None] - y)
+    assert distance[np.triu_indices(37, 1)].min() == pytest.approx(4.3e-3)
+
+
+@settings(max_examples=20)
+@given(st.floats(-3, 3), st.booleans(), st.booleans())
+def test_orientation_of_the_pattern(start_angle: float, clockwise: bool, reflected: bool) -> None:
+    x, y = hexagonal_positions(37, 4.3e-3, start_angle, clockwise, reflected)
+    sign_x = -1 if reflected else 1
+    for first in (1, 7, 19):
+        angle = math.atan2(y[first], sign_x * x[first])
+        assert math.remainder(angle - start_angle, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+    turn = x[1] * y[2] - y[1] * x[2]
+    assert (turn > 0) == (clockwise == reflected)
+    plain_x, plain_y = hexagonal_positions(37, 4.3e-3)
+    assert np.hypot(x, y) == pytest.approx(np.hypot(plain_x, plain_y), abs=1e-12)
+
+
+def test_neighbours_of_the_pattern() -> None:
+    x, y = hexagonal_positions(37, 4.3e-3, start_angle=0.3)
+    a, b = neighbour_pairs(x, y)
+    assert len(a) == 90  # edges of a triangular lattice hexagon of side 3: 9 s^2 + 3 s
+    assert (a < b).all()
+    counts = np.bincount(np.concatenate([a, b]), minlength=37)
+    assert (counts[:19] == 6).all()
+    assert sorted(counts[19:]) == [3] * 6 + [4] * 12
+    assert set(zip(a[a == 0], b[a == 0], strict=True)) == {(0, k) for k in range(1, 7)}
+
+
+def test_two_actuators_at_one_place_are_refused() -> None:
+    with pytest.raises(ValueError, match="actuators 1 and 3 are at the same place"):
+        neighbour_pairs(np.array([0.0, 1.0, 0.0]), np.zeros(3))
+
+
+@pytest.mark.parametrize(("actuators", "rings"), [(1, 0), (7, 1), (19, 2), (37, 3), (61, 4)])
+def test_full_patterns(actuators: int, rings: int) -> None:
+    assert ring_count(actuators) == rings
+    assert hexagonal_positions(actuators)[0].size == actuators
+
+
+@pytest.mark.parametrize("actuators", [0, 2, 36, 38])
+def test_other_numbers_have_no_pattern(actuators: int) -> None:
+    with pytest.raises(ValueError, match=f"mirror.actuators = {actuators}"):
+        ring_count(actuators)
+
+
+def test_vendor_rule_when_the_range_is_the_whole_dac() -> None:
+    """code = max_code (u + 1) / 2, as in the vendor's library."""
+    scale = VoltScale(4095, 0.0, 5.0, 60.0, 0.0, 300.0)
+    signals = np.linspace(-1, 1, 4096)
+    assert (scale.codes(signals) == np.arange(4096)).all()
+    assert scale.resolution == pytest.approx(2 / 4095)
+
+
+def test_edac40_as_delivered() -> None:
+    """Code 0 is -6 V: 0 V at the actuator is mid scale, and 300 V needs 3.75 V at the DAC."""
+    scale = VoltScale(65535, -6.0, 6.0, 80.0, 0.0, 300.0)
+    codes = scale.codes(np.array([-1.0, 0.0, 1.0]))
+    assert codes.tolist() == [32768, 43007, 53247]
+    assert scale.volts_of_codes(codes) == pytest.approx([0, 150, 300], abs=0.015)
+    assert (scale.volts_of_codes(codes) >= 0).all() and (scale.volts_of_codes(codes) <= 300).all()
+
+
+scales = st.builds(
+    lambda bits, zero, span, inverted, gain, low, width: VoltScale(
+        2**bits - 1,
+        *((zero + span, zero) if inverted else (zero, zero + span)),
+        gain,
+        gain * (zero + span * low) if gain > 0 else gain * (zero + span * (low + width)),
+        gain * (zero + span * (low + width)) if gain > 0 else gain * (zero + span * low),
+    ),
+    st.sampled_from([12, 14, 16]),
+    st.floats(-10, 10),
+    st.floats(1, 20),
+    st.booleans(),
+    st.floats(1, 200).flatmap(lambda gain: st.sampled_from([gain, -gain])),
+    st.floats(0, 0.4),
+    st.floats(0.1, 0.6),
+)
+
+
+@settings(max_examples=80)
+@given(scales, st.lists(st.floats(-1, 1), min_size=1, max_size=8))
+def test_quantisation_is_within_one_code_and_never_outside_the_range(scale: VoltScale, values: list[float]) -> None:
+    signals = np.array([*values, -1.0, 1.0])
+    codes = scale.codes(signals)
+    back = scale.signals_of_codes(codes)
+    assert (np.abs(back - signals) <= scale.resolution * (1 + 1e-6)).all()
+    assert (np.abs(back) <= 1 + 1e-6 * scale.resolution * 10).all()
+    assert scale.volts(back) == pytest.approx(scale.volts_of_codes(codes))
+
+
+@pytest.mark.parametrize("bad", [math.nan, 1.0001, -1.0001, math.inf])
+def test_codes_of_illegal_signals_are_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="must be finite and in -1 to 1"):
+        VoltScale(4095, 0.0, 5.0, 60.0, 0.0, 300.0).codes(np.array([0.0, bad]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((65535, -6, 6, 80, 0, 500), "volts.max = 500 V needs 6.25 V at the DAC, which reaches -6 to 6 V"),
+        ((65535, 0, 6, 80, -10, 300), "volts.min = -10 V needs -0.125 V"),
+        ((65535, -6, 6, 0, 0, 300), "volts.amplifier_gain = 0"),
+        ((65535, 6, 6, 80, 0, 300), "volts.dac_at_zero = volts.dac_at_full"),
+        ((65535, -6, 6, 80, 300, 0), "volts.max = 0 V: must be above volts.min = 300 V"),
+        ((65535, -6, math.nan, 80, 0, 300), "volts.dac_at_full = nan: must be finite"),
+        ((65535, -6, 6, 800000, 0, 300), "spans only 2 of 65535 codes"),
+    ],
+)
+def test_contradictory_voltages_are_refused(arguments: tuple[float, ...], words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        VoltScale(int(arguments[0]), *arguments[1:])

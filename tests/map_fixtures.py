@@ -1,0 +1,154 @@
+"""Map files made by hand from the format descriptions, byte by byte, for tests of the readers."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+NO_DATA = 2147483640
+WAVELENGTH = 632.8e-9
+
+DAT_DEFAULTS: dict[str, tuple[int, str, Any]] = {
+    "magic": (0, ">I", 0x881B036F),
+    "format": (4, ">H", 1),
+    "header_size": (6, ">I", 834),
+    "software": (10, ">h", 1),
+    "origin_x": (64, ">h", 12),
+    "origin_y": (66, ">h", 34),
+    "time": (76, ">I", 1429905292),
+    "S": (164, ">f", 0.5),
+    "W": (168, ">f", WAVELENGTH),
+    "O": (176, ">f", 1.0),
+    "pitch": (184, ">f", 24e-6),
+    "resolution": (218, ">h", 1),
+    "sign": (232, ">h", 0),
+    "system": (238, ">h", 4),
+    "serial": (242, ">H", 62398),
+    "part": (258, "40s", b"PDM30-37 no. 7"),
+    "subtracted": (302, ">h", 0),
+}
+
+
+def dat_bytes(counts: NDArray[Any], intensity: NDArray[Any] | None = None, **fields: Any) -> bytes:
+    """A `.dat` file of these phase counts (h, w) and intensity frames (buckets, h, w)."""
+    size = fields.get("header_size", 834)
+    header = bytearray(max(size, 834))
+    for name, (offset, code, default) in DAT_DEFAULTS.items():
+        struct.pack_into(code, header, offset, fields.get(name, default))
+    height, width = counts.shape
+    struct.pack_into(">HHI", header, 68, width, height, 4 * width * height)
+    body = b""
+    if intensity is not None:
+        buckets, rows, columns = intensity.shape
+        struct.pack_into(">HHH", header, 52, columns, rows, buckets)
+        struct.pack_into(">I", header, 60, 2 * intensity.size)
+        body = b"".join(struct.pack(">H", int(value)) for value in intensity.ravel())
+    return bytes(header) + body + counts.astype(">i4").tobytes()
+
+
+def text_header(width: int, height: int, title: str = "Zygo ASCII Data File - Format 2", **fields: Any) -> str:
+    """The fourteen header lines and the `#`."""
+    get = fields.get
+    return "\n".join(
+        [
+            title,
+            '0 6 4 0 "Thu Jan  1 01:00:00 1970     "',
+            get("intensity_line", "0 0 0 0 0 0"),
+            f"{get('origin_x', 12)} {get('origin_y', 34)} {width} {height}",
+            get("comment", '""   "'),
+            '"" "',
+            f'"{get("part", "mirror")}"',
+            f"0 {get('S', 0.5)} {get('W', WAVELENGTH)} 0.5 {get('O', 1)} 0 {get('pitch', 24e-6)} 1571391436",
+            '640 480 4 0 651012 0 "" "',
+            "0 0 1 34 0 1 0 43.6713 0 0",
+            f"{get('resolution', 1)} 10 100 0 0 0 0 {get('sign', 0)} 0",
+            f'{get("subtracted", 0)} ""  "',
+            "1.5 0.01",
+            '""  "',
+            "#",
+            "",
+        ]
+    )
+
+
+def asc_bytes(counts: NDArray[Any], intensity: Sequence[int] | None = (), **fields: Any) -> bytes:
+    """An `.asc` file; intensity None leaves that section out."""
+    height, width = counts.shape
+    words = [str(value) for value in counts.ravel()]
+    lines = [" ".join(words[start : start + 10]) + " " for start in range(0, len(words), 10)]
+    section = "" if intensity is None else " ".join(map(str, intensity)) + "\n#\n"
+    return (text_header(width, height, **fields) + section + "\n".join(lines) + "\n#\n").encode("latin-1")
+
+
+def xyz_bytes(values: NDArray[Any], title: str = "Zygo XYZ Data File - Format 1", **fields: Any) -> bytes:
+    """An `.xyz` file of values in whatever unit, NaN = No Data, column and row on the camera."""
+    height, width = values.shape
+    left, top = fields.get("origin_x", 12), fields.get("origin_y", 34)
+    lines = [
+        f"{left + column} {top + row} {float(values[row, column])!r}".replace("nan", "No Data")
+        for row in range(height)
+        for column in range(width)
+    ]
+    return (text_header(width, height, title, **fields) + "\n".join(lines) + "\n#\n").encode()
+
+
+SURFACE_ID, ATTRIBUTES_ID = "{5D0C}", "{A77B}"
+SURFACE_PATH, ATTRIBUTES_PATH = f"/Data/Surface/{SURFACE_ID}", f"/Attributes/{ATTRIBUTES_ID}"
+
+
+def write_datx(
+    path: Path,
+    values: NDArray[Any],
+    unit: str = "Fringes",
+    *,
+    attributes: dict[str, Any] | None = None,
+    extra: dict[str, Any] | None = None,
+    pitch: float = 24e-6,
+    **dataset: Any,
+) -> None:
+    """A `.datx` file; an attribute given as None is left out."""
+    converter = np.dtype([("Category", h5py.string_dtype()), ("BaseUnit", h5py.string_dtype()), ("P", "f8", (4,))])
+    found: dict[str, Any] = {
+        "Unit": np.array([unit.encode()], dtype=object),
+        "No Data": np.array([1.7976931348623157e308]),
+        "Wavelength": np.array([WAVELENGTH]),
+        "Interferometric Scale Factor": np.array([0.5]),
+        "Obliquity Factor": np.array([1.0]),
+        "X Converter": np.array([(b"LateralCat", b"Pixels", [0, pitch, 0, 0])], dtype=converter),
+        "Y Converter": np.array([(b"LateralCat", b"Pixels", [0, pitch, 0, 0])], dtype=converter),
+    }
+    found.update(attributes or {})
+    links = [
+        ("Root", "Measurement", "{M}"),
+        ("{M}", "Surface", "{S}"),
+        ("{S}", "Path", SURFACE_PATH),
+        ("{M}", "Attributes", "{A}"),
+        ("{A}", "Path", ATTRIBUTES_PATH),
+    ]
+    table = np.dtype([(name, h5py.string_dtype("ascii")) for name in ("Source", "Link", "Destination")])
+    with h5py.File(path, "w") as file:
+        file.create_dataset("MetaData", data=np.array(links, dtype=table))
+        surface = file.create_dataset(SURFACE_PATH, data=values, **dataset)
+        for name, value in found.items():
+            if value is not None:
+                if value.dtype == object:
+                    surface.attrs.create(name, value, dtype=h5py.string_dtype())
+                else:
+                    surface.attrs[name] = value
+        group = file.create_group(ATTRIBUTES_PATH)
+        for name, value in (extra or {}).items():
+            group.attrs[name] = value
+
+
+def disc_counts(size: int, amplitude: int = 1000, seed: int = 0) -> NDArray[np.int64]:
+    """Counts of a bowl on a disc that fills a square map, with the corners marked as no data."""
+    y, x = (np.mgrid[:size, :size] - (size - 1) / 2) / (size / 2)
+    noise = np.random.default_rng(seed).integers(-3, 4, (size, size))
+    counts = np.rint(amplitude * (x**2 + y**2) + 0.1 * amplitude * x).astype(np.int64) + noise
+    return np.where(x**2 + y**2 <= 1, counts, NO_DATA)

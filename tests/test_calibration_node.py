@@ -1,0 +1,351 @@
+"""The node `calibration` over DDS, with a linear mirror behind stand-ins for driver and interferometer."""
+
+from __future__ import annotations
+
+import resource
+import signal
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from dm_msgs.action import Calibrate
+from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo
+from dm_msgs.msg import Calibration as CalibrationMsg
+from dm_msgs.srv import Degauss, FitInfluenceFunction, ListCalibrations, LoadCalibration, Measure, SetSignals
+
+from dm_calibration.influence.mirror import Mirror
+from dm_calibration.influence.sag import remove_piston_tilt
+from dm_calibration.store import CalibrationStore
+from dm_runtime import qos
+from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
+from support import NodeProcess, Observer, wait_until
+
+RINGS = 2
+ACTUATORS = 19
+
+
+def doubles(values: np.ndarray) -> array[float]:
+    return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+class StandIn:
+    """Driver and interferometer as the calibration node meets them, on the observer's node."""
+
+    def __init__(self, node: Any, mirror: Mirror, plant: LinearMirror) -> None:
+        self.node, self.mirror, self.plant = node, mirror, plant
+        self.signals = mirror.rest
+        self.degaussed = 0
+        self.measured: list[str] = []
+        self.failing: set[str] = set()
+        self.disturbed_at = ""
+        self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
+        self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+        node.create_service(SetSignals, "set_signals", self.on_set_signals)
+        node.create_service(Degauss, "degauss", self.on_degauss)
+        node.create_service(Measure, "measure", self.on_measure)
+        self.publish_info(mirror)
+        self.publish_state()
+
+    def publish_info(self, mirror: Mirror) -> None:
+        message = MirrorInfo(name=mirror.name, serial=mirror.serial, actuators=mirror.actuators)
+        message.header.frame_id = "mirror"
+        message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
+        message.neighbour_a = array("I", mirror.neighbours[:, 0].astype(np.uint32).tobytes())
+        message.neighbour_b = array("I", mirror.neighbours[:, 1].astype(np.uint32).tobytes())
+        message.working_aperture_diameter = 2.0 * mirror.working_radius
+        message.signal_min, message.signal_max = mirror.signal_min, mirror.signal_max
+        message.neighbour_difference_max = mirror.neighbour_difference_max
+        self.info.publish(message)
+
+    def publish_state(self, driver_state: int = ActuatorState.STATE_ACTIVE) -> None:
+        message = ActuatorState(driver_state=driver_state, history_known=True)
+        message.requested = message.applied = doubles(self.signals)
+        self.state.publish(message)
+
+    def on_set_signals(self, request: Any, response: Any) -> Any:
+        self.signals = np.array(request.signals)
+        self.publish_state()
+        response.applied = doubles(self.signals)
+        return response
+
+    def on_degauss(self, _request: Any, response: Any) -> Any:
+        self.degaussed += 1
+        self.signals = self.mirror.rest
+        self.publish_state()
+        return response
+
+    def on_measure(self, request: Any, response: Any) -> Any:
+        self.measured.append(request.label)
+        if request.label == self.disturbed_at:
+            self.signals = np.full(ACTUATORS, 0.3)
+            self.publish_state()
+        if request.label in self.failing:
+            response.error_code, response.message = ErrorCode.MAP_TIMEOUT, "no new file within 5 s"
+            return response
+        sag = self.plant.sag(self.signals)
+        zernike, samples = response.zernike, response.samples
+        zernike.header.stamp = samples.header.stamp = self.node.get_clock().now().to_msg()
+        zernike.radius = samples.radius = RADIUS
+        zernike.wavelength = 632.8e-9
+        zernike.coefficients = doubles(self.plant.fit_terms(sag))
+        zernike.residual_rms, zernike.valid_fraction = 3e-9, 0.97
+        samples.x, samples.y = doubles(self.plant.points.x), doubles(self.plant.points.y)
+        samples.weight, samples.sag = doubles(self.plant.points.weight), doubles(sag)
+        response.info.file, response.info.sha256 = f"/maps/{request.label}.dat", "00"
+        return response
+
+
+@pytest.fixture
+def bench(observer: Observer) -> StandIn:
+    mirror = make_mirror(RINGS)
+    return StandIn(observer.node, mirror, LinearMirror(mirror.x, mirror.y, noise=1e-9, piston_tilt=1e-6))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "calibrations"
+
+
+@pytest.fixture
+def node(start: Callable[..., NodeProcess], bench: StandIn, folder: Path) -> Iterator[NodeProcess]:
+    process = start("dm_calibration", "calibration", parameters(folder))
+    yield process
+    assert "Traceback" not in process.output, process.output
+
+
+def parameters(folder: Path, **changes: Any) -> dict[str, Any]:
+    return {"calibration_folder": str(folder), "settle_time": 0.01, "measure_retries": 1, **changes}
+
+
+def pokes(**fields: Any) -> Calibrate.Goal:
+    return Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True, **fields)
+
+
+def ready(observer: Observer, process: NodeProcess) -> list[Any]:
+    """Wait until the node has published and knows the mirror; returns what it publishes on `calibration`."""
+    received = observer.record(CalibrationMsg, "calibration", qos.LATCHED)
+    health = observer.record(DiagnosticArray, "/diagnostics")
+    wait_until(
+        lambda: received and any("no mirror_info" not in m.status[0].message for m in health), 20, process.output
+    )
+    return received
+
+
+def test_calibrate_store_publish_and_serve(node: NodeProcess, bench: StandIn, observer: Observer, folder: Path) -> None:
+    received = ready(observer, node)
+    assert received[0].id == ""
+    bench.failing = {"poke+04"}
+    seen: list[Any] = []
+    handle, future = observer.send_goal(
+        Calibrate, "calibrate", pokes(note="on the bench"), lambda message: seen.append(message.feedback)
+    )
+    wait_until(lambda: bench.measured, 10)
+    second, _ = observer.send_goal(Calibrate, "calibrate", pokes())
+    assert not second.accepted
+    wait_until(future.done, 60, node.output)
+    result = future.result().result
+    assert handle.accepted and future.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert result.error_code == ErrorCode.OK, result.message
+    assert "the mirror is back at mid range" in result.message
+    assert (bench.signals == 0.0).all()
+    assert bench.degaussed == 1
+    assert bench.measured.count("poke+04") == 2
+    assert result.maps == 2 * ACTUATORS + 5 - 1
+    assert list(result.dropped) == ["poke+04: measure: no new file within 5 s (2 tries)"]
+    assert result.maps_dropped == 1
+    assert result.poke_check_passed and not result.poke_findings
+    assert 0.0 < result.in_sample_rms < 1.5e-9 and result.held_out_rms < 4e-9
+    assert result.duration > 0.0
+    assert seen and all(feedback.steps == 2 * ACTUATORS + 6 for feedback in seen)
+    assert any(feedback.phase == Calibrate.Feedback.PHASE_POKES for feedback in seen)
+
+    message = wait_until(lambda: received[-1] if received[-1].id else None, 10)
+    assert message.id == result.id and message.file == result.file == str(folder / f"{result.id}.h5")
+    assert (message.actuators, message.terms, message.points) == (ACTUATORS, 21, 300)
+    true = remove_piston_tilt(bench.plant.influence.T, bench.plant.points).T
+    assert np.abs(np.array(message.influence_sag).reshape(300, ACTUATORS) - true).max() < 15e-9
+    assert np.array(message.influence_zernike).reshape(21, ACTUATORS)[3:] == pytest.approx(
+        bench.plant.fit_terms(bench.plant.influence.T).T[3:], abs=5e-9
+    )
+    assert (message.mirror_serial, message.wavelength, message.method) == ("T-1", 632.8e-9, "AZreg")
+    assert message.quality == CalibrationMsg.CALIBRATED
+    assert list(message.actuator_grade) == [CalibrationMsg.GRADE_GOOD] * ACTUATORS
+    assert message.header.frame_id == "mirror" and message.header.stamp.sec > 0
+
+    stored = CalibrationStore(folder).load(result.id)
+    assert stored.note == "on the bench"
+    assert stored.maps.file[0] == "/maps/reference 1.dat"
+    assert np.array_equal(stored.fit.influence_sag.ravel(), np.array(message.influence_sag))
+
+    # Refit without one map, then list both and go back to the first.
+    fitted = observer.call(
+        FitInfluenceFunction, "fit_influence_function", FitInfluenceFunction.Request(exclude=["poke-02"], activate=True)
+    )
+    assert fitted.error_code == ErrorCode.OK, fitted.message
+    assert fitted.id != result.id
+    wait_until(lambda: received[-1].id == fitted.id, 10)
+    assert received[-1].maps_used == result.maps - 1
+    unknown = observer.call(
+        FitInfluenceFunction, "fit_influence_function", FitInfluenceFunction.Request(exclude=["poke-99"])
+    )
+    assert unknown.error_code == ErrorCode.UNKNOWN_NAME and "poke-99" in unknown.message
+    wrong = observer.call(FitInfluenceFunction, "fit_influence_function", FitInfluenceFunction.Request(method="AZx"))
+    assert wrong.error_code == ErrorCode.UNKNOWN_NAME and "AZreg" in wrong.message
+
+    (folder / "broken.h5").write_bytes(Path(result.file).read_bytes()[:5000])
+    listed = observer.call(ListCalibrations, "list_calibrations")
+    remarks = dict(zip(listed.ids, listed.remarks, strict=True))
+    assert remarks[fitted.id] == "in use" and remarks[result.id] == ""
+    assert "not a whole HDF5 file" in remarks["broken"]
+    loaded = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=result.id))
+    assert loaded.error_code == ErrorCode.OK and loaded.id == result.id
+    wait_until(lambda: received[-1].id == result.id, 10)
+    for name, code in (
+        ("broken", ErrorCode.CALIBRATION_UNREADABLE),
+        ("../x", ErrorCode.UNKNOWN_NAME),
+        ("nothing", ErrorCode.UNKNOWN_NAME),
+    ):
+        refused = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=name))
+        assert refused.error_code == code, refused.message
+
+    # Another mirror: the calibration is withdrawn, and refused when asked for.
+    bench.publish_info(make_mirror(RINGS, serial="T-2"))
+    wait_until(lambda: received[-1].id == "", 10)
+    refused = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=result.id))
+    assert refused.error_code == ErrorCode.CALIBRATION_MISMATCH
+    assert "'T-1', this is 'T-2'" in refused.message
+    newest = observer.call(LoadCalibration, "load_calibration")
+    assert newest.error_code == ErrorCode.NOT_CALIBRATED
+    bench.publish_info(bench.mirror)
+    newest = wait_until(
+        lambda: (r := observer.call(LoadCalibration, "load_calibration")).error_code == ErrorCode.OK and r, 10
+    )
+    assert newest.id == fitted.id
+
+
+def test_cancel_brings_the_mirror_back(node: NodeProcess, bench: StandIn, observer: Observer, folder: Path) -> None:
+    received = ready(observer, node)
+    handle, future = observer.send_goal(Calibrate, "calibrate", pokes(settle_time=0.2))
+    wait_until(lambda: len(bench.measured) >= 3, 20, node.output)
+    handle.cancel_goal_async()
+    wait_until(future.done, 20, node.output)
+    result = future.result().result
+    assert future.result().status == GoalStatus.STATUS_CANCELED
+    assert result.error_code == ErrorCode.CANCELED
+    assert "the mirror is back at mid range" in result.message
+    assert (bench.signals == 0.0).all()
+    assert len(bench.measured) < 8
+    assert not folder.exists() and received[-1].id == ""
+
+
+def test_poke_check_names_what_differs(start: Callable[..., NodeProcess], observer: Observer, folder: Path) -> None:
+    mirror = make_mirror(RINGS)
+    x, y = hexagon(RINGS)
+    order = np.arange(ACTUATORS)
+    order[[2, 6]] = order[[6, 2]]
+    bench = StandIn(observer.node, mirror, LinearMirror(x[order], y[order], noise=1e-9))
+    process = start("dm_calibration", "calibration", parameters(folder))
+    received = ready(observer, process)
+    check = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKE_CHECK)
+    result = observer.run_goal(Calibrate, "calibrate", check, 60).result
+    assert result.error_code == ErrorCode.POKE_CHECK_FAILED
+    assert list(result.poke_findings) == ["actuators 3 and 7 are exchanged"]
+    assert not result.poke_check_passed and not folder.exists()
+    assert (bench.signals == 0.0).all()
+    # A calibration is stored all the same, with the finding in it.
+    result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
+    assert result.error_code == ErrorCode.OK and not result.poke_check_passed
+    wait_until(lambda: received[-1].id == result.id, 10)
+    assert any("actuators 3 and 7 are exchanged" in sentence for sentence in received[-1].known_limitations)
+
+
+def test_failures_are_told_and_leave_things_as_they_were(
+    start: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
+) -> None:
+    first = start("dm_calibration", "calibration", parameters(folder))
+    ready(observer, first)
+    kept = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
+    assert kept.error_code == ErrorCode.OK, kept.message
+    assert first.stop() == 0
+
+    process = start("dm_calibration", "calibration", parameters(folder, load_on_start="newest"))
+    received = ready(observer, process)
+    wait_until(lambda: received[-1].id == kept.id, 20, process.output)
+
+    def run(goal: Calibrate.Goal, code: int, words: str) -> Any:
+        result = observer.run_goal(Calibrate, "calibrate", goal, 60).result
+        assert (result.error_code, words in result.message) == (code, True), result.message
+        assert (bench.signals == 0.0).all()
+        assert received[-1].id == kept.id
+        return result
+
+    run(pokes(poke_amplitude=float("nan")), ErrorCode.OUT_OF_RANGE, "poke_amplitude = nan: must be 0 to 1")
+    run(pokes(settle_time=-1.0), ErrorCode.OUT_OF_RANGE, "settle_time = -1.0")
+    run(Calibrate.Goal(plan=9), ErrorCode.OUT_OF_RANGE, "plan = 9: must be 0 to 3")
+    unknown = Calibrate.Goal(plan=Calibrate.Goal.PLAN_SURFACES, surfaces=["p60"])
+    run(unknown, ErrorCode.UNKNOWN_NAME, "surface 'p60' is unknown; did you mean")
+    bench.failing = {f"poke{mark}{k:02d}" for mark in "+-" for k in range(1, 20)}
+    result = run(pokes(), ErrorCode.MAP_TIMEOUT, "3 states in a row gave no map")
+    assert len(result.dropped) == 3 and result.maps == 1
+    bench.failing = set()
+    few = Calibrate.Goal(plan=Calibrate.Goal.PLAN_SURFACES, surfaces=["p01", "p05"])
+    run(few, ErrorCode.TOO_FEW_MAPS, "good maps")
+    bench.publish_state(ActuatorState.STATE_INACTIVE)
+    run(pokes(), ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active")
+    bench.publish_state()
+
+    # Files of the node may not grow any more, as on a full disk.
+    files = sorted(path.name for path in folder.iterdir())
+    resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (20000, 20000))
+    result = run(pokes(), ErrorCode.STORAGE_FAILED, "was not stored")
+    assert result.id == "" and result.file == ""
+    assert sorted(path.name for path in folder.iterdir()) == files
+    again = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=kept.id))
+    assert again.error_code == ErrorCode.OK
+
+
+def test_somebody_else_commands_meanwhile(node: NodeProcess, bench: StandIn, observer: Observer) -> None:
+    ready(observer, node)
+    bench.disturbed_at = "poke+02"
+    result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
+    assert result.error_code == ErrorCode.PREEMPTED
+    assert "somebody else commanded the mirror" in result.message
+    assert (bench.signals == 0.0).all()
+
+
+def test_neighbours_that_are_not_there(start: Callable[..., NodeProcess], observer: Observer, folder: Path) -> None:
+    process = start("dm_calibration", "calibration", parameters(folder, driver_timeout=0.3, degauss_timeout=0.3))
+    observer.record(CalibrationMsg, "calibration", qos.LATCHED)
+    result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
+    assert result.error_code == ErrorCode.DRIVER_UNAVAILABLE and "no mirror_info yet" in result.message
+    publisher = observer.node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
+    mirror = make_mirror(RINGS)
+    message = MirrorInfo(name="m", serial="s", actuators=ACTUATORS, working_aperture_diameter=22e-3)
+    message.signal_min, message.signal_max, message.neighbour_difference_max = -1.0, 1.0, 2.0
+    publisher.publish(message)  # without positions: refused, the node lives on
+    wait_until(lambda: "mirror_info refused: mirror_info: actuator_x has 0 values" in process.output, 10)
+    message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
+    publisher.publish(message)
+    health = observer.record(DiagnosticArray, "/diagnostics")
+    wait_until(lambda: any(m.status[0].message == "no calibration is in use" for m in health), 10)
+    result = observer.run_goal(Calibrate, "calibrate", pokes(), 60).result
+    assert result.error_code == ErrorCode.DRIVER_UNAVAILABLE
+    assert "no such service" in result.message and "could NOT be brought back" in result.message
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ended_in_the_middle_the_mirror_still_goes_back(
+    number: int, start: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path
+) -> None:
+    process = start("dm_calibration", "calibration", parameters(folder))
+    ready(observer, process)
+    observer.send_goal(Calibrate, "calibrate", pokes(settle_time=0.3))
+    wait_until(lambda: (bench.signals != 0.0).any() and len(bench.measured) > 2, 20, process.output)
+    assert process.stop(number) == 0
+    assert (bench.signals == 0.0).all(), process.output
+    assert "Traceback" not in process.output, process.output

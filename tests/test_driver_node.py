@@ -1,0 +1,350 @@
+"""Node `pdm_driver` in its own process, over DDS on one side and a TCP drive unit on the other."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode, MirrorInfo
+from dm_msgs.srv import Degauss, SetSignals
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+
+from dm_runtime import qos
+from drive_unit_servers import Edac40TcpUnit, Frame
+from support import NodeProcess, Observer, wait_until
+
+TRIHEX = [
+    *(14, 16, 38, 23, 26, 1, 8, 10, 13, 37, 18, 36, 25, 28, 22, 7, 5, 2, 6),
+    *(19, 17, 32, 15, 11, 35, 34, 39, 33, 31, 21, 27, 29, 24, 9, 3, 4, 12),
+]
+CODE = 2.0 * 12 * 80 / 300 / 65535
+
+Start = Callable[..., NodeProcess]
+
+
+@pytest.fixture
+def unit() -> Iterator[Edac40TcpUnit]:
+    with Edac40TcpUnit() as server:
+        assert isinstance(server, Edac40TcpUnit)
+        yield server
+
+
+def parameters(unit: Edac40TcpUnit, **changes: Any) -> dict[str, Any]:
+    """A whole configuration; keyword `a__b` sets the parameter `a.b`, None removes it."""
+    values: dict[str, Any] = {
+        "mirror.serial": "07-123",
+        "electronics.kind": "edac40_tcp",
+        "electronics.address": "127.0.0.1",
+        "electronics.port": unit.port,
+        "volts.dac_at_zero": -6.0,
+        "volts.dac_at_full": 6.0,
+        "volts.amplifier_gain": 80.0,
+        "volts.min": 0.0,
+        "volts.max": 300.0,
+    }
+    values.update({name.replace("__", "."): value for name, value in changes.items()})
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def signals_of(frames: list[Frame]) -> np.ndarray:
+    """(frames, 37) signals on the wire: code 0 is -6 V, full scale +6 V, gain 80, 0..300 V."""
+    codes = np.array([[frame[channel] for channel in TRIHEX] for frame in frames], dtype=float)
+    return (codes / 65535 * 12 - 6) * 80 / 150 - 1
+
+
+class Driver:
+    """The driver as seen by its neighbours."""
+
+    def __init__(self, observer: Observer, unit: Edac40TcpUnit) -> None:
+        self.observer = observer
+        self.unit = unit
+        self.states = observer.record(ActuatorState, "actuator_state", qos.STATE)
+        self.infos = observer.record(MirrorInfo, "mirror_info", qos.LATCHED)
+        self.diagnostics = observer.record(DiagnosticArray, "/diagnostics")
+        self._publisher = observer.node.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
+
+    def command(self, signals: Any, age_s: float | None = None) -> None:
+        wait_until(lambda: self._publisher.get_subscription_count() > 0, what="the driver's subscription")
+        message = ActuatorCommand(signals=[float(value) for value in signals])
+        if age_s is not None:
+            stamp_ns = self.observer.node.get_clock().now().nanoseconds - round(age_s * 1e9)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        self._publisher.publish(message)
+
+    def wait_for_state(self, condition: Callable[[ActuatorState], Any], what: str) -> ActuatorState:
+        """The first state, from the newest one on, that meets the condition."""
+        seen = max(0, len(self.states) - 1)
+
+        def find() -> ActuatorState | None:
+            return next((state for state in self.states[seen:] if condition(state)), None)
+
+        return wait_until(find, 15, what)
+
+    def wait_for_refusal(self, code: int, words: str) -> ActuatorState:
+        return self.wait_for_state(lambda state: state.error_code == code and words in state.message, words)
+
+    def wait_active(self) -> None:
+        self.wait_for_state(
+            lambda state: state.driver_state == ActuatorState.STATE_ACTIVE and state.sequence >= 1, "active"
+        )
+
+    def change(self, transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self.observer.call(ChangeState, "pdm_driver/change_state", request).success)
+
+    def set_signals(self, signals: Any, **fields: Any) -> Any:
+        request = SetSignals.Request(signals=[float(value) for value in signals], **fields)
+        return self.observer.call(SetSignals, "set_signals", request)
+
+
+@pytest.fixture
+def driver(start: Start, observer: Observer, unit: Edac40TcpUnit) -> Driver:
+    start("dm_driver", "pdm_driver", parameters(unit))
+    result = Driver(observer, unit)
+    result.wait_active()
+    return result
+
+
+def test_commands_reach_the_wire_and_the_state_tells(driver: Driver) -> None:
+    unit = driver.unit
+    wait_until(lambda: len(unit.frames) == 1)
+    assert signals_of(unit.frames)[0] == pytest.approx(-1.0, abs=CODE)
+
+    info = wait_until(lambda: driver.infos)[-1]
+    assert (info.name, info.serial, info.actuators) == ("PDM30-37", "07-123", 37)
+    assert (info.wiring, info.electronics) == ("trihex", "edac40_tcp")
+    assert len(info.neighbour_a) == len(info.neighbour_b) == 90
+    assert max(np.hypot(info.actuator_x, info.actuator_y)) == pytest.approx(12.9e-3)
+    assert (info.volts_min, info.volts_max) == (0.0, 300.0)
+    assert list(info.safe_signals) == [-1.0] * 37
+
+    small = -1.0 + 0.1 * np.linspace(0, 1, 37)
+    driver.command(small, age_s=0.0)
+    state = driver.wait_for_state(lambda state: state.sequence == 2, "the second write")
+    assert list(state.requested) == pytest.approx(small)
+    assert list(state.applied) == pytest.approx(small, abs=CODE)
+    assert list(state.volts) == pytest.approx((small + 1) * 150, abs=CODE * 150)
+    assert not state.moving and not state.history_known
+    assert state.error_code == ErrorCode.OK and state.message == ""
+    assert state.flags[0] == ActuatorState.FLAG_AT_LIMIT and state.flags[36] == 0
+    assert len(unit.frames) == 2
+    assert signals_of(unit.frames)[1] == pytest.approx(small, abs=CODE)
+
+    driver.command(np.full(37, 1.0))  # without a stamp: now
+    state = driver.wait_for_state(lambda state: not state.moving and state.applied[0] > 0.9, "the end of the ramp")
+    wait_until(lambda: len(unit.frames) == state.sequence)
+    on_wire = signals_of(unit.frames)
+    assert len(on_wire) == 2 + 20
+    assert on_wire[-1] == pytest.approx(1.0, abs=CODE)
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+    ramping = [state for state in driver.states if state.moving]
+    assert ramping and ramping[0].sequence in (2, 3)  # 2: told between acceptance and first write
+    assert all(flag & ActuatorState.FLAG_RAMPING for flag in ramping[0].flags)
+
+
+def test_refused_commands_leave_the_wire_alone(driver: Driver) -> None:
+    good = np.zeros(37)
+    assert driver.set_signals(good, wait=True).error_code == ErrorCode.OK
+    frames = len(driver.unit.frames)
+    nan, outside, neighbours = good.copy(), good.copy(), good.copy()
+    nan[4] = np.nan
+    outside[6] = 1.01
+    neighbours[0], neighbours[2] = 0.6, -0.6
+    cases: list[tuple[Any, float | None, int, list[int], str]] = [
+        (good[:36], None, ErrorCode.INVALID_LENGTH, [], "36 values: must have 37"),
+        (nan, None, ErrorCode.NOT_FINITE, [4], "actuator 5 = nan"),
+        (outside, None, ErrorCode.OUT_OF_RANGE, [6], "actuator 7 = 1.01: must be -1 to 1"),
+        (neighbours, None, ErrorCode.NEIGHBOUR_DIFFERENCE, [0, 2], "actuators 1 and 3"),
+        (good, 5.0, ErrorCode.STALE, [], "s old: must be at most 1 s"),
+        (good, -5.0, ErrorCode.STALE, [], "in the future"),
+    ]
+    for signals, age_s, code, actuators, words in cases:
+        driver.command(signals, age_s)
+        state = driver.wait_for_refusal(code, words)
+        assert [i for i, flag in enumerate(state.flags) if flag & ActuatorState.FLAG_REFUSED] == actuators
+        assert list(state.requested) == pytest.approx([0.0] * 37)
+        assert state.driver_state == ActuatorState.STATE_ACTIVE
+        if age_s is None:
+            answer = driver.set_signals(signals)
+            assert answer.error_code == code and words in answer.message
+    # A refused dry run is answered; an accepted one moves nothing.
+    assert driver.set_signals(outside, dry_run=True).error_code == ErrorCode.OUT_OF_RANGE
+    answer = driver.set_signals(np.full(37, 0.8), dry_run=True)
+    assert answer.error_code == ErrorCode.OK and answer.ramp_time == pytest.approx(0.7 / 40)
+    assert len(driver.unit.frames) == frames
+
+    def counted() -> bool:
+        values = {pair.key: pair.value for pair in driver.diagnostics[-1].status[0].values}
+        return values.get("refused STALE") == "2" and values.get("refused OUT_OF_RANGE") == "2"
+
+    wait_until(lambda: driver.diagnostics and counted(), what="the counts in the diagnostics")
+    assert driver.diagnostics[-1].status[0].level == b"\x01"
+    driver.command(np.full(37, 0.05))
+    state = driver.wait_for_state(lambda state: state.error_code == ErrorCode.OK, "recovery")
+    wait_until(lambda: len(driver.unit.frames) == frames + 1)
+
+
+def test_set_signals_answers_when_the_shape_stands(driver: Driver) -> None:
+    answer = driver.set_signals(np.full(37, 0.5), wait=True)
+    assert answer.error_code == ErrorCode.OK
+    assert list(answer.applied) == pytest.approx([0.5] * 37, abs=CODE)
+    assert answer.ramp_time == pytest.approx(1.4 / 40)
+    wait_until(lambda: len(driver.unit.frames) == 16)
+    assert signals_of(driver.unit.frames)[-1] == pytest.approx(0.5, abs=CODE)
+
+
+def test_degauss_makes_the_history_known(driver: Driver) -> None:
+    request = Degauss.Request(amplitude=0.4, steps=6, end_signals=[0.1] * 37)
+    answer = driver.observer.call(Degauss, "degauss", request)
+    assert answer.error_code == ErrorCode.OK and answer.duration > 0
+    state = driver.wait_for_state(lambda state: state.history_known and not state.moving, "history known")
+    assert list(state.applied) == pytest.approx([0.1] * 37, abs=CODE)
+    on_wire = signals_of(driver.unit.frames)
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+    bad = driver.observer.call(Degauss, "degauss", Degauss.Request(amplitude=1.5))
+    assert bad.error_code == ErrorCode.OUT_OF_RANGE and "must be 0 to 1" in bad.message
+
+
+def test_unit_unplugged_during_a_ramp_and_its_return(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
+    start("dm_driver", "pdm_driver", parameters(unit, limits__slew_rate=2.0))
+    driver = Driver(observer, unit)
+    driver.wait_active()
+    driver.command(np.full(37, 1.0))
+    wait_until(lambda: len(unit.frames) > 5)
+    unit.unplug()
+    state = driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_LINK_LOST, "link lost")
+    assert state.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
+    assert f"127.0.0.1:{unit.port}" in state.message
+    assert not state.history_known
+    answer = driver.set_signals(np.zeros(37))
+    assert answer.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
+    wait_until(
+        lambda: driver.diagnostics and driver.diagnostics[-1].status[0].level == b"\x02",
+        what="an error in the diagnostics",
+    )
+    assert "link lost" in driver.diagnostics[-1].status[0].message
+
+    applied = list(driver.states[-1].applied)
+    before = len(unit.frames)
+    unit.plug()
+    driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_ACTIVE, "active again")
+    wait_until(lambda: len(unit.frames) > before)
+    assert signals_of(unit.frames)[before] == pytest.approx(applied, abs=1e-9)
+    answer = driver.set_signals(np.full(37, -1.0), wait=True)
+    assert answer.error_code == ErrorCode.OK
+
+
+def test_a_unit_that_is_off_at_the_start_is_taken_when_it_comes(
+    start: Start, observer: Observer, unit: Edac40TcpUnit
+) -> None:
+    unit.unplug()
+    start("dm_driver", "pdm_driver", parameters(unit))
+    driver = Driver(observer, unit)
+    state = driver.wait_for_state(
+        lambda state: (
+            state.driver_state == ActuatorState.STATE_LINK_LOST
+            and state.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
+        ),
+        "link lost",
+    )
+    assert "cannot open EDAC40" in state.message and list(state.applied) == []
+    unit.plug()
+    driver.wait_active()
+    wait_until(lambda: unit.frames)
+    assert signals_of(unit.frames)[0] == pytest.approx(-1.0, abs=CODE)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ramps_to_the_safe_shape(
+    start: Start, observer: Observer, unit: Edac40TcpUnit, number: signal.Signals
+) -> None:
+    safe = np.linspace(-0.9, -0.5, 37)
+    node = start("dm_driver", "pdm_driver", parameters(unit, safe_signals=[float(value) for value in safe]))
+    driver = Driver(observer, unit)
+    driver.wait_active()
+    assert driver.set_signals(np.full(37, 0.8), wait=True).error_code == ErrorCode.OK
+    assert node.stop(number) == 0
+    wait_until(lambda: signals_of(unit.frames[-1:])[0] == pytest.approx(safe, abs=CODE), what="safe shape")
+    on_wire = signals_of(unit.frames)
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+    assert "Traceback" not in node.output
+    assert "the mirror stands in the safe shape" in node.output
+
+
+def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
+    start("dm_driver", "pdm_driver", parameters(unit, autostart=False))
+    driver = Driver(observer, unit)
+    driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_UNCONFIGURED, "unconfigured")
+    assert driver.set_signals(np.zeros(37)).error_code == ErrorCode.DRIVER_INACTIVE
+    assert driver.change(Transition.TRANSITION_CONFIGURE)
+    driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_INACTIVE, "inactive")
+    answer = driver.set_signals(np.zeros(37))
+    assert answer.error_code == ErrorCode.DRIVER_INACTIVE and "activate" in answer.message
+    driver.command(np.zeros(37))
+    driver.wait_for_state(lambda state: state.error_code == ErrorCode.DRIVER_INACTIVE, "refusal")
+    assert unit.raw == b""
+
+    assert driver.change(Transition.TRANSITION_ACTIVATE)
+    driver.wait_active()
+    assert driver.set_signals(np.full(37, 0.4), wait=True).error_code == ErrorCode.OK
+    assert driver.change(Transition.TRANSITION_DEACTIVATE)
+    state = driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_INACTIVE, "inactive")
+    assert list(state.applied) == pytest.approx([-1.0] * 37, abs=CODE)
+    assert any(state.driver_state == ActuatorState.STATE_SAFING for state in driver.states)
+    on_wire = signals_of(unit.frames)
+    assert on_wire[-1] == pytest.approx(-1.0, abs=CODE)
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+    assert driver.change(Transition.TRANSITION_CLEANUP)
+    driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_UNCONFIGURED, "unconfigured")
+    assert driver.change(Transition.TRANSITION_CONFIGURE)
+    assert driver.change(Transition.TRANSITION_ACTIVATE)
+    assert driver.set_signals(np.full(37, -0.5), wait=True).error_code == ErrorCode.OK
+    # Straight from active to finalized: the safe shape again.
+    assert driver.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    wait_until(lambda: signals_of(unit.frames[-1:])[0] == pytest.approx(-1.0, abs=CODE), what="safe shape")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"mirror__wiring": "hexagon"}, ["mirror.wiring = 'hexagon'", "trihex, 37ch_30mm, 37ch_30mm_v2005, custom"]),
+        (
+            {"mirror__serial": None, "electronics__kind": None, "volts__min": None, "volts__amplifier_gain": None},
+            ["required", "mirror.serial", "electronics.kind", "volts.min", "volts.amplifier_gain"],
+        ),
+        ({"volts__max": 500.0}, ["volts.max = 500 V needs 6.25 V"]),
+        ({"safe_signals": [0.0] * 36}, ["safe_signals has 36 values: must have 37"]),
+        ({"limits__step": 5.0}, ["limits.step", "5.0"]),
+        ({"volts__max": 300}, ["volts.max"]),
+        ({"electronics__address": ""}, ["electronics.address is empty"]),
+    ],
+)
+def test_wrong_configurations_are_refused_in_words(
+    start: Start, observer: Observer, unit: Edac40TcpUnit, changes: dict[str, Any], words: list[str]
+) -> None:
+    node = start("dm_driver", "pdm_driver", parameters(unit, **changes))
+    driver = Driver(observer, unit)
+    state = driver.wait_for_state(lambda state: state.message, "the reason")
+    assert state.driver_state == ActuatorState.STATE_UNCONFIGURED
+    assert state.error_code == ErrorCode.INVALID_ARGUMENT
+    for word in words:
+        assert word in state.message
+        assert word in node.output
+    assert driver.set_signals(np.zeros(37)).error_code == ErrorCode.DRIVER_INACTIVE
+    assert node.running and unit.clients == 0
+    assert node.stop() == 0
+
+
+def test_watchdog_over_dds(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:
+    start("dm_driver", "pdm_driver", parameters(unit, limits__watchdog=1.0))
+    driver = Driver(observer, unit)
+    driver.wait_active()
+    assert driver.set_signals(np.full(37, 0.2), wait=True).error_code == ErrorCode.OK
+    state = driver.wait_for_state(lambda state: not state.moving and state.applied[0] < -0.99, "safe shape")
+    assert state.driver_state == ActuatorState.STATE_ACTIVE
+    assert driver.set_signals(np.full(37, -0.9), wait=True).error_code == ErrorCode.OK

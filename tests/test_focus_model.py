@@ -1,0 +1,143 @@
+"""Commands for curvatures on a linear mirror with known influence functions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
+
+from dm_calibration.optics.zernike import basis
+from dm_controller.model import CalibratedMirror, InfluenceModel
+from dm_controller.solvers.bounded import Limits
+from dm_controller.target import FocusTarget, TargetError
+
+PAIRS = np.asarray(make_mirror().neighbours, dtype=np.intp)
+
+
+@pytest.fixture(scope="module")
+def mirror() -> LinearMirror:
+    return LinearMirror(*hexagon())
+
+
+def model_of(mirror: LinearMirror, held_out: float = 0.0) -> InfluenceModel:
+    points = mirror.points
+    return InfluenceModel(
+        aperture_radius=RADIUS,
+        influence_zernike=mirror.fit_terms(mirror.influence.T).T,
+        zernike_offset=mirror.figure_coefficients,
+        sample_x=points.x,
+        sample_y=points.y,
+        sample_weight=points.weight,
+        influence_sag=mirror.influence,
+        sag_offset=mirror.modes @ mirror.figure_coefficients,
+        in_sample_rms=0.0,
+        held_out_rms=held_out,
+        held_out_max_zernike=held_out,
+        maps_used=100,
+    )
+
+
+def calibrated(mirror: LinearMirror, neighbour_difference: float = 2.0, held_out: float = 0.0) -> CalibratedMirror:
+    return CalibratedMirror(model_of(mirror, held_out), Limits(-1.0, 1.0, PAIRS, neighbour_difference))
+
+
+@pytest.mark.parametrize("curvature", [-0.03, 0.0, 0.01, 0.03])
+def test_the_surface_takes_the_curvature(mirror: LinearMirror, curvature: float) -> None:
+    """The true surface of the planned command, against the sphere by itself: c r^2 / 2 to third order."""
+    plan = calibrated(mirror).plan(FocusTarget(curvature))
+    sag = mirror.sag(plan.signals)
+    radius = RADIUS * np.hypot(mirror.points.x, mirror.points.y)
+    error = mirror.fit_terms(sag - curvature * radius**2 / 2)
+    assert np.abs(error[3:]).max() < 1e-10
+    assert plan.max_zernike < 1e-10
+    assert not plan.saturated.any()
+
+
+def test_predicted_rms_is_the_true_one(mirror: LinearMirror) -> None:
+    target = FocusTarget(0.03, conic_constant=-1.0)
+    plan = calibrated(mirror).plan(target)
+    points = mirror.points
+    error = mirror.sag(plan.signals) - target.sag(points.x, points.y, RADIUS)
+    tilt_free = error - np.column_stack([np.ones(len(points)), points.x, points.y]) @ np.linalg.lstsq(
+        np.sqrt(points.weight)[:, None] * np.column_stack([np.ones(len(points)), points.x, points.y]),
+        np.sqrt(points.weight) * error,
+        rcond=None,
+    )[0]
+    assert plan.rms == pytest.approx(math.sqrt(points.weight @ tilt_free**2), rel=1e-6)
+
+
+def test_bounds_hold_the_held_out_error(mirror: LinearMirror) -> None:
+    plan = calibrated(mirror, held_out=5e-9).plan(FocusTarget(0.02))
+    assert plan.rms_upper == pytest.approx(math.hypot(plan.rms, 1.96 * 5e-9))
+    assert plan.max_zernike_upper == pytest.approx(plan.max_zernike + 5e-9)
+
+
+def test_reachable_range_has_its_edge_where_the_error_meets_the_tolerance(mirror: LinearMirror) -> None:
+    controller, tolerance = calibrated(mirror), 1e-8
+    low, high = controller.reachable_range(FocusTarget(0.0), tolerance)
+    assert low < 0 < high
+    for edge in (low, high):
+        assert controller.plan(FocusTarget(edge)).max_zernike <= tolerance
+        assert controller.plan(FocusTarget(edge * 1.01)).max_zernike > tolerance
+        assert controller.plan(FocusTarget(edge * 1.01)).saturated.any()
+
+
+def test_a_tighter_neighbour_limit_narrows_the_range_and_is_kept(mirror: LinearMirror) -> None:
+    wide, narrow = calibrated(mirror), calibrated(mirror, neighbour_difference=0.15)
+    assert narrow.reachable_range(FocusTarget(0.0), 1e-8)[1] < wide.reachable_range(FocusTarget(0.0), 1e-8)[1]
+    plan = narrow.plan(FocusTarget(0.05))
+    differences = np.abs(plan.signals[PAIRS[:, 0]] - plan.signals[PAIRS[:, 1]])
+    assert differences.max() <= 0.15 + 1e-9
+
+
+def test_added_terms_appear_on_the_surface(mirror: LinearMirror) -> None:
+    wanted = np.zeros(21)
+    wanted[4], wanted[6] = 3e-7, -1e-7
+    plan = calibrated(mirror).plan(FocusTarget(0.01, zernike=tuple(wanted)))
+    radius = RADIUS * np.hypot(mirror.points.x, mirror.points.y)
+    surface = mirror.fit_terms(mirror.sag(plan.signals) - 0.01 * radius**2 / 2)
+    np.testing.assert_allclose(surface[3:], wanted[3:], atol=1e-10)
+
+
+def test_nothing_is_reachable_with_terms_beyond_the_stroke(mirror: LinearMirror) -> None:
+    wanted = np.zeros(21)
+    wanted[10] = 1e-3
+    low, high = calibrated(mirror).reachable_range(FocusTarget(0.0, zernike=tuple(wanted)), 1e-8)
+    assert math.isnan(low)
+    assert math.isnan(high)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"curvature": math.nan}, "curvature = nan"),
+        ({"curvature": 0.0, "conic_constant": math.inf}, "conic_constant = inf"),
+        ({"curvature": 0.0, "zernike": (0.0, 1.0)}, "zernike has 2 terms: must be empty or 21"),
+        ({"curvature": 0.0, "zernike": (math.nan,) * 21}, "every term must be finite"),
+    ],
+)
+def test_impossible_requests_are_refused_by_name(arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(TargetError, match=words):
+        FocusTarget(**arguments)  # type: ignore[arg-type]
+
+
+def test_a_sphere_smaller_than_the_aperture_is_refused() -> None:
+    with pytest.raises(TargetError, match="must be below 1"):
+        FocusTarget(200.0).coefficients(RADIUS)
+
+
+def test_sag_and_coefficients_agree() -> None:
+    target = FocusTarget(0.05, -0.5)
+    x, y = np.array([0.0, 0.3, -0.6]), np.array([0.1, -0.2, 0.7])
+    np.testing.assert_allclose(target.sag(x, y, RADIUS), basis(x, y) @ target.coefficients(RADIUS), atol=1e-15)
+
+
+def test_inconsistent_calibrations_are_refused(mirror: LinearMirror) -> None:
+    good = model_of(mirror)
+    fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
+    with pytest.raises(ValueError, match="sag_offset has shape"):
+        InfluenceModel(**{**fields, "sag_offset": np.zeros(3)})
+    with pytest.raises(ValueError, match="influence_sag holds values that are not finite"):
+        InfluenceModel(**{**fields, "influence_sag": np.full_like(mirror.influence, np.nan)})

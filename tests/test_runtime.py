@@ -1,0 +1,298 @@
+"""The runtime the nodes share: executor, worker services and actions, calls from threads, declared parameters."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from action_msgs.msg import GoalStatus
+from dm_msgs.action import MoveFocus
+from dm_msgs.msg import ErrorCode
+from dm_msgs.srv import Flatten, SetSignals
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from std_msgs.msg import Int32
+
+from dm_runtime import qos
+from dm_runtime.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
+from dm_runtime.worker import ServiceCallError, WorkerActionServer, WorkerService, call, sleep
+from support import Observer, wait_until
+
+
+def test_stream_is_served_while_a_service_blocks(observer: Observer) -> None:
+    release = threading.Event()
+
+    def blocking(_request: Any, response: Any) -> Any:
+        assert release.wait(20)
+        response.message = "done"
+        return response
+
+    WorkerService(observer.node, Flatten, "slow", blocking)
+    received = observer.record(Int32, "stream")
+    publisher = observer.node.create_publisher(Int32, "stream", 10)
+    client = observer.node.create_client(Flatten, "slow")
+    wait_until(client.service_is_ready)
+    future = client.call_async(Flatten.Request())
+    for value in range(20):
+        publisher.publish(Int32(data=value))
+        wait_until(lambda value=value: len(received) > value, what="the stream stalled behind the service")
+    assert not future.done()
+    release.set()
+    wait_until(future.done)
+    assert future.result().message == "done"
+
+
+def test_waiting_for_a_worker_does_not_poll(observer: Observer) -> None:
+    release = threading.Event()
+    WorkerService(observer.node, Flatten, "slow", lambda _request, response: (release.wait(20), response)[1])
+    client = observer.node.create_client(Flatten, "slow")
+    wait_until(client.service_is_ready)
+    future = client.call_async(Flatten.Request())
+    time.sleep(0.3)
+    before = time.process_time()
+    time.sleep(1.0)
+    used = time.process_time() - before
+    release.set()
+    wait_until(future.done)
+    assert used < 0.5, f"{used:.2f} s of CPU in 1 s of waiting: something polls"
+
+
+def test_a_failing_service_callback_answers_with_the_reason(observer: Observer) -> None:
+    def failing(_request: Any, _response: Any) -> Any:
+        raise RuntimeError("the plate is bent")
+
+    WorkerService(observer.node, SetSignals, "failing", failing)
+    response = observer.call(SetSignals, "failing")
+    assert response.error_code == ErrorCode.INTERNAL
+    assert "the plate is bent" in response.message
+
+
+def test_the_loop_survives_a_callback_that_raises(observer: Observer) -> None:
+    received = []
+
+    def callback(message: Int32) -> None:
+        if message.data == 0:
+            raise ValueError("first message")
+        received.append(message.data)
+
+    observer.node.create_subscription(Int32, "numbers", callback, 10)
+    publisher = observer.node.create_publisher(Int32, "numbers", 10)
+    wait_until(lambda: publisher.get_subscription_count() == 1)
+    for value in (0, 1, 0, 2):
+        publisher.publish(Int32(data=value))
+    wait_until(lambda: received == [1, 2])
+    publisher.publish(Int32(data=3))
+    wait_until(lambda: received == [1, 2, 3])
+
+
+class Mover:
+    """An action body that runs until it is told to stop or allowed to finish."""
+
+    def __init__(self, observer: Observer, exclusive: str) -> None:
+        self.release = threading.Event()
+        self.started: list[float] = []
+        self.server = WorkerActionServer(observer.node, MoveFocus, "move", self.body, exclusive=exclusive)
+
+    def body(self, goal_handle: Any) -> tuple[str, Any]:
+        self.started.append(goal_handle.request.tolerance)
+        result = MoveFocus.Result()
+        while not self.release.is_set():
+            goal_handle.publish_feedback(MoveFocus.Feedback(progress=0.5))
+            if goal_handle.is_cancel_requested:
+                result.error_code = ErrorCode.CANCELED
+                return "canceled", result
+            if self.server.preempted(goal_handle):
+                result.error_code = ErrorCode.PREEMPTED
+                return "abort", result
+            time.sleep(0.01)
+        result.duration = goal_handle.request.tolerance
+        return "succeed", result
+
+
+def test_action_succeeds_with_its_result_and_feedback(observer: Observer) -> None:
+    mover = Mover(observer, "refuse")
+    feedback: list[Any] = []
+    handle, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal(tolerance=2.5), feedback.append)
+    assert handle.accepted
+    wait_until(lambda: feedback)
+    mover.release.set()
+    wait_until(result.done)
+    assert result.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert result.result().result.duration == 2.5
+
+
+def test_action_cancel_is_honoured(observer: Observer) -> None:
+    Mover(observer, "refuse")
+    handle, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
+    handle.cancel_goal_async()
+    wait_until(result.done)
+    assert result.result().status == GoalStatus.STATUS_CANCELED
+    assert result.result().result.error_code == ErrorCode.CANCELED
+
+
+def test_a_second_goal_is_refused_while_one_runs(observer: Observer) -> None:
+    mover = Mover(observer, "refuse")
+    first, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
+    second, _ = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
+    assert first.accepted
+    assert not second.accepted
+    mover.release.set()
+    wait_until(result.done)
+    third, _ = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
+    assert third.accepted
+
+
+def test_the_newest_goal_preempts(observer: Observer) -> None:
+    mover = Mover(observer, "preempt")
+    _, first = observer.send_goal(MoveFocus, "move", MoveFocus.Goal(tolerance=1.0))
+    wait_until(lambda: mover.started == [1.0])
+    _, second = observer.send_goal(MoveFocus, "move", MoveFocus.Goal(tolerance=2.0))
+    wait_until(first.done)
+    assert first.result().result.error_code == ErrorCode.PREEMPTED
+    mover.release.set()
+    wait_until(second.done)
+    assert second.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert mover.started == [1.0, 2.0]
+
+
+def test_call_names_the_service_that_is_missing(observer: Observer) -> None:
+    client = observer.node.create_client(Flatten, "nowhere")
+    with pytest.raises(ServiceCallError, match="nowhere: no such service"):
+        call(client, Flatten.Request(), timeout_s=0.1)
+
+
+def test_call_gives_up_on_a_silent_server_and_on_cancel(observer: Observer) -> None:
+    release = threading.Event()
+    WorkerService(observer.node, Flatten, "silent", lambda _request, response: (release.wait(20), response)[1])
+    client = observer.node.create_client(Flatten, "silent")
+    wait_until(client.service_is_ready)
+    with pytest.raises(ServiceCallError, match="no answer within"):
+        call(client, Flatten.Request(), timeout_s=0.2)
+    with pytest.raises(ServiceCallError, match="cancelled"):
+        call(client, Flatten.Request(), timeout_s=20, cancelled=lambda: True)
+    release.set()
+
+
+def test_sleep_ends_early_when_cancelled(observer: Observer) -> None:
+    assert sleep(observer.node.get_clock(), 0.05)
+    assert not sleep(observer.node.get_clock(), 60.0, cancelled=lambda: True)
+
+
+TABLE = (
+    Parameter("serial", str, REQUIRED, "serial number of the mirror"),
+    Parameter("gain", float, 2.0, "gain of the amplifier", "V/V", 0.0, 100.0, live=True),
+    Parameter("count", int, 3, "how many", low=1, high=5),
+    Parameter("kind", str, "a", "which kind", choices=("a", "b")),
+    Parameter("positions", "float[]", [], "where", "m", -1.0, 1.0),
+)
+
+
+def node_with(observer: Observer, name: str, **values: Any) -> Node:
+    return Node(name, parameter_overrides=[RosParameter(key, value=value) for key, value in values.items()])
+
+
+def test_parameters_take_defaults_and_given_values(observer: Observer) -> None:
+    node = node_with(observer, "given", serial="S1", positions=[0.5, -0.5])
+    values = declare(node, TABLE)
+    assert values == {"serial": "S1", "gain": 2.0, "count": 3, "kind": "a", "positions": [0.5, -0.5]}
+    node.destroy_node()
+
+
+def test_missing_required_parameters_are_named(observer: Observer) -> None:
+    node = node_with(observer, "missing")
+    with pytest.raises(ParameterError, match="serial"):
+        declare(node, TABLE)
+    node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("gain", 101.0, "0 to 100 V/V"),
+        ("gain", math.nan, "0 to 100"),
+        ("count", 9, "1 to 5"),
+        ("kind", "c", "one of a, b"),
+        ("positions", [2.0], "-1 to 1 m"),
+    ],
+)
+def test_values_out_of_range_are_refused_with_the_range(observer: Observer, name: str, value: Any, words: str) -> None:
+    node = node_with(observer, "wrong", serial="S1", **{name: value})
+    with pytest.raises((ParameterError, Exception)) as caught:
+        declare(node, TABLE)
+    assert name in str(caught.value)
+    node.destroy_node()
+    with pytest.raises(ParameterError) as refused:
+        next(parameter for parameter in TABLE if parameter.name == name).check(value)
+    assert words in str(refused.value)
+
+
+def test_live_parameters_are_checked_and_applied_on_set(observer: Observer) -> None:
+    node = node_with(observer, "live", serial="S1")
+    changes: list[Any] = []
+    values = declare(node, TABLE, on_change=changes.append)
+    assert not node.set_parameters([RosParameter("gain", value=-1.0)])[0].successful
+    assert values["gain"] == 2.0
+    assert node.set_parameters([RosParameter("gain", value=5.0)])[0].successful
+    assert values["gain"] == 5.0
+    assert changes == [{"gain": 5.0}]
+    assert not node.set_parameters([RosParameter("serial", value="S2")])[0].successful
+    node.destroy_node()
+
+
+def test_markdown_lists_every_parameter() -> None:
+    text = as_markdown(TABLE)
+    assert all(f"`{parameter.name}`" in text for parameter in TABLE)
+    assert "**required**" in text
+
+
+NODE_SCRIPT = """
+import sys, time
+from dm_runtime.executor import run_node
+from rclpy.node import Node
+
+class Careful(Node):
+    def __init__(self):
+        super().__init__("careful")
+        print("ready", flush=True)
+    def make_safe(self):
+        time.sleep(0.5)
+        print("safe", flush=True)
+
+sys.exit(run_node(Careful))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_is_made_safe_on_signals_even_when_hit_twice(domain: int, tmp_path: Path, number: int) -> None:
+    script = tmp_path / "careful.py"
+    script.write_text(NODE_SCRIPT)
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(0.3)
+    process.send_signal(number)
+    time.sleep(0.2)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=15)
+    assert output == "safe\n"
+    assert "Traceback" not in errors
+    assert process.returncode == 0
+
+
+def test_nothing_of_a_client_stays_in_the_graph(domain: int) -> None:
+    """Also after it called a service of its own: the executor lets go of every entity."""
+    for _round in range(3):
+        with Observer(domain) as observer:
+            WorkerService(observer.node, Flatten, "flatten", lambda _request, response: response)
+            observer.record(Int32, "numbers", qos.LATCHED)
+            observer.node.create_publisher(Int32, "numbers", qos.LATCHED).publish(Int32(data=1))
+            observer.call(Flatten, "flatten")
+            assert observer.node.count_publishers("numbers") == 1
+            assert observer.node.get_node_names() == ["observer"]
