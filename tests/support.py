@@ -36,6 +36,10 @@ def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str 
 __all__ = ["NodeProcess", "Observer", "own_domain", "wait_until"]
 
 
+#: A server that answers before it has discovered the client's reader drops the answer.
+DISCOVERY_S = 0.2
+
+
 class NodeProcess:
     """One node of the suite in its own process, its output in a file."""
 
@@ -111,6 +115,7 @@ class Observer:
         """Call a service and return its response."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(service_type, name)
+            time.sleep(DISCOVERY_S)
         client = self._clients[name]
         wait_until(client.service_is_ready, timeout_s, f"service {name}")
         future = client.call_async(request if request is not None else service_type.Request())
@@ -123,6 +128,7 @@ class Observer:
         """Send a goal; return (goal handle, future of the result)."""
         if name not in self._clients:
             self._clients[name] = ActionClient(self.node, action_type, name)
+            time.sleep(DISCOVERY_S)
         client = self._clients[name]
         wait_until(client.server_is_ready, 15, f"action {name}")
         accepted = client.send_goal_async(goal, feedback_callback=feedback)

@@ -21,10 +21,10 @@ from dm_msgs.msg import (
     MirrorInfo,
 )
 from dm_msgs.srv import Flatten, SetFocus
-from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from rclpy.time import Time
 
 from dm_runtime import qos
+from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from support import NodeProcess, Observer, wait_until
 
 MIRROR = LinearMirror(*hexagon())

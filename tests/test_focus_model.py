@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 from dm_calibration.optics.zernike import basis
 from dm_controller.model import CalibratedMirror, InfluenceModel
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget, TargetError
+from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 PAIRS = np.asarray(make_mirror().neighbours, dtype=np.intp)
 
@@ -60,11 +60,15 @@ def test_predicted_rms_is_the_true_one(mirror: LinearMirror) -> None:
     plan = calibrated(mirror).plan(target)
     points = mirror.points
     error = mirror.sag(plan.signals) - target.sag(points.x, points.y, RADIUS)
-    tilt_free = error - np.column_stack([np.ones(len(points)), points.x, points.y]) @ np.linalg.lstsq(
-        np.sqrt(points.weight)[:, None] * np.column_stack([np.ones(len(points)), points.x, points.y]),
-        np.sqrt(points.weight) * error,
-        rcond=None,
-    )[0]
+    tilt_free = (
+        error
+        - np.column_stack([np.ones(len(points)), points.x, points.y])
+        @ np.linalg.lstsq(
+            np.sqrt(points.weight)[:, None] * np.column_stack([np.ones(len(points)), points.x, points.y]),
+            np.sqrt(points.weight) * error,
+            rcond=None,
+        )[0]
+    )
     assert plan.rms == pytest.approx(math.sqrt(points.weight @ tilt_free**2), rel=1e-6)
 
 

@@ -43,6 +43,7 @@ class Calibration:
         maps: the raw data.
         fit: the result.
         dropped: "label: reason" of the states that gave no map at all.
+        targets: the shapes that were solved from an influence function, in words; their coefficients are maps.nominal.
         limitations: sentences; those of the fit, of the run, and of the poke check.
         note: the user's.
     """
@@ -58,6 +59,7 @@ class Calibration:
     maps: MapSet
     fit: InfluenceFit
     dropped: tuple[str, ...] = ()
+    targets: tuple[str, ...] = ()
     limitations: tuple[str, ...] = ()
     note: str = ""
     software_version: str = ""
@@ -105,6 +107,7 @@ def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, A
         "created_ns": int(calibration.created_ns),
         "software_version": calibration.software_version,
         "dropped": calibration.dropped,
+        "targets": calibration.targets,
         "known_limitations": calibration.limitations,
         "note": calibration.note,
         "maps_used": int(fit.used.sum()),
@@ -157,6 +160,7 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
             maps=maps,
             fit=fit,
             dropped=_typed(attributes, "dropped", tuple),
+            targets=_typed(attributes, "targets", tuple),
             limitations=_typed(attributes, "known_limitations", tuple),
             note=_typed(attributes, "note", str),
             software_version=_typed(attributes, "software_version", str),

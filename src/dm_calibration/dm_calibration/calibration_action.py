@@ -20,6 +20,7 @@ from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.mirror import Mirror
 from dm_calibration.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure import Outcome, Procedure, Progress
+from dm_runtime.worker import wait_for_clock
 
 #: Least time between two feedback messages, s.
 FEEDBACK_PERIOD_S = 0.1
@@ -31,6 +32,10 @@ _PHASES = {
 }
 
 
+#: How long a goal waits for a driver that was started together with this node.
+START_GRACE_S = 5.0
+
+
 class CalibrateAction:
     """Runs one goal at a time, in a worker thread."""
 
@@ -39,11 +44,14 @@ class CalibrateAction:
 
     def run(self, handle: ServerGoalHandle) -> tuple[str, Calibrate.Result]:
         result = Calibrate.Result()
-        started = self._node.get_clock().now()
+        clock = self._node.get_clock()
+        started = clock.now()
         outcome = Outcome()
         moved = False
         try:
-            mirror = self._desk.known_mirror()
+            mirror = self._desk.known_mirror(wait_s=START_GRACE_S)
+            wait_for_clock(clock)
+            started = clock.now()
             plan = self._planned(handle.request, mirror)
             self._bench.check_ready()
             self._bench.settle_time = handle.request.settle_time or self._values["settle_time"]
@@ -62,7 +70,7 @@ class CalibrateAction:
             if moved:
                 result.message = "; ".join(filter(None, (result.message, self._bench.rest(mirror.rest))))
         result.maps_dropped = len(result.dropped)
-        result.duration = (self._node.get_clock().now() - started).nanoseconds * 1e-9
+        result.duration = (clock.now() - started).nanoseconds * 1e-9
         if result.error_code == ErrorCode.OK:
             self._node.get_logger().info(f"calibration {result.id}: {result.message}")
             return "succeed", result

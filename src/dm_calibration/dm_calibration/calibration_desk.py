@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -48,13 +49,15 @@ class CalibrationDesk:
         with self._lock:
             return self._in_use
 
-    def known_mirror(self) -> Mirror:
-        """The mirror.
+    def known_mirror(self, wait_s: float = 0.0) -> Mirror:
+        """The mirror. A worker thread may wait for a driver that is still starting.
 
         Raises:
             Refused: it is not known yet.
         """
-        mirror = self.mirror
+        deadline = time.monotonic() + wait_s
+        while (mirror := self.mirror) is None and time.monotonic() < deadline:
+            time.sleep(0.02)
         if mirror is None:
             raise Refused(ErrorCode.DRIVER_UNAVAILABLE, "no mirror_info yet: is pdm_driver running and configured?")
         return mirror

@@ -70,6 +70,7 @@ def evaluate(
         maps=maps,
         fit=fit,
         dropped=tuple(outcome.dropped),
+        targets=tuple(outcome.targets),
         limitations=tuple(limitations),
         note=provenance.note,
         software_version=software_version(),

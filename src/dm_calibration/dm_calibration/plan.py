@@ -112,10 +112,10 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
     return Plan(kind, tuple(steps), tuple(remarks))
 
 
-def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple[Step, str]:
-    """`step` with the signals and nominal coefficients that `model` gives it, and a remark."""
+def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple[Step, surfaces.Surface]:
+    """`step` with the signals and nominal coefficients that `model` gives it, and the surface they come from."""
     surface = surfaces.model_surface(step.label, model, mirror)
-    return Step(step.label, step.kind, surface.signals, surface.nominal), surface.remark
+    return Step(step.label, step.kind, surface.signals, surface.nominal), surface
 
 
 def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:

@@ -126,7 +126,8 @@ class Outcome:
         system_error_subtracted: as in Measurement, the same for all maps.
         radius_known: whether the maps tell their aperture radius.
         dropped: "label: reason" of each map or state that gave none.
-        remarks: what else a person should know.
+        remarks: what was measured differently than asked.
+        targets: the shapes that were solved, in words.
     """
 
     records: list[MapRecord] = field(default_factory=list)
@@ -136,6 +137,7 @@ class Outcome:
     radius_known: bool = True
     dropped: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    targets: list[str] = field(default_factory=list)
 
     def maps(self) -> MapSet:
         """All maps measured.
@@ -209,12 +211,13 @@ class Procedure:
         try:
             if self._model is None:
                 self._model = fit_influence(self.outcome.maps(), self._options.fit, rings=self._mirror.rings)
-            solved, remark = solve_step(step, self._model, self._mirror)
+            solved, surface = solve_step(step, self._model, self._mirror)
         except TooFewMapsError as error:
             self.outcome.dropped.append(f"{step.label}: no influence function to solve its signals from: {error}")
             return None
-        if remark:
-            self.outcome.remarks.append(remark)
+        self.outcome.targets.append(surface.target)
+        if surface.remark:
+            self.outcome.remarks.append(surface.remark)
         return solved
 
     def _measure_state(self, step: Step, number: int) -> None:

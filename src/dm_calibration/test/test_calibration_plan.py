@@ -39,8 +39,8 @@ def test_pokes_push_and_pull_one_actuator() -> None:
     for k in range(37):
         unit = np.eye(37)[k]
         assert pokes[2 * k].label == f"poke+{k + 1:02d}"
-        assert np.array_equal(pokes[2 * k].signals, 0.5 * unit)
-        assert np.array_equal(pokes[2 * k + 1].signals, -0.5 * unit)
+        for step, expected in ((pokes[2 * k], 0.5 * unit), (pokes[2 * k + 1], -0.5 * unit)):
+            assert step.signals is not None and np.array_equal(step.signals, expected)
 
 
 def test_pokes_shrink_to_the_neighbour_limit() -> None:

@@ -203,7 +203,8 @@ def test_shapes_are_solved_from_the_pokes_of_the_run() -> None:
     sphere = next(record for record in outcome.records if record.label == "p57")
     assert sphere.nominal is not None
     assert sphere.coefficients[3:] == pytest.approx(sphere.nominal[3:], abs=10e-9)
-    assert any(remark.startswith("p57: sphere of radius +100 m") for remark in outcome.remarks)
+    assert any(target.startswith("p57: sphere of radius +100 m") for target in outcome.targets)
+    assert outcome.remarks == []
     maps = outcome.maps()
     assert np.isfinite(maps.nominal).all(axis=1).sum() == 15
 

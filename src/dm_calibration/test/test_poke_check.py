@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dm_calibration.poke_check import check_pokes, cycles, layout_symmetries
+from dm_calibration.poke_check import PokeCheck, check_pokes, cycles, layout_symmetries
 from linear_mirror import RADIUS, LinearMirror, hexagon
 
 X, Y = hexagon()
@@ -23,7 +23,7 @@ def response(x: np.ndarray = X, y: np.ndarray = Y, length: float = 2.6e-3, seed:
     return np.asarray(plant.influence + planes + NOISE * random.standard_normal(plant.influence.shape))
 
 
-def check(measured: np.ndarray, **options: np.ndarray):
+def check(measured: np.ndarray, **options: np.ndarray) -> PokeCheck:
     return check_pokes(measured, PLANT.points, X / RADIUS, Y / RADIUS, **options)
 
 

@@ -37,6 +37,20 @@ from dm_runtime import qos
 from dm_runtime.executor import BackgroundExecutor
 from dm_runtime.worker import ServiceCallError, call
 
+SERVICES = {
+    SetSignals: "set_signals",
+    Degauss: "degauss",
+    SetFocus: "set_focus",
+    Flatten: "flatten",
+    IngestFile: "ingest_file",
+    Measure: "measure",
+    ListCalibrations: "list_calibrations",
+    LoadCalibration: "load_calibration",
+}
+ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus"}
+#: Time the nodes may take to discover a new client on a busy machine.
+DISCOVERY_S = 1.0
+
 
 class DeformableMirrorError(Exception):
     """The suite refused or could not carry out a request.
@@ -68,6 +82,7 @@ class DeformableMirrorClient:
         self._timeout_s = timeout_s
         self._latest: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
+        self._created: dict[str, float] = {}
         for message_type, topic, profile in (
             (MirrorInfo, "mirror_info", qos.LATCHED),
             (Calibration, "calibration", qos.LATCHED),
@@ -75,6 +90,11 @@ class DeformableMirrorClient:
             (ActuatorState, "actuator_state", qos.STATE),
         ):
             self._keep_latest(message_type, topic, profile)
+        # Early, so that the nodes have discovered them all by the time the first is used.
+        for service_type, name in SERVICES.items():
+            self._client(service_type, name)
+        for action_type, name in ACTIONS.items():
+            self._client(action_type, name)
         self._background = BackgroundExecutor(self.node)
 
     def _keep_latest(self, message_type: Any, topic: str, profile: Any) -> None:
@@ -114,6 +134,17 @@ class DeformableMirrorClient:
             time.sleep(0.005)
         return True
 
+    def wait_until_active(self, timeout_s: float = 20.0) -> None:
+        """Wait until the driver accepts commands. Raises DeformableMirrorError with the driver's own reason."""
+
+        def active() -> bool:
+            state = self._latest.get("actuator_state")
+            return state is not None and state.driver_state == ActuatorState.STATE_ACTIVE
+
+        if not self.wait(active, timeout_s):
+            reason = self.latest("actuator_state", 0.1).message or "it is not in the lifecycle state `active`"
+            raise DeformableMirrorError(200, f"pdm_driver does not accept commands: {reason}")
+
     @property
     def capabilities(self) -> Capabilities:
         """Reachable range, calibration quality and error bound."""
@@ -129,14 +160,26 @@ class DeformableMirrorClient:
         """What stands at the electronics."""
         return self.latest("actuator_state")
 
+    def _client(self, interface: Any, name: str) -> Any:
+        """The service or action client of that name, once the other side can have discovered it.
+
+        A server that answers before it knows the client's reader drops the answer, and no API tells whether it does.
+        """
+        if name not in self._clients:
+            is_action = hasattr(interface, "Goal")
+            made = ActionClient(self.node, interface, name) if is_action else self.node.create_client(interface, name)
+            self._clients[name], self._created[name] = made, time.monotonic()
+        elif (missing := self._created[name] + DISCOVERY_S - time.monotonic()) > 0:
+            time.sleep(missing)
+        return self._clients[name]
+
     # --- services ---
 
     def call(self, service_type: Any, name: str, request: Any, timeout_s: float | None = None) -> Any:
         """Call any service of the suite; raise DeformableMirrorError when it refuses or does not answer."""
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(service_type, name)
+        client = self._client(service_type, name)
         try:
-            response = call(self._clients[name], request, self._timeout_s if timeout_s is None else timeout_s)
+            response = call(client, request, self._timeout_s if timeout_s is None else timeout_s)
         except ServiceCallError as error:
             raise DeformableMirrorError(503, str(error)) from error
         if response.error_code != 0:
@@ -211,9 +254,7 @@ class DeformableMirrorClient:
         self, action_type: Any, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float
     ) -> Any:
         """Run a goal to its end. Ctrl-C cancels it first, so that the mirror is left safe."""
-        if name not in self._clients:
-            self._clients[name] = ActionClient(self.node, action_type, name)
-        client = self._clients[name]
+        client = self._client(action_type, name)
         if not self.wait(client.server_is_ready):
             raise DeformableMirrorError(503, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))

@@ -84,7 +84,7 @@ def save_sweep_figure(rows: Sequence[dict[str, Any]], path: Path, title: str, mi
         summary.axhline(WAVELENGTH_NM / divisor, color="grey", linewidth=0.8, linestyle=":")
         summary.annotate(f"λ/{divisor}", (curvatures[0], WAVELENGTH_NM / divisor), fontsize=8, va="bottom")
     summary.set(xlabel="requested curvature, 1/m (concave positive)", ylabel="nm")
-    summary.legend(fontsize=8, ncols=3, loc="upper center")
+    summary.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     summary.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -10,11 +10,13 @@ with care (measured with rclpy 7.1.6):
   that waits therefore runs in worker threads (see :mod:`dm_runtime.worker`), and callbacks stay short.
 * It keeps a hold on every entity it serves: a node destroyed before its executor is shut down stays in the ROS graph,
   latched messages and all.
-* It installs its own SIGINT/SIGTERM handler, which shuts the ROS context down and ends the loop.
+* A signal may raise KeyboardInterrupt inside any callback, and is not noticed while the loop sleeps. `StopOnSignals`
+  turns SIGINT and SIGTERM into an orderly end instead.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -81,6 +83,35 @@ def _serve_rest_of_batch(executor: Executor) -> None:
                     _log_exception()
 
 
+class StopOnSignals:
+    """Turns SIGINT and SIGTERM into a flag and wakes the executor, so that no callback is interrupted half way.
+
+    Install it after the executor was made: that one sets handlers of its own.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        # Python runs a handler when the main thread is back from the executor's C++ code; a byte in this pipe fetches
+        # it from there.
+        self._reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        self.requested = True
+
+    def wake(self, executor: Executor) -> None:
+        """Wake `executor` at every signal from now on."""
+
+        def watch() -> None:
+            while os.read(self._reader, 1):
+                executor.create_task(lambda: None)
+
+        threading.Thread(target=watch, daemon=True).start()
+
+
 class BackgroundExecutor:
     """Serves a node from a thread of its own, for programs that are not nodes themselves."""
 
@@ -116,7 +147,9 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
     try:
         node = make_node()
         executor = make_executor(node)
-        spin(executor)
+        signals = StopOnSignals()
+        signals.wake(executor)
+        spin(executor, until=lambda: signals.requested)
         return 0
     except (ParameterException, ValueError, OSError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)

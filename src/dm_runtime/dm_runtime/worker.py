@@ -182,12 +182,26 @@ def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[],
     return future.result()
 
 
+def wait_for_clock(clock: Clock, timeout_s: float = 10.0) -> None:
+    """Wait in a worker thread until ROS time runs: simulated time stands at 0 until the first message on /clock.
+
+    Raises:
+        TimeoutError: no time within `timeout_s`.
+    """
+    deadline = time.monotonic() + timeout_s
+    while clock.now().nanoseconds == 0:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"use_sim_time is set, but nothing came on /clock within {timeout_s:g} s")
+        time.sleep(0.01)
+
+
 def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: False) -> bool:
     """Sleep in ROS time (which may run faster than the wall clock) in a worker thread.
 
     Returns True, or False as soon as `cancelled()` is true. When ROS time stands still (a simulator that ended), it
     gives up after 10 s plus ten times `seconds` of wall time and raises TimeoutError.
     """
+    wait_for_clock(clock)
     end = clock.now() + Duration(nanoseconds=round(seconds * 1e9))
     give_up = time.monotonic() + 10.0 + 10.0 * seconds
     while (remaining := (end - clock.now()).nanoseconds * 1e-9) > 0:

@@ -18,8 +18,9 @@ Floats = NDArray[np.float64]
 def drift_columns(stamp_ns: NDArray[np.int64], reference: NDArray[np.bool_]) -> Floats:
     """(M, R) columns of the design: hat functions of time with a knot at each distinct time of a reference frame.
 
-    When the clock was set back during the run, the order of the maps stands for the time. Before the first and after the last frame the figure is taken as constant. Rows sum to 1. With fewer than two
-    distinct reference times there is one column of ones: a constant figure.
+    Before the first and after the last frame the figure is taken as constant. Rows sum to 1. With fewer than two
+    distinct reference times there is one column of ones: a constant figure. When the clock was set back during the
+    run, the order of the maps stands for the time.
     """
     if (np.diff(stamp_ns) < 0).any():
         stamp_ns = np.arange(stamp_ns.size, dtype=np.int64)

@@ -135,7 +135,6 @@ def fit_influence(
             fitted.leverage,
             good.applied,
             _response(fitted, design, good),
-            good.reference,
             options.screening,
         )
         if outlier is None:

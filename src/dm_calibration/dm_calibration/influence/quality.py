@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence.regression import Design
+from dm_calibration.optics.zernike import TERM_RMS
 
 Floats = NDArray[np.float64]
 
@@ -100,8 +101,11 @@ def held_out_residual(
 def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
     """Ratio of the largest to the smallest singular value of G without piston, and without tilt unless it is known.
 
+    In rms-normalised modes, as the tables of mirror makers are: a unit of each mode is then the same rms sag.
     Only as many modes as there are actuators can be told apart, so of (K, N) with N < K - 1 the N largest count.
     """
-    singular = np.linalg.svd(influence_zernike[1 if tilt_known else 3 :], compute_uv=False)
+    first = 1 if tilt_known else 3
+    rms = np.asarray(TERM_RMS)[first : len(influence_zernike), np.newaxis]
+    singular = np.linalg.svd(influence_zernike[first:] * rms, compute_uv=False)
     smallest = float(singular[-1])
     return float(singular[0] / smallest) if smallest > 0.0 else float("inf")

@@ -72,22 +72,20 @@ def worst_outlier(
     leverage: Floats,
     applied: Floats,
     response: Floats,
-    reference: NDArray[np.bool_],
     options: ScreeningOptions,
 ) -> tuple[int, str] | None:
     """The map that stands out most from the fit, with the reason in words; None when none does.
 
     A fit follows a map the more, the greater the map's leverage; residual / sqrt(1 - leverage) makes up for that. A map
-    is an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis of the actuators
-    it moved can explain, added up without coherence. A reference frame moves nothing but carries the remanence of the
-    moves around it; it gets the allowance of the largest of them.
+    is an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis can explain: an
+    allowance for the actuators moved, added up without coherence. A small move carries the remanence of larger ones
+    before it, so the largest move up to then counts.
 
     Args:
         residual_rms: (M,) m.
         leverage: (M,).
         applied: (M, N) normalised.
         response: (N,) rms sag per unit signal, m.
-        reference: (M,) which maps are reference frames.
     """
     judged = leverage < LEVERAGE_MAX
     if judged.sum() < 3:
@@ -96,12 +94,7 @@ def worst_outlier(
     median = float(np.median(scaled[judged]))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(scaled[judged] - median)))
     move = np.sqrt(np.square(applied) @ np.square(response))
-    frames = np.flatnonzero(reference)
-    borders = np.concatenate(([0], frames, [move.size - 1]))
-    around = move.copy()
-    for before, frame, after in zip(borders[:-2], frames, borders[2:], strict=True):
-        around[frame] = move[before : after + 1].max()
-    allowance = options.hysteresis_allowance * around
+    allowance = options.hysteresis_allowance * np.maximum.accumulate(move)
     limit = np.maximum(np.maximum(median + options.outlier_sigmas * sigma, options.residual_floor), allowance)
     outside = scaled > limit
     if not outside.any():

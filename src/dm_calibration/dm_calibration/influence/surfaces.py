@@ -33,8 +33,9 @@ ZERNIKE_NAMES = ("Z_1^1", "Z_2^0", "Z_2^2", "Z_3^1", "Z_3^3", "Z_4^0", "Z_4^2", 
 ZERNIKE_INDEX = (1, 3, 4, 6, 8, 10, 11, 13, 15, 17, 19)
 #: Amplitude of the Zernike surfaces as a share of the largest one the limits allow.
 ZERNIKE_SHARE = 0.5
-#: Weight of small signals in the bounded solve, relative to the influence function.
-DAMPING = 1e-4
+#: Weight of small signals in the solve, relative to the influence function: keeps noise from driving the actuators
+#: that the aperture hardly shows, and costs a shape less than 1 % of its residual.
+DAMPING = 1e-2
 
 _LEVELS = {"p01": -1.0, "p02": -0.5, "p03": 0.0, "p04": 0.5, "p05": 1.0}
 _POKES = {f"p{6 + k:02d}": k for k in range(TABLE_CHANNELS)}
@@ -67,13 +68,15 @@ class Surface:
         name: as in Table 1.
         signals: (N,) normalised, inside the mirror's limits.
         nominal: (21,) Zernike coefficients of the shape aimed at, m; None when signals were prescribed.
-        remark: what differs from Table 1, in words; "" = nothing.
+        remark: what the mirror's limits changed, in words; "" = nothing.
+        target: the shape aimed at and how far it is out of reach, in words; "" when signals were prescribed.
     """
 
     name: str
     signals: Floats
     nominal: Floats | None = None
     remark: str = ""
+    target: str = ""
 
 
 def check_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -184,11 +187,12 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
         raise ValueError(f"{name} prescribes signals, not a shape")
     signals, left = solve_shape(basis(points.x, points.y) @ nominal, model, mirror)
     signals, factor = scale_to_limits(signals, mirror)
-    remark = f"{name}: {wanted}, {left * 1e9:.1f} nm rms beyond the mirror's reach"
+    described = f"{name}: {wanted}, {left * 1e9:.1f} nm rms beyond the mirror's reach"
+    remark = ""
     if factor < 1.0:
         nominal = factor * nominal
-        remark += f"; reduced to {factor:.0%} to keep the limit between neighbours"
-    return Surface(name, signals, nominal, remark)
+        remark = f"{name}: reduced to {factor:.0%} of the {wanted} to keep the limit between neighbours"
+    return Surface(name, signals, nominal, remark, described)
 
 
 def _unbounded(target: Floats, model: LinearModel) -> Floats:
@@ -211,5 +215,5 @@ def _tilt_surface(name: str, unit: Floats, model: LinearModel, mirror: Mirror) -
     direction = mirror.x / np.abs(mirror.x).max() if np.abs(mirror.x).max() > 0 else np.zeros(mirror.actuators)
     share = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
     signals, _ = scale_to_limits(flat + share * direction, mirror)
-    remark = f"{name}: Z_1^1 as a plane of signals of +-{share:.2f}; its size in metres is not measured"
-    return Surface(name, signals, 0.0 * unit, remark)
+    target = f"{name}: Z_1^1 as a plane of signals of +-{share:.2f}; its size in metres is not measured"
+    return Surface(name, signals, 0.0 * unit, target=target)

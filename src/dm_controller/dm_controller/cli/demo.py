@@ -212,8 +212,10 @@ def demo(
         )
         with Suite(config, folder, domain) as suite, DeformableMirrorClient(domain=domain) as client:
             try:
-                client.latest("mirror_info", 20.0)
+                client.wait_until_active(20.0)
+                begun = time.monotonic()
                 result = run_calibration(client, Calibrate.Goal(activate=True, note="demo"))
+                wall_time = time.monotonic() - begun
                 show_result(result)
                 if not client.wait(lambda: client.capabilities.calibration_id == result.id):
                     raise RuntimeError("the focus controller did not take the new calibration")
@@ -230,7 +232,7 @@ def demo(
     if not keep_maps:
         shutil.rmtree(folder / "maps")
     figures |= {
-        "calibration": figures_of(result),
+        "calibration": figures_of(result) | {"seconds": wall_time, "bench_seconds": result.duration},
         "focus": [
             {
                 "curvature": row["curvature"],
