@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,10 @@ from dm_runtime.worker import ServiceCallError, WorkerActionServer, WorkerServic
 from support import Observer, wait_until
 
 
+def _longer(received: list[Any], count: int) -> bool:
+    return len(received) > count
+
+
 def test_stream_is_served_while_a_service_blocks(observer: Observer) -> None:
     release = threading.Event()
 
@@ -42,7 +47,7 @@ def test_stream_is_served_while_a_service_blocks(observer: Observer) -> None:
     future = client.call_async(Flatten.Request())
     for value in range(20):
         publisher.publish(Int32(data=value))
-        wait_until(lambda value=value: len(received) > value, what="the stream stalled behind the service")
+        wait_until(partial(_longer, received, value), what="the stream stalled behind the service")
     assert not future.done()
     release.set()
     wait_until(future.done)

@@ -58,7 +58,7 @@ def _azimuthal_orders(n: int) -> list[int]:
     return [m for m in range(n % 2, n + 1, 2) for _part in range(1 if m == 0 else 2)]
 
 
-#: rms of the 21 peak-normalised terms over the disc, by radial order n: 1/sqrt(n + 1) for m = 0, else 1/sqrt(2 (n + 1)).
+#: rms of the peak-normalised terms over the disc, by radial order n: 1/sqrt(n + 1) for m = 0, else 1/sqrt(2 (n + 1)).
 RMS = np.array(
     [[1 / np.sqrt(n + 1) if m == 0 else 1 / np.sqrt(2 * (n + 1))] for n in range(6) for m in _azimuthal_orders(n)]
 )

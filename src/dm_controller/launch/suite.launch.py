@@ -27,7 +27,7 @@ def generate_launch_description():
                 "FASTRTPS_DEFAULT_PROFILES_FILE",
                 EnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", default_value=str(profile)),
             ),
-            # Matrix products here take a millisecond; the threads of several nodes would fight over the cores for longer.
+            # Matrix products here take a millisecond; threads of several nodes would fight over the cores for longer.
             SetEnvironmentVariable("OPENBLAS_NUM_THREADS", "1"),
             *(
                 Node(

@@ -39,7 +39,8 @@ def focus(
         console.print(
             f"{wanted:+.4f} 1/m ({2 * wanted:+.3f} dioptre): predicted residual "
             f"{nanometres(state.predicted_rms):.1f} nm rms, largest coefficient "
-            f"{nanometres(state.predicted_max_zernike):.2f} nm ({as_wavelengths(state.predicted_max_zernike_upper)} with the calibration's own error), "
+            f"{nanometres(state.predicted_max_zernike):.2f} nm "
+            f"({as_wavelengths(state.predicted_max_zernike_upper)} with the calibration's own error), "
             f"reachable {state.curvature_min:+.4f} to {state.curvature_max:+.4f} 1/m"
         )
         if state.saturated:

@@ -1,0 +1,273 @@
+"""The whole chain as separate processes: virtual bench, driver, interferometer, calibration, focus controller.
+
+Ideal actuators and a seed that nothing was tuned on, so that the numeric bound judges the chain and not hysteresis.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from dm_msgs.action import Calibrate
+from dm_msgs.msg import ActuatorState, ErrorCode, ZernikeCoefficients
+from rclpy.action import ActionClient
+from std_srvs.srv import SetBool
+
+from dm_calibration.map_files import read_map
+from dm_controller.cli.demo import bench_config
+from dm_controller.client import DeformableMirrorClient, DeformableMirrorError
+from dm_controller.suite import Suite, own_domain, save_config
+from dm_controller.target import FocusTarget
+from dm_controller.verify import map_of, surface_error
+from dm_driver.virtual.parameters import TABLE
+from support import wait_until
+
+SEED = 20_11
+WAVELENGTH = 632.8e-9
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("suite")
+
+
+@pytest.fixture(scope="module")
+def mirror(folder: Path) -> Iterator[DeformableMirrorClient]:
+    """A client of the running suite."""
+    config = bench_config(folder, "off", 0.0, SEED, speed=20.0)
+    with (
+        own_domain() as domain,
+        Suite(config, folder, domain) as suite,
+        DeformableMirrorClient(domain=domain) as client,
+    ):
+        try:
+            client.wait_until_active()
+        finally:
+            suite.check()
+        yield client
+
+
+@pytest.fixture(scope="module")
+def calibrated(mirror: DeformableMirrorClient) -> Calibrate.Result:
+    """The full plan, once for all tests of this module."""
+    before = mirror.capabilities
+    assert before.quality == before.UNCALIBRATED
+    feedback: list[Any] = []
+    result = mirror.calibrate(Calibrate.Goal(activate=True), feedback.append)
+    assert [item.step for item in feedback] == sorted(item.step for item in feedback)
+    assert {item.phase for item in feedback} >= {Calibrate.Feedback.PHASE_POKES, Calibrate.Feedback.PHASE_SURFACES}
+    assert mirror.wait(lambda: mirror.capabilities.calibration_id == result.id)
+    return result
+
+
+def measured_error(mirror: DeformableMirrorClient, curvature: float) -> Any:
+    mirror.move_focus(curvature, settle_time=0.5)
+    measurement, image = mirror.measure_map(f"{curvature:+.3f}")
+    return surface_error(map_of(image), measurement.info, FocusTarget(curvature))
+
+
+def test_focus_without_calibration_is_refused(mirror: DeformableMirrorClient) -> None:
+    if mirror.capabilities.calibration_id:
+        pytest.skip("already calibrated: run the whole module")
+    with pytest.raises(DeformableMirrorError) as refused:
+        mirror.focus(0.01)
+    assert refused.value.error_code == ErrorCode.NOT_CALIBRATED
+
+
+def test_calibration_is_good_and_stored(mirror: DeformableMirrorClient, calibrated: Calibrate.Result) -> None:
+    assert calibrated.maps >= 69 + 74
+    assert calibrated.maps_dropped == 0
+    assert calibrated.poke_check_passed
+    assert 0 < calibrated.in_sample_rms < calibrated.held_out_rms < 2e-9
+    assert Path(calibrated.file).is_file()
+    stored = mirror.list_calibrations()
+    assert calibrated.id in stored.ids
+    assert mirror.load_calibration(calibrated.id).id == calibrated.id
+
+
+@pytest.mark.parametrize("curvature", [-0.05, -0.02, 0.0, 0.035, 0.05])
+def test_measured_surface_is_the_requested_one(
+    mirror: DeformableMirrorClient, calibrated: Calibrate.Result, curvature: float
+) -> None:
+    prediction = mirror.focus(curvature, dry_run=True)
+    error = measured_error(mirror, curvature)
+    assert error.max_zernike < WAVELENGTH / 500
+    # The prediction knows what the actuators cannot make (print-through); the rest is the noise of one map.
+    assert abs(error.rms - prediction.predicted_rms) < 1.5e-9
+
+
+def test_beyond_reach_nothing_moves_and_the_range_is_named(
+    mirror: DeformableMirrorClient, calibrated: Calibrate.Result
+) -> None:
+    mirror.move_focus(0.01)
+    before = list(mirror.actuator_state.applied)
+    with pytest.raises(DeformableMirrorError, match=r"reachable: -0\.\d+ to \+0\.\d+ 1/m") as refused:
+        mirror.focus(0.5)
+    assert refused.value.error_code == ErrorCode.UNREACHABLE
+    time.sleep(0.6)  # more than the period of actuator_state
+    assert list(mirror.actuator_state.applied) == before
+
+
+def test_cancelled_calibration_leaves_the_mirror_at_mid_range(
+    mirror: DeformableMirrorClient, calibrated: Calibrate.Result
+) -> None:
+    pokes: list[Any] = []
+    server = ActionClient(mirror.node, Calibrate, "calibrate")
+    wait_until(server.server_is_ready)
+    time.sleep(0.5)
+    accepted = server.send_goal_async(
+        Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, skip_degauss=True), feedback_callback=pokes.append
+    )
+    wait_until(lambda: len(pokes) > 3)
+    handle = accepted.result()
+    handle.cancel_goal_async()
+    result = handle.get_result_async()
+    wait_until(result.done)
+    assert result.result().status == GoalStatus.STATUS_CANCELED
+    assert result.result().result.error_code == ErrorCode.CANCELED
+    wait_until(lambda: not mirror.actuator_state.moving and not np.any(np.abs(mirror.actuator_state.applied) > 1e-3))
+    assert mirror.capabilities.calibration_id == calibrated.id
+
+
+def test_unplugged_electronics_are_noticed_and_their_return_too(
+    mirror: DeformableMirrorClient, calibrated: Calibrate.Result
+) -> None:
+    mirror.move_focus(0.02)
+    before = list(mirror.actuator_state.applied)
+    power = mirror.node.create_client(SetBool, "virtual_bench/power")
+    assert mirror.wait(power.service_is_ready)
+    time.sleep(0.5)
+
+    def switch(on: bool) -> None:
+        done = power.call_async(SetBool.Request(data=on))
+        wait_until(done.done)
+
+    switch(False)
+    wait_until(lambda: mirror.actuator_state.driver_state == ActuatorState.STATE_LINK_LOST)
+    with pytest.raises(DeformableMirrorError) as refused:
+        mirror.focus(-0.02)
+    assert refused.value.error_code == ErrorCode.DRIVER_INACTIVE
+    switch(True)
+    wait_until(lambda: mirror.actuator_state.driver_state == ActuatorState.STATE_ACTIVE)
+    assert list(mirror.actuator_state.applied) == before
+    assert not mirror.actuator_state.history_known
+    assert measured_error(mirror, 0.02).max_zernike < WAVELENGTH / 500
+
+
+def test_the_electronics_never_saw_a_jump(mirror: DeformableMirrorClient, calibrated: Calibrate.Result) -> None:
+    """The monitor in the emulated electronics watched every frame of this module."""
+    received: list[Any] = []
+    mirror.node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
+
+    def figures() -> dict[str, str] | None:
+        for array in reversed(received):
+            for status in array.status:
+                if status.name == "virtual_bench":
+                    return {item.key: item.value for item in status.values}
+        return None
+
+    values = wait_until(figures)
+    assert int(values["frames"]) > 1000
+    assert int(values["violations"]) == 0
+    assert int(values["malformed_frames"]) == 0
+    assert int(values["settings_frames"]) == 0
+
+
+def test_poke_check_tells_what_is_wired_wrongly(folder: Path) -> None:
+    config = bench_config(folder / "miswired", "off", 0.0, SEED, speed=20.0)
+    wiring = list(next(parameter for parameter in TABLE if parameter.name == "wiring").default)
+    wiring[2], wiring[6] = wiring[6], wiring[2]
+    config["virtual_bench"]["wiring"] = wiring
+    with (
+        own_domain() as domain,
+        Suite(config, folder / "miswired", domain),
+        DeformableMirrorClient(domain=domain) as client,
+    ):
+        client.wait_until_active()
+        with pytest.raises(DeformableMirrorError) as found:
+            client.calibrate(Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKE_CHECK))
+    assert found.value.error_code == ErrorCode.POKE_CHECK_FAILED
+    findings = " ".join(found.value.response.poke_findings)
+    assert "3 and 7" in findings
+
+
+def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_path: Path) -> None:
+    """`dm up --config FILE` without a virtual bench in it; emulated electronics and instrument are the hardware."""
+    config = bench_config(tmp_path, "off", 0.0, SEED, speed=0.0)
+    bench = {"virtual_bench": config.pop("virtual_bench")}
+    for name in config:
+        config[name].pop("use_sim_time", None)
+    config["interferometer"].pop("trigger_command")
+    config["interferometer"]["stable_time"] = 0.1
+    save_config(config, tmp_path / "my_bench.yaml")
+    trigger = Path(sys.modules["dm_driver"].__path__[0]) / "virtual" / "trigger.py"
+    with (
+        own_domain() as elsewhere,
+        Suite(bench, tmp_path / "bench", elsewhere, nodes=("virtual_bench",)),
+        own_domain() as domain,
+    ):
+        log = (tmp_path / "up.log").open("w+")
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dm_controller.cli", "up", "--config", str(tmp_path / "my_bench.yaml")],
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            with DeformableMirrorClient(domain=domain) as client:
+                client.wait_until_active(30.0)
+                assert client.mirror_info.electronics == "edac40_tcp"
+                client.set_signals([0.1] * 37)
+                port = str(bench["virtual_bench"]["trigger.port"])
+                seen: list[Any] = []
+                client.node.create_subscription(ZernikeCoefficients, "zernike", seen.append, 10)
+                wait_until(lambda: client.node.count_publishers("zernike"), 20.0, what="the interferometer node")
+                time.sleep(1.0)  # it must have discovered this subscription too
+                saved = tmp_path / "maps" / "from_instrument.datx"
+                subprocess.run([sys.executable, str(trigger), "--port", port, "--output", str(saved)], check=True)
+                zernike = wait_until(lambda: seen and seen[-1], 20.0, what="the watched folder's map")
+                assert zernike.radius == pytest.approx(0.011)
+                assert zernike.wavelength == pytest.approx(read_map(saved).wavelength)
+        finally:
+            process.send_signal(signal.SIGINT)
+            status = process.wait(30)
+            log.seek(0)
+            output = log.read()
+            log.close()
+    assert status == 0, output
+    assert "safe shape" in output
+
+
+def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
+    """The demo as a user runs it, with a folder and figures of the test's."""
+    figures = tmp_path / "demo.json"
+    command = [sys.executable, "-m", "dm_controller.cli", "demo", "--hysteresis", "off", "--seed", "2012"]
+    done = subprocess.run(
+        [*command, "--out", str(tmp_path / "run"), "--json", str(figures)], capture_output=True, text=True, timeout=400
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    content = json.loads(figures.read_text())
+    assert content["calibration"].keys() >= {
+        "maps",
+        "seconds",
+        "in_sample_rms_nm",
+        "held_out_rms_nm",
+        "condition_number",
+    }
+    assert [row["curvature"] for row in content["focus"]] == pytest.approx(np.linspace(-0.05, 0.05, 11))
+    for row in content["focus"]:
+        assert row.keys() == {"curvature", "predicted_rms_nm", "measured_rms_nm", "max_zernike_nm", "saturated"}
+        assert row["max_zernike_nm"] <= 632.8 / 500
+    assert content["fitting_limit_nm"] > 0
+    assert (tmp_path / "run" / "demo.png").stat().st_size > 50_000
