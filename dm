@@ -264,10 +264,6 @@ def build_workspace() -> None:
     if workspace_is_ready():
         return
     check_tools()
-    for package in (ROOT / "src").iterdir():  # stale links of moved files would survive a rebuild
-        if (package / "setup.py").is_file():
-            shutil.rmtree(ROOT / "build" / package.name, ignore_errors=True)
-            shutil.rmtree(ROOT / "install" / package.name, ignore_errors=True)
     cmake = ["-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"] + ([] if sourced_jazzy() else ["-GNinja"])
     run_logged(
         [str(PYTHON), "-m", "colcon", "build", "--symlink-install", "--base-paths", "src", "--cmake-args", *cmake],
@@ -275,6 +271,9 @@ def build_workspace() -> None:
         "building the workspace",
         wheel_environment(),
     )
+    for link in (ROOT / "install").rglob("*"):  # of files that were moved or renamed
+        if link.is_symlink() and not link.exists():
+            link.unlink()
     BUILD_STAMP.write_text(json.dumps({"key": key, "environment": captured_environment()}))
 
 

@@ -16,6 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.patches import Circle, RegularPolygon
 
+from dm_calibration.optics.piston_tilt import remove_piston_tilt
+
 #: Curvatures shown as columns: the ends, half way and flat.
 COLUMNS = (-0.05, -0.02, 0.0, 0.02, 0.05)
 WAVELENGTH_NM = 632.8
@@ -54,21 +56,24 @@ def save_sweep_figure(rows: Sequence[dict[str, Any]], path: Path, title: str, mi
     figure = plt.figure(figsize=(13, 11), layout="constrained")
     figure.suptitle(title)
     grid = figure.add_gridspec(4, len(shown), height_ratios=(1, 1, 1, 0.9))
-    sag_limit = max(np.nanmax(np.abs(row["sag"] - np.nanmean(row["sag"]))) for row in shown) * 1e6
+    measured_sag = [remove_piston_tilt(row["sag"].astype(float)) for row in shown]
+    sag_limit = max(np.nanmax(np.abs(sag)) for sag in measured_sag) * 1e6
     residual_limit = max(np.nanpercentile(np.abs(row["error"].residual), 99.5) for row in shown) * 1e9
-    for column, row in enumerate(shown):
+    for column, (row, sag) in enumerate(zip(shown, measured_sag, strict=True)):
         axes = [figure.add_subplot(grid[line, column]) for line in range(3)]
         info = row["info"]
         axes[0].set_title(f"{row['curvature']:+.2f} 1/m", fontsize=10)
         command = draw_command(axes[0], row["signals"], positions, info.aperture_radius)
-        measured = draw_map(axes[1], (row["sag"] - np.nanmean(row["sag"])) * 1e6, info, sag_limit, "viridis")
+        measured = draw_map(axes[1], sag * 1e6, info, sag_limit, "viridis")
         residual = draw_map(axes[2], row["error"].residual * 1e9, info, residual_limit, "PuOr")
         axes[2].set_title(f"{row['error'].rms * 1e9:.1f} nm rms", fontsize=9)
         axes[2].set_xlabel("x, mm")
         for item in axes:
             item.tick_params(labelsize=7)
         if column == 0:
-            for item, label in zip(axes, ("command\ny, mm", "measured\ny, mm", "residual\ny, mm"), strict=True):
+            for item, label in zip(
+                axes, ("command\ny, mm", "measured, tilt removed\ny, mm", "residual\ny, mm"), strict=True
+            ):
                 item.set_ylabel(label)
         if column == len(shown) - 1:
             figure.colorbar(command, ax=axes[0], label="signal")
@@ -85,6 +90,7 @@ def save_sweep_figure(rows: Sequence[dict[str, Any]], path: Path, title: str, mi
         summary.annotate(f"λ/{divisor}", (curvatures[0], WAVELENGTH_NM / divisor), fontsize=8, va="bottom")
     summary.set(xlabel="requested curvature, 1/m (concave positive)", ylabel="nm")
     summary.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    summary.margins(y=0.12)
     summary.grid(alpha=0.3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

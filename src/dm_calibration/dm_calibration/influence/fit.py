@@ -15,27 +15,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence import quality, screening
+from dm_calibration.influence.gaps import regress, usable_sag
+from dm_calibration.influence.limitations import limitations
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GradeOptions
+from dm_calibration.influence.region_weighting import choose_weighting, weighted_coefficients
 from dm_calibration.influence.regression import METHODS, Design, Method, Regression, TooFewMapsError, make_design
-from dm_calibration.influence.sag import fill_gaps, remove_piston_tilt, rms, weighted_fit
+from dm_calibration.influence.sag import rms
 from dm_calibration.influence.screening import ScreeningOptions
 from dm_calibration.names import unknown_name
 from dm_calibration.optics.sampling import SamplePoints
-from dm_calibration.optics.zernike import basis
 
 Floats = NDArray[np.float64]
 
 #: Number of the first terms, piston and the two tilts, that an interferometer does not know.
 PISTON_TILT = 3
-#: Rounds in which sampling points without data are filled from the fit, and the change in m that ends them sooner.
-GAP_ROUNDS = 60
-GAP_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit: method, folds of the cross-validation, thresholds."""
+    """How to fit: method (a name of METHODS), folds of the cross-validation, thresholds."""
 
     method: str = "AZreg"
     folds: int = 10
@@ -114,6 +113,7 @@ def fit_influence(
     Raises:
         UnknownNameError: an unknown method or label, listing the near ones.
         TooFewMapsError: the good maps do not determine the unknowns.
+        ValueError: region weights are asked for and the maps give none.
     """
     options = options or FitOptions()
     if options.method not in METHODS:
@@ -125,7 +125,7 @@ def fit_influence(
     reasons = screening.unusable(maps, options.screening)
     reasons = ["excluded by request" if label in exclude else r for label, r in zip(maps.label, reasons, strict=True)]
 
-    sag = _without_gaps(maps, reasons)
+    sag = usable_sag(maps, reasons)
     good, design, fitted, responses = _fit_good(method, maps, sag, reasons)
     budget = int(options.screening.dropped_max * len(maps))
     doubtful = False
@@ -150,7 +150,20 @@ def fit_influence(
         except TooFewMapsError:  # a doubtful map is better than none
             reasons[index] = ""
             doubtful = True
-    return _judge(maps, options, rings, reasons, good, design, fitted, responses, doubtful)
+    remarks = []
+    if method.region_weighted:
+        # The outliers do not depend on it: they are found in the sag, which the weights do not touch.
+        filled = responses[:, maps.terms :]
+        weighting = choose_weighting(design, good, filled, options.folds)
+        responses = np.hstack((weighted_coefficients(good, filled, weighting.weights), filled))
+        fitted = method.estimate(design, responses)
+        remarks.append(weighting.sentence())
+    if doubtful:
+        remarks.append(
+            f"More than {options.screening.dropped_max:.0%} of the maps look like outliers; not all of them were "
+            "dropped. Doubt this calibration."
+        )
+    return _judge(maps, options, rings, reasons, good, design, fitted, responses, remarks)
 
 
 def _fit_good(
@@ -160,42 +173,8 @@ def _fit_good(
     used = np.array([not reason for reason in reasons], dtype=bool)
     good = maps.select(used)
     design = make_design(good)
-    fitted, responses = _regress(method, design, good, sag[used])
+    fitted, responses = regress(method.estimate, design, good, sag[used])
     return good, design, fitted, responses
-
-
-def _without_gaps(maps: MapSet, reasons: list[str]) -> Floats:
-    """Sag of usable maps with piston and tilt removed; gaps still NaN, unusable maps zero."""
-    usable = np.array([not reason for reason in reasons], dtype=bool)
-    sag = np.zeros_like(maps.sag)
-    if not usable.any():
-        raise TooFewMapsError(f"none of the {len(maps)} maps is usable; the first: {maps.label[0]}: {reasons[0]}")
-    sag[usable] = remove_piston_tilt(maps.sag[usable], maps.points)
-    return sag
-
-
-def _regress(method: Method, design: Design, maps: MapSet, sag: Floats) -> tuple[Regression, Floats]:
-    """Regress coefficients and sag together; points without data are filled from the fit, round by round.
-
-    That is the expectation-maximisation form of least squares with missing data; a gap converges as fast as the other
-    maps, rather than its own, determine the fit there.
-    """
-    gaps = np.isnan(sag).any(axis=1)
-    if not gaps.any():
-        responses = np.hstack((maps.coefficients, sag))
-        return method(design, responses), responses
-    modes = basis(maps.points.x, maps.points.y)
-    filled = sag.copy()
-    model = weighted_fit(sag[gaps], modes, maps.points.weight) @ modes.T
-    projection = np.linalg.qr(design.matrix)[0]
-    for _ in range(GAP_ROUNDS):
-        before = filled[gaps]
-        filled[gaps] = fill_gaps(sag[gaps], model, maps.points)
-        if np.abs(filled[gaps] - before).max(initial=0.0) < GAP_TOLERANCE:  # NaN in the first round
-            break
-        model = projection[gaps] @ (projection.T @ filled)
-    responses = np.hstack((maps.coefficients, filled))
-    return method(design, responses), responses
 
 
 def _response(fitted: Regression, design: Design, maps: MapSet) -> Floats:
@@ -213,7 +192,7 @@ def _judge(
     design: Design,
     fitted: Regression,
     responses: Floats,
-    doubtful: bool,
+    remarks: list[str],
 ) -> InfluenceFit:
     """Put the result together with its quality figures."""
     used = np.array([not reason for reason in reasons], dtype=bool)
@@ -265,48 +244,5 @@ def _judge(
         signal_covariance=covariance,
         grades=grades,
         drift_rms=float(np.sqrt(np.mean(np.square(rms(figure_sag - figure_sag.mean(axis=0), weight))))),
-        limitations=tuple(_limitations(maps, options, good, design, grades, tilt_known, untested, doubtful)),
+        limitations=(*limitations(good, design, grades, tilt_known, untested), *remarks),
     )
-
-
-def _limitations(
-    maps: MapSet,
-    options: FitOptions,
-    good: MapSet,
-    design: Design,
-    grades: NDArray[np.uint8],
-    tilt_known: bool,
-    untested: int,
-    doubtful: bool,
-) -> list[str]:
-    """What a user of the influence function must know, in sentences."""
-    sentences = ["The model is linear and without memory: hysteresis and creep stay in its error."]
-    if not tilt_known:
-        sentences.append(
-            "The maps do not show the mirror's tilt (the interferometer's own is larger); "
-            "the condition number leaves tilt out."
-        )
-    if design.drift == 1:
-        sentences.append("The figure is taken as constant over the run: too few reference frames to follow its drift.")
-    for value, words in (
-        (quality.GRADE_WEAK, "respond weakly or uncertainly"),
-        (quality.GRADE_DEAD, "show no response above the noise"),
-        (quality.GRADE_NOT_EXCITED, "were never moved and count as without effect"),
-    ):
-        numbers = np.flatnonzero(grades == value) + 1
-        if numbers.size:
-            sentences.append(f"Actuators {', '.join(map(str, numbers))} {words}.")
-    if untested:
-        sentences.append(
-            f"{untested} maps move an actuator as no other map does; predicting them from the others would be "
-            "extrapolation, so they do not count in the held-out error."
-        )
-    if doubtful:
-        sentences.append(
-            f"More than {options.screening.dropped_max:.0%} of the maps look like outliers; not all of them were "
-            "dropped. Doubt this calibration."
-        )
-    blind = np.isnan(good.sag).all(axis=0).sum()
-    if blind:
-        sentences.append(f"{blind} of the {maps.points.x.size} sampling points have no data in any map.")
-    return sentences

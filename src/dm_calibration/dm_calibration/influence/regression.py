@@ -1,4 +1,9 @@
-"""Eq. (6): the influence function as an ordinary least-squares problem, and the registry of methods."""
+"""Eq. (6): the influence function as an ordinary least-squares problem, and the registry of methods.
+
+Both methods of the paper regress by Eq. (6). AZreg takes the coefficients fitted to every pixel of a map alike; AZWreg
+takes coefficients fitted to the sag with region weights (see :mod:`~dm_calibration.influence.weights` for why the
+weights of Eq. (7) act there and nowhere in the regression).
+"""
 
 from __future__ import annotations
 
@@ -109,8 +114,21 @@ def least_squares(design: Design, responses: Floats) -> Regression:
     )
 
 
-#: A method estimates (p, Q) coefficients, with what is needed to judge them, from a design and responses (M, Q).
-Method = Callable[[Design, Floats], Regression]
+@dataclass(frozen=True)
+class Method:
+    """A way from maps to an influence function.
+
+    Attributes:
+        estimate: (p, Q) coefficients, with what is needed to judge them, from a design and responses (M, Q).
+        region_weighted: whether the Zernike coefficients are fitted anew to the sag with region weights, Eq. (8).
+    """
+
+    estimate: Callable[[Design, Floats], Regression]
+    region_weighted: bool = False
+
 
 #: Methods by the name used in messages and calibration files.
-METHODS: dict[str, Method] = {"AZreg": least_squares}
+METHODS: dict[str, Method] = {
+    "AZreg": Method(least_squares),
+    "AZWreg": Method(least_squares, region_weighted=True),
+}

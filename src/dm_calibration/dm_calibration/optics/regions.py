@@ -1,6 +1,9 @@
-"""Concentric circular regions of the aperture (the paper's Fig. 4)."""
+"""Concentric circular regions of the aperture (the paper's Fig. 4) and the errors inside them (Fig. 5)."""
 
 from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +12,12 @@ from .aperture import Aperture
 
 #: Shares of the aperture's area, 10 % to 100 %.
 AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))
+#: Surfaces that the paper leaves out of the mean of Fig. 5(b): Z_2^0 and Z_2^2.
+OUTSIDE_MEAN = ("pz02", "pz03")
+
+
+class EmptyRegionError(ValueError):
+    """A region holds no data; the message names the map and the region."""
 
 
 class ConcentricRegions:
@@ -24,10 +33,9 @@ class ConcentricRegions:
         Raises:
             ValueError: fractions out of range or order.
         """
-        fractions = np.asarray(area_fractions, dtype=float)
-        if not (fractions.size and (np.diff(fractions) > 0).all() and fractions[0] > 0 and fractions[-1] <= 1):
-            raise ValueError(f"area_fractions = {fractions.tolist()}: must rise within 0 to 1")
+        fractions = checked_fractions(area_fractions)
         self.area_fractions = fractions
+        self._shape = shape
         # The ring between two discs, numbered from inside; one more number for everything outside.
         self._ring = np.searchsorted(fractions, aperture.squared_distance(shape)).astype(np.uint8).ravel()
 
@@ -47,3 +55,119 @@ class ConcentricRegions:
         count = np.bincount(self._ring, valid, size)[:-1].cumsum()
         with np.errstate(invalid="ignore"):
             return np.sqrt(energy / count)
+
+    def rms_of_each(self, residuals: Iterable[NDArray[np.float64]], labels: Sequence[str] = ()) -> NDArray[np.float64]:
+        """:meth:`rms` of a set of residual maps, one pass over each, one map in memory at a time.
+
+        Args:
+            residuals: M maps (height, width), NaN = no data; may be a generator.
+            labels: names of the maps for messages; "map 1", "map 2", ... when there are fewer than maps.
+
+        Returns:
+            (M, R), in the unit of the residuals; all finite.
+
+        Raises:
+            EmptyRegionError: a disc of some map holds no valid pixel.
+            ValueError: a map of another shape, or no map at all.
+        """
+        rows = []
+        for number, residual in enumerate(residuals):
+            label = labels[number] if number < len(labels) else f"map {number + 1}"
+            if residual.shape != self._shape:
+                raise ValueError(
+                    f"{label} has the shape {residual.shape}, the regions were made for {self._shape}: "
+                    "compare only maps of one camera and one aperture"
+                )
+            rows.append(self.rms(residual))
+            check_regions(rows[-1][np.newaxis], self.area_fractions, (label,))
+        if not rows:
+            raise ValueError("no map given: regional errors need at least one")
+        return np.stack(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class RegionStatistics:
+    """One panel of Fig. 5: regional rms errors over a group of surfaces.
+
+    Attributes:
+        labels: (M,) of the surfaces, the dots of the figure.
+        rms: (M, R) m.
+        averaged: (M,) which of them enter mean and variance.
+        area_fractions: (R,) shares of the aperture's area.
+        mean: (R,) m, the polyline of the figure.
+        variance: (R,) m^2, unbiased (divisor: surfaces - 1).
+    """
+
+    labels: tuple[str, ...]
+    rms: NDArray[np.float64]
+    averaged: NDArray[np.bool_]
+    area_fractions: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
+def region_statistics(
+    rms: NDArray[np.float64],
+    labels: Sequence[str] = (),
+    leave_out: Collection[str] = (),
+    area_fractions: ArrayLike = AREA_FRACTIONS,
+) -> RegionStatistics:
+    """Mean and variance over surfaces of regional errors.
+
+    Args:
+        rms: (M, R) m, one row per surface.
+        labels: (M,); "map 1", ... when empty.
+        leave_out: labels that count as dots only.
+
+    Raises:
+        EmptyRegionError: a NaN in `rms`.
+        ValueError: fewer than two surfaces to average, or lengths that disagree.
+    """
+    fractions = checked_fractions(area_fractions)
+    names = tuple(labels) or tuple(f"map {k + 1}" for k in range(len(rms)))
+    if rms.ndim != 2 or rms.shape != (len(names), len(fractions)):
+        raise ValueError(f"rms has the shape {rms.shape}: must be ({len(names)} surfaces, {len(fractions)} regions)")
+    check_regions(rms, fractions, names)
+    averaged = np.array([name not in leave_out for name in names], dtype=bool)
+    if averaged.sum() < 2:
+        raise ValueError(f"{averaged.sum()} surfaces to average: a variance needs at least 2, measure more surfaces")
+    chosen = rms[averaged]
+    return RegionStatistics(names, rms, averaged, fractions, chosen.mean(axis=0), chosen.var(axis=0, ddof=1))
+
+
+def figure_5(rms: NDArray[np.float64], labels: Sequence[str]) -> tuple[RegionStatistics, RegionStatistics]:
+    """Both panels of Fig. 5: (a) the actuator surfaces p01-p58, (b) the Zernike surfaces, averaged without pz02, pz03.
+
+    Args:
+        rms: (M, 10) m, one row per surface; rows that are neither (reference frames, pokes) are left out.
+        labels: (M,) names as in Table 1.
+
+    Raises:
+        ValueError: a panel has fewer than two surfaces to average; otherwise as :func:`region_statistics`.
+    """
+    if len(rms) != len(labels):
+        raise ValueError(f"{len(rms)} rows of errors for {len(labels)} labels: must be equal")
+    panels = []
+    for prefix, leave_out in (("p", ()), ("pz", OUTSIDE_MEAN)):
+        rows = [k for k, name in enumerate(labels) if name.removeprefix(prefix).isdigit() and name.startswith(prefix)]
+        panels.append(region_statistics(rms[rows], [labels[k] for k in rows], leave_out))
+    return panels[0], panels[1]
+
+
+def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:
+    """(R,) shares of the area as an array; ValueError unless they rise above 0 and up to 1 at most."""
+    fractions = np.asarray(area_fractions, dtype=float)
+    if not (fractions.size and (np.diff(fractions) > 0).all() and fractions[0] > 0 and fractions[-1] <= 1):
+        raise ValueError(f"area_fractions = {fractions.tolist()}: must rise within 0 to 1")
+    return fractions
+
+
+def check_regions(rms: NDArray[np.float64], area_fractions: NDArray[np.float64], labels: Sequence[str]) -> None:
+    """Raise EmptyRegionError for the first NaN in `rms` (M, R)."""
+    empty = np.argwhere(~np.isfinite(rms))
+    if len(empty):
+        row, region = empty[0]
+        raise EmptyRegionError(
+            f"{labels[row]}: the concentric region of {area_fractions[region]:.0%} of the area holds no valid data; "
+            "measure the map again, or check centre and radius of the aperture"
+        )

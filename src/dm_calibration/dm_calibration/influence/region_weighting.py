@@ -1,0 +1,183 @@
+"""AZWreg: region weights of a set of maps, their epsilon by cross-validation, and the coefficients they give.
+
+See :mod:`~dm_calibration.influence.weights` for where weights act; this is its place (a).
+
+Epsilon. The paper calls it a prior parameter. As epsilon goes from 0 to infinity the weights go from w_i ~ 1/r_i (the
+common factor does not matter) to 1, so some candidates around the median of the r_i cover both limits. The one is
+chosen whose influence function predicts maps it has not seen best, in the measure the paper judges by: the rms surface
+error inside the ten concentric regions, each region counting alike. The figure at rest, which no weights can change, is
+part of the prediction. Weights of a fold come from the other folds alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence import quality
+from dm_calibration.influence.maps import SURFACE, MapSet
+from dm_calibration.influence.regression import Design, TooFewMapsError
+from dm_calibration.influence.sag import remove_piston_tilt, weighted_fit
+from dm_calibration.influence.weights import coefficient_operator, region_weights, surface_control_error
+from dm_calibration.optics.regions import AREA_FRACTIONS, region_statistics
+from dm_calibration.optics.sample_regions import regional_rms
+from dm_calibration.optics.zernike import PISTON_TILT, TERMS, basis
+
+Floats = NDArray[np.float64]
+
+#: Candidates of epsilon, in medians of the region variances.
+EPSILON_CANDIDATES: tuple[float, ...] = tuple(10.0 ** (k / 3.0) for k in range(-6, 7))
+#: Standard deviation of regional errors, relative to their mean, below which they count as constant over the surfaces.
+CONSTANT = 1e-9
+#: Fewest sample surfaces: without a fold of two, two must be left to take a variance over.
+SURFACES_MIN = 4
+
+
+@dataclass(frozen=True, eq=False)
+class RegionWeighting:
+    """Weights of the ten regions and where they come from.
+
+    Attributes:
+        variance: (R,) r_i, m^2.
+        epsilon: m^2.
+        weights: (R,) Eq. (8).
+        candidates: (E,) m^2, the values of epsilon tried, rising.
+        score: (E,) m, held-out rms surface error of each, mean square over maps and regions.
+        score_unweighted: m, the same with all weights 1.
+        surfaces: number of surfaces that the variances are taken over.
+        folds: of the cross-validation.
+    """
+
+    variance: Floats
+    epsilon: float
+    weights: Floats
+    candidates: Floats
+    score: Floats
+    score_unweighted: float
+    surfaces: int
+    folds: int
+
+    def sentence(self) -> str:
+        """What a user of the influence function must know."""
+        return (
+            f"AZWreg: coefficients fitted to the sag with region weights {', '.join(f'{w:.2f}' for w in self.weights)} "
+            f"from the centre outwards (Eq. 8, epsilon {self.epsilon * 1e18:.3g} nm^2 by {self.folds}-fold "
+            f"cross-validation over {self.surfaces} surfaces: held-out regional error {self.score.min() * 1e9:.2f} nm, "
+            f"without weights {self.score_unweighted * 1e9:.2f} nm)."
+        )
+
+
+def sample_surfaces(maps: MapSet) -> NDArray[np.bool_]:
+    """(M,) which maps the region variances are taken over: the surfaces of Table 1, else all but reference frames."""
+    chosen = np.array([kind == SURFACE for kind in maps.kind], dtype=bool)
+    return chosen if np.unique(maps.step[chosen]).size >= SURFACES_MIN else ~maps.reference
+
+
+def choose_weighting(design: Design, maps: MapSet, sag: Floats, folds: int = 10) -> RegionWeighting:
+    """Region weights of `maps` with epsilon by k-fold cross-validation.
+
+    Folds go by commanded state in order, so that they are the same in every run and repeated maps leave together.
+
+    Args:
+        design: of these maps, (M, p).
+        sag: (M, P) m, without gaps, piston and tilt removed.
+        folds: at least 2.
+
+    Raises:
+        TooFewMapsError: fewer than four sample surfaces.
+        ValueError: regional errors that are the same for all surfaces, so that no weights follow; folds below 2; maps
+            with other than 21 terms.
+    """
+    if maps.terms != len(TERMS):
+        raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
+    chosen = sample_surfaces(maps)
+    fold = _folds(maps, chosen, folds)
+    fractions = np.array((0.0, *EPSILON_CANDIDATES))  # 0 stands for no weights at all
+    variance = _variance(design, maps, sag, chosen)
+    scale = float(np.median(variance))
+
+    # Which held-out predictions are extrapolation does not depend on the responses: any column tells.
+    _, tested = quality.held_out_residual(design, sag[:, :1], maps.step, chosen, folds)
+    squares = np.zeros(fractions.size)
+    for k in range(int(fold.max()) + 1):
+        left_out = fold == k
+        judged = left_out & tested
+        if not judged.any():
+            continue
+        train = _without(design, ~left_out)
+        predicted = design.matrix[judged] @ (np.linalg.pinv(train.matrix, rcond=1e-9) @ sag[~left_out])
+        r = _variance(train, maps.select(~left_out), sag[~left_out], chosen[~left_out])
+        for e, share in enumerate(fractions):
+            weights = region_weights(r, share * scale) if share else np.ones(len(AREA_FRACTIONS))
+            squares[e] += _squares(predicted, sag[judged], maps, weights)
+    score = np.sqrt(squares / (len(AREA_FRACTIONS) * max(int((tested & chosen).sum()), 1)))
+    candidates = fractions[1:] * scale
+    epsilon = float(candidates[::-1][np.argmin(score[1:][::-1])])  # the mildest weights of several that do as well
+    return RegionWeighting(
+        variance=variance,
+        epsilon=epsilon,
+        weights=region_weights(variance, epsilon),
+        candidates=candidates,
+        score=score[1:],
+        score_unweighted=float(score[0]),
+        surfaces=int(chosen.sum()),
+        folds=int(fold.max()) + 1,
+    )
+
+
+def weighted_coefficients(maps: MapSet, sag: Floats, weights: Floats) -> Floats:
+    """(M, 21) coefficients fitted to the sag with region weights, m; piston and tilt as measured.
+
+    Args:
+        sag: (M, P) m, without gaps, piston and tilt removed.
+        weights: (R,) of the regions.
+    """
+    coefficients = sag @ coefficient_operator(maps.points, weights).T
+    # What was removed is a plane, which any weights fit exactly.
+    plane = basis(maps.points.x, maps.points.y)[:, PISTON_TILT]
+    coefficients[:, PISTON_TILT] += weighted_fit(maps.sag - sag, plane, maps.points.weight)
+    return np.asarray(coefficients)
+
+
+def _folds(maps: MapSet, chosen: NDArray[np.bool_], folds: int) -> NDArray[np.int64]:
+    """(M,) fold of each sample surface, -1 for maps that stay in every fit."""
+    if folds < 2:
+        raise ValueError(f"folds = {folds}: must be at least 2")
+    states, state = np.unique(maps.step[chosen], return_inverse=True)
+    if states.size < SURFACES_MIN:
+        raise TooFewMapsError(
+            f"{states.size} sample surfaces: the region weights of AZWreg come from variances over surfaces and need "
+            f"at least {SURFACES_MIN}; measure more surfaces or use AZreg"
+        )
+    fold = np.full(len(maps), -1, dtype=np.int64)
+    fold[chosen] = state % folds
+    return fold
+
+
+def _without(design: Design, keep: NDArray[np.bool_]) -> Design:
+    return Design(design.matrix[keep], design.drift, design.excited)
+
+
+def _variance(design: Design, maps: MapSet, sag: Floats, chosen: NDArray[np.bool_]) -> Floats:
+    """(R,) variance over the chosen maps of the regional rms surface control error, G being that of AZreg."""
+    coefficients = np.linalg.pinv(design.matrix, rcond=1e-9) @ maps.coefficients
+    influence = np.zeros((maps.terms, maps.actuators))
+    influence[:, design.excited] = coefficients[design.drift :].T
+    error = surface_control_error(sag[chosen], maps.applied[chosen], influence, maps.points)
+    labels = [label for label, used in zip(maps.label, chosen, strict=True) if used]
+    statistics = region_statistics(regional_rms(error, maps.points, labels=labels), labels)
+    if (np.sqrt(statistics.variance) <= CONSTANT * statistics.mean).all():
+        raise ValueError(
+            f"the regional errors are the same for all {chosen.sum()} sample surfaces, so Eq. (8) has no variances to "
+            "weight by: measure surfaces that differ, or use AZreg"
+        )
+    return statistics.variance
+
+
+def _squares(predicted: Floats, measured: Floats, maps: MapSet, weights: Floats) -> float:
+    """Sum over maps and regions of the mean square error of the 21 terms fitted, with weights, to `predicted`."""
+    terms = predicted @ coefficient_operator(maps.points, weights).T
+    error = remove_piston_tilt(measured - terms @ basis(maps.points.x, maps.points.y).T, maps.points)
+    return float(np.square(regional_rms(error, maps.points)).sum())

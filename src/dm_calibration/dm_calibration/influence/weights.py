@@ -1,0 +1,181 @@
+"""Region weights, Eqs. (7) and (8) of the paper: how they follow from errors, why they cancel, and where they act.
+
+Eq. (8) gives each concentric region a weight from the variance r_i, over the sample surfaces, of the rms surface
+control error inside it. Eq. (7) puts these weights, as a diagonal matrix W, on the rows of dC - G dS. With G free that
+changes nothing: the Frobenius norm is a sum over rows, each row of G occurs in one term of it only, and a factor in
+front of a term does not move its minimum. :func:`weights_cancel_max_abs` shows it on data.
+
+Weights act only where measurements of several regions share unknowns. There are two such places:
+
+(a) The 21 coefficients of a map are shared by all its points. Fitted to the sag with the points of region i weighted by
+    w_i (:func:`coefficient_operator`) they describe the lightly weighted regions less well and the others better;
+    Eq. (6) on these coefficients gives another G. This is what the method "AZWreg" of the influence function means.
+(b) The signals are shared by all points of the wanted surface, which outnumber the actuators:
+    min over ds of |W(dC - G dS)| on the vector of sag points (:func:`command_row_weights`). This is what the solver
+    "AZWreg" of a controller means.
+
+The ten regions are nested. Two readings of "the points of region i": each point belongs to the smallest disc that holds
+it (the ring between two discs), or a point counts once in every disc that holds it, w_j^2 + ... + w_10^2 in all. The
+first is taken: there w_i acts on region i alone, and equal weights are no weights. In the second even equal weights
+favour the centre ten to one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dm_calibration.influence.sag import remove_piston_tilt
+from dm_calibration.optics.regions import AREA_FRACTIONS
+from dm_calibration.optics.sample_regions import disc_shares
+from dm_calibration.optics.sampling import SamplePoints
+from dm_calibration.optics.zernike import TERMS, basis
+
+Floats = NDArray[np.float64]
+
+#: Smallest singular value, relative to the largest, at which a least-squares problem still counts as determined.
+RANK_TOLERANCE = 1e-7
+
+
+def region_weights(variance: ArrayLike, epsilon: float) -> Floats:
+    """Eq. (8): w_i = (1 + (r_i / epsilon)^2)^(-1/2).
+
+    Args:
+        variance: (R,) r_i, m^2, variance over the sample surfaces of the rms error inside region i.
+        epsilon: m^2, the prior parameter; variances far below it have weight 1.
+
+    Returns:
+        (R,) above 0, at most 1.
+
+    Raises:
+        ValueError: epsilon not above 0, or a variance negative or not finite.
+    """
+    r = np.asarray(variance, dtype=float)
+    if not (np.isfinite(epsilon) and epsilon > 0.0):
+        raise ValueError(
+            f"epsilon = {epsilon:g} m^2: must be above 0 and finite; the median of the variances is a start"
+        )
+    if r.ndim != 1 or not r.size or not (np.isfinite(r) & (r >= 0.0)).all():
+        raise ValueError(f"variance = {r.tolist()}: must be one finite number of m^2, 0 or more, per region")
+    return np.asarray(1.0 / np.hypot(1.0, r / epsilon))
+
+
+def surface_control_error(sag: Floats, signals: Floats, influence_zernike: Floats, points: SamplePoints) -> Floats:
+    """Measured sag less its nominal surface, piston and tilt removed: the paper's surface control error (section 2.2).
+
+    The nominal surface is what the 21 terms of G predict for the signals, G s without offset. So the error holds the
+    initial figure, the print-through beyond 21 terms and the hysteresis.
+
+    Args:
+        sag: (M, P) m; NaN = no data, stays NaN.
+        signals: (M, N).
+        influence_zernike: (21, N) m per unit signal.
+
+    Returns:
+        (M, P) m.
+    """
+    if influence_zernike.shape != (len(TERMS), signals.shape[-1]):
+        raise ValueError(
+            f"influence_zernike has the shape {influence_zernike.shape}: must be ({len(TERMS)}, {signals.shape[-1]})"
+        )
+    nominal = (signals @ influence_zernike.T) @ basis(points.x, points.y).T
+    return remove_piston_tilt(sag - nominal, points)
+
+
+def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
+    """(P,) weight of each point: that of the ring it lies in.
+
+    Where the boundary of a region cuts through a point's area the squares are averaged, since weights act squared.
+
+    Args:
+        weights: (R,) of the discs, from the smallest; R of equal steps in area up to the whole aperture.
+
+    Raises:
+        ValueError: weights not above 0, or not one per region.
+    """
+    w = np.asarray(weights, dtype=float)
+    if w.shape != (len(AREA_FRACTIONS),) or not (np.isfinite(w) & (w > 0.0)).all():
+        raise ValueError(
+            f"weights = {w.tolist()}: must be {len(AREA_FRACTIONS)} finite numbers above 0, one per region"
+        )
+    ring_shares = np.diff(disc_shares(points), axis=1, prepend=0.0)
+    return np.asarray(np.sqrt(ring_shares @ np.square(w)))
+
+
+def coefficient_operator(points: SamplePoints, weights: ArrayLike) -> Floats:
+    """Place (a): the linear map from sag at the points to the 21 coefficients, points weighted by area and region.
+
+    Args:
+        weights: (R,) of the regions.
+
+    Returns:
+        (21, P): coefficients (M, 21) = sag (M, P) @ operator.T, in the unit of the sag.
+
+    Raises:
+        ValueError: fewer points than terms, or points that do not tell the terms apart.
+    """
+    if len(points) < len(TERMS):
+        raise ValueError(
+            f"{len(points)} sampling points for {len(TERMS)} coefficients: at least {len(TERMS)} are needed"
+        )
+    row = np.sqrt(points.weight) * point_weights(points, weights)
+    q, r = np.linalg.qr(row[:, np.newaxis] * basis(points.x, points.y))
+    diagonal = np.abs(np.diag(r))
+    if diagonal.min() < RANK_TOLERANCE * diagonal.max():
+        raise ValueError(f"the {len(points)} sampling points do not tell the {len(TERMS)} terms apart: spread them out")
+    return np.asarray(np.linalg.solve(r, q.T * row))
+
+
+def command_row_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
+    """Place (b): factor of each row of the command solve min |W(dC - G dS)| on the vector of sag points.
+
+    Multiply the rows of the influence function (P, N) and of the wanted sag (P,) by it. It holds the points' areas too,
+    and its squares sum to 1 as those do: a ridge then weighs as much as without region weights.
+
+    Args:
+        weights: (R,) of the regions.
+
+    Returns:
+        (P,) above 0.
+    """
+    row = np.sqrt(points.weight) * point_weights(points, weights)
+    return np.asarray(row / np.linalg.norm(row))
+
+
+def weights_cancel_max_abs(delta_c: Floats, delta_s: Floats, weights: ArrayLike) -> float:
+    """Largest difference between the G of Eq. (7), weights on the rows, and the G of Eq. (6): rounding, no more.
+
+    Eq. (7) is solved as one problem in all K N unknowns of G at once, with no use of its rows being independent.
+
+    Args:
+        delta_c: (K, M) changes of the coefficients, m.
+        delta_s: (N, M) changes of the signals.
+        weights: (K,) diagonal of W, above 0.
+
+    Returns:
+        max |G7 - G6|, m per unit signal.
+
+    Raises:
+        ValueError: shapes that disagree, weights not above 0, or signals that do not determine G.
+    """
+    w = np.asarray(weights, dtype=float)
+    rows, maps = delta_c.shape
+    actuators = delta_s.shape[0]
+    if delta_s.shape != (actuators, maps):
+        raise ValueError(f"delta_s has the shape {delta_s.shape}, delta_c {delta_c.shape}: as many columns are needed")
+    if w.shape != (rows,) or not (np.isfinite(w) & (w > 0.0)).all():
+        raise ValueError(f"weights: must be {rows} finite numbers above 0, one per row of delta_c")
+    if maps < actuators:
+        raise ValueError(f"{maps} surfaces for {actuators} unknowns per row of G: at least {actuators} are needed")
+    solution, _, rank, _ = np.linalg.lstsq(delta_s.T, delta_c.T, rcond=RANK_TOLERANCE)
+    if rank < actuators:
+        raise ValueError(
+            f"the signals span {rank} of {actuators} directions: some actuators never move, or only together with "
+            "others; add surfaces that move each on its own"
+        )
+    # Row-major vectors: vec(W G S) = kron(W, S^T) vec(G). QR of the whole, scaled columns for its conditioning.
+    whole = np.kron(np.diag(w), delta_s.T)
+    scale = np.linalg.norm(whole, axis=0)
+    q, r = np.linalg.qr(whole / scale)
+    weighted = np.linalg.solve(r, q.T @ (w[:, np.newaxis] * delta_c).ravel()) / scale
+    return float(np.abs(weighted.reshape(rows, actuators) - solution.T).max())

@@ -1,0 +1,153 @@
+"""Rules of the repository itself: imports, packages, configuration, interfaces, the set-up script."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+
+from dm_controller.reference import TABLES, parameters_page
+from dm_controller.suite import load_config
+from dm_runtime.parameters import REQUIRED
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src"
+
+#: What each package may import of the others: msgs <- driver; msgs <- calibration <- controller, runtime below all.
+ALLOWED = {
+    "dm_runtime": set(),
+    "dm_driver": {"dm_msgs", "dm_runtime"},
+    "dm_calibration": {"dm_msgs", "dm_runtime"},
+    "dm_controller": {"dm_msgs", "dm_runtime", "dm_driver", "dm_calibration"},
+}
+
+
+def imported(path: Path) -> set[str]:
+    """Full names of all modules a file imports."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return names
+
+
+@pytest.mark.parametrize("package", ALLOWED)
+def test_imports_go_one_way(package: str) -> None:
+    for path in (SOURCE / package / package).rglob("*.py"):
+        others = {name.split(".")[0] for name in imported(path)} & (ALLOWED.keys() | {"dm_msgs"}) - {package}
+        assert others <= ALLOWED[package], f"{path.relative_to(ROOT)} imports {others - ALLOWED[package]}"
+
+
+def test_the_twin_shares_no_code_with_what_it_judges() -> None:
+    for path in (SOURCE / "dm_driver" / "dm_driver" / "virtual").glob("*.py"):
+        own = {name for name in imported(path) if name.startswith("dm_")}
+        allowed = ("dm_driver.virtual", "dm_runtime")
+        assert all(name.startswith(allowed) for name in own), f"{path.name} imports {own}"
+    for path in (SOURCE / "dm_driver" / "dm_driver").rglob("*.py"):
+        if "virtual" not in path.as_posix().removeprefix(SOURCE.as_posix()):
+            assert not any("virtual" in name for name in imported(path)), f"{path.name} imports the twin"
+
+
+@pytest.mark.parametrize("package", [path.name for path in SOURCE.iterdir() if (path / "package.xml").is_file()])
+def test_packages_declare_the_ros_packages_they_use(package: str) -> None:
+    tree = ElementTree.parse(SOURCE / package / "package.xml").getroot()
+    declared = {element.text for element in tree if element.tag.endswith("depend")}
+    assert tree.findtext("name") == package
+    assert tree.findtext("license") == "Apache-2.0"
+    ros = re.compile(r"^(rclpy|[a-z]+_msgs|dm_\w+|std_srvs|rcl_interfaces|ament_index_python|launch|launch_ros)$")
+    used = set()
+    for path in [*(SOURCE / package / package).rglob("*.py"), *(SOURCE / package / "launch").glob("*.py")]:
+        used |= {name.split(".")[0] for name in imported(path) if ros.match(name.split(".")[0])}
+    assert used - {package} <= declared
+
+
+@pytest.mark.parametrize("name", ["bench.yaml", "hardware.yaml"])
+def test_shipped_configurations_name_only_parameters_that_exist(name: str) -> None:
+    config = load_config(SOURCE / "dm_controller" / "config" / name)
+    for node, values in config.items():
+        known = {parameter.name: parameter for parameter in TABLES[node]}
+        for parameter, value in values.items():
+            assert parameter in known, f"{name}: {node} has no parameter {parameter}"
+            known[parameter].check(value)
+            if known[parameter].kind is float:
+                assert isinstance(value, float), f"{name}: {node}.{parameter} must be written with a point"
+    required = {parameter.name for parameter in TABLES["pdm_driver"] if parameter.default is REQUIRED}
+    assert required <= config["pdm_driver"].keys()
+
+
+def test_the_parameter_page_is_what_the_code_says() -> None:
+    assert (ROOT / "docs" / "parameters.md").read_text() == parameters_page()
+
+
+@pytest.mark.parametrize(
+    "path", sorted((SOURCE / "dm_msgs").glob("*/*.[msa]*")), ids=lambda path: path.relative_to(SOURCE).as_posix()
+)
+def test_every_number_in_an_interface_is_explained(path: Path) -> None:
+    for line in path.read_text().splitlines():
+        declaration, _, comment = line.partition("#")
+        if re.match(r"(float|u?int)\d+", declaration) and "=" not in declaration:
+            assert comment.strip(), f"{path.name}: {declaration}"
+
+
+def test_launch_files_compose_every_node() -> None:
+    text = (SOURCE / "dm_controller" / "launch" / "suite.launch.py").read_text()
+    for node in ("pdm_driver", "interferometer", "calibration", "focus_controller"):
+        assert f'"{node}"' in text
+    for path in (SOURCE / "dm_controller" / "launch").glob("*.py"):
+        compile(path.read_text(), str(path), "exec")
+
+
+def bare_machine(tmp_path: Path, *tools: str) -> tuple[Path, dict[str, str]]:
+    """A copy of the set-up script on a machine that has only `tools`."""
+    checkout = tmp_path / "checkout"
+    checkout.mkdir()
+    shutil.copy(ROOT / "dm", checkout / "dm")
+    shutil.copytree(ROOT / "requirements", checkout / "requirements")
+    (checkout / "src" / "dm_msgs").mkdir(parents=True)
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for tool in tools:
+        (programs / tool).symlink_to(shutil.which(tool) or pytest.skip(f"no {tool} here"))
+    return checkout, {"PATH": str(programs), "HOME": str(tmp_path)}
+
+
+def test_a_missing_compiler_is_named_with_its_cure(tmp_path: Path) -> None:
+    checkout, environment = bare_machine(tmp_path, "bash")
+    done = subprocess.run(
+        [sys.executable, str(checkout / "dm"), "demo"], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert "C++ compiler" in done.stderr
+    assert "sudo apt-get install g++" in done.stderr
+    assert not (checkout / ".venv").exists()
+
+
+def test_help_needs_no_set_up(tmp_path: Path) -> None:
+    checkout, environment = bare_machine(tmp_path)
+    done = subprocess.run(
+        [sys.executable, str(checkout / "dm"), "--help"], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    for command in ("demo", "test", "up", "calibrate", "focus", "doctor", "exec"):
+        assert re.search(rf"^  {command} ", done.stdout, re.MULTILINE)
+    assert not (checkout / ".venv").exists()
+
+
+def test_exec_of_an_unknown_command_fails_clearly() -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "dm"), "exec", "no-such-command"],
+        capture_output=True,
+        text=True,
+        env=dict(os.environ),
+    )
+    assert done.returncode == 127
+    assert "no-such-command" in done.stderr
