@@ -5,12 +5,10 @@ from __future__ import annotations
 import array
 import math
 import sys
-import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from dm_msgs.action import MoveFocus
 from dm_msgs.msg import (
     ActuatorCommand,
     ActuatorState,
@@ -22,17 +20,16 @@ from dm_msgs.msg import (
     MirrorInfo,
 )
 from dm_msgs.srv import Flatten, SetFocus
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.time import Time
 
 from dm_controller.conversions import doubles, limits_of, model_of, target_of
 from dm_controller.model import CalibratedMirror, Plan
+from dm_controller.move_focus_action import MoveFocusAction
 from dm_controller.target import FocusTarget, TargetError
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
 from dm_runtime.parameters import Parameter, declare
-from dm_runtime.worker import WorkerActionServer, sleep
 
 PARAMETERS = (
     Parameter(
@@ -83,7 +80,7 @@ class FocusControllerNode(Node):
 
     def __init__(self, **keywords: Any) -> None:
         super().__init__("focus_controller", **keywords)
-        self._parameters_by_name = declare(self, PARAMETERS, on_change=lambda _changes: self._publish_capabilities())
+        self._values = declare(self, PARAMETERS, on_change=lambda _changes: self._publish_capabilities())
         self._mirror_info: MirrorInfo | None = None
         self._calibration: Calibration | None = None
         self._calibrated: CalibratedMirror | None = None
@@ -100,7 +97,7 @@ class FocusControllerNode(Node):
         self.create_subscription(FocusRequest, "focus_request", self._on_focus_request, qos.COMMAND)
         self.create_service(SetFocus, "set_focus", self._on_set_focus)
         self.create_service(Flatten, "flatten", self._on_flatten)
-        self._move = WorkerActionServer(self, MoveFocus, "move_focus", self._move_focus, exclusive="preempt")
+        self._move = MoveFocusAction(self, self._carry_out, self._send, lambda: self._driver, self._values)
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         self._publish_capabilities()
 
@@ -153,7 +150,7 @@ class FocusControllerNode(Node):
         if calibration.actuators != mirror.actuators:
             return f"has {calibration.actuators} actuators, this mirror {mirror.actuators}"
         working = mirror.working_aperture_diameter / 2
-        if abs(calibration.aperture_radius - working) > self._parameters_by_name["aperture_tolerance"] * working:
+        if abs(calibration.aperture_radius - working) > self._values["aperture_tolerance"] * working:
             return (
                 f"was made over an aperture of radius {calibration.aperture_radius * 1e3:.3f} mm, "
                 f"the working aperture's is {working * 1e3:.3f} mm"
@@ -180,12 +177,12 @@ class FocusControllerNode(Node):
             plan = self._calibrated.plan(target)
         except TargetError as error:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
-        tolerance = self._parameters_by_name["reachable_tolerance"]
+        tolerance = self._values["reachable_tolerance"]
         reachable = self._calibrated.reachable_range(target, tolerance)
         return Decision(target, plan, reachable, FocusRequest.MODE_DIRECT)
 
     def _check_age(self, request: FocusRequest) -> None:
-        limit = self._parameters_by_name["request_age"]
+        limit = self._values["request_age"]
         stamp = Time.from_msg(request.header.stamp, clock_type=self.get_clock().clock_type)
         if limit == 0.0 or stamp.nanoseconds == 0:
             return
@@ -195,7 +192,7 @@ class FocusControllerNode(Node):
 
     def _check_reachable(self, decision: Decision) -> None:
         low, high = decision.reachable
-        tolerance = self._parameters_by_name["reachable_tolerance"]
+        tolerance = self._values["reachable_tolerance"]
         if decision.plan.max_zernike <= tolerance:
             return
         if math.isnan(low):
@@ -273,97 +270,12 @@ class FocusControllerNode(Node):
         response.error_code, response.message = response.state.error_code, response.state.message
         return response
 
-    # --- the action ---
-
-    def _move_focus(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
-        started = time.monotonic()
-        goal, result = goal_handle.request, MoveFocus.Result()
-
-        def end(outcome: str, error_code: int, message: str) -> tuple[str, Any]:
-            result.error_code, result.message = error_code, message
-            result.duration = time.monotonic() - started
-            return outcome, result
-
-        goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
-        if goal.tolerance > 0.0:
-            preview = self._carry_out(goal.request, dry_run=True)
-            if preview.error_code == ErrorCode.OK and preview.predicted_max_zernike > goal.tolerance:
-                result.state = preview
-                return end(
-                    "abort",
-                    ErrorCode.OUT_OF_RANGE,
-                    f"tolerance = {goal.tolerance * 1e9:.2f} nm: the predicted largest coefficient error is "
-                    f"{preview.predicted_max_zernike * 1e9:.2f} nm; nothing moved",
-                )
-        result.state = self._carry_out(goal.request)
-        if result.state.error_code != ErrorCode.OK:
-            return end("abort", result.state.error_code, result.state.message)
-        wanted = np.asarray(result.state.signals)
-        stopped = self._await_shape(goal_handle, wanted)
-        if stopped is not None:
-            outcome, error_code, message = stopped
-            return end(outcome, error_code, message)
-        settle = goal.settle_time or self._parameters_by_name["settle_time"]
-        goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))
-        if not sleep(self.get_clock(), settle, lambda: self._told_to_stop(goal_handle)):
-            return end(*self._stop(goal_handle))
-        return end(
-            "succeed", ErrorCode.OK, f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
-        )
-
-    def _told_to_stop(self, goal_handle: ServerGoalHandle) -> bool:
-        return goal_handle.is_cancel_requested or self._move.preempted(goal_handle)
-
-    def _stop(self, goal_handle: ServerGoalHandle) -> tuple[str, int, str]:
-        """End a goal early: on cancel the mirror holds the shape it has; a newer goal goes on from there by itself."""
-        if goal_handle.is_cancel_requested:
-            if self._driver is not None and len(self._driver.applied):
-                self._send(self._driver.applied)
-            return "canceled", ErrorCode.CANCELED, "canceled; the mirror holds the shape it had reached"
-        return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
-
-    def _await_shape(self, goal_handle: ServerGoalHandle, wanted: np.ndarray) -> tuple[str, int, str] | None:
-        """Wait until the driver reports the wanted shape; None when it stands."""
-        deadline = time.monotonic() + self._parameters_by_name["move_timeout"]
-        next_feedback, first_gap = 0.0, 0.0
-        while True:
-            if self._told_to_stop(goal_handle):
-                return self._stop(goal_handle)
-            driver = self._driver
-            if driver is not None and len(driver.requested) == len(wanted):
-                gap = float(np.abs(np.asarray(driver.applied) - wanted).max())
-                first_gap = max(first_gap, gap)
-                ours = np.allclose(driver.requested, wanted, atol=1e-9)
-                if ours and not driver.moving and driver.driver_state == ActuatorState.STATE_ACTIVE:
-                    return None
-                if driver.driver_state != ActuatorState.STATE_ACTIVE:
-                    return (
-                        "abort",
-                        ErrorCode.ELECTRONICS_UNREACHABLE,
-                        f"the driver left its active state: {driver.message}",
-                    )
-                if time.monotonic() >= next_feedback:
-                    next_feedback = time.monotonic() + 0.1
-                    goal_handle.publish_feedback(
-                        MoveFocus.Feedback(
-                            phase=MoveFocus.Feedback.PHASE_MOVE,
-                            progress=1.0 - gap / first_gap if first_gap else 1.0,
-                            remaining=gap,
-                        )
-                    )
-            if time.monotonic() > deadline:
-                message = (
-                    driver.message if driver is not None and driver.message else "the driver did not report the shape"
-                )
-                return "abort", ErrorCode.TIMEOUT, message
-            time.sleep(0.002)
-
     # --- what this node says of itself ---
 
     def _publish_capabilities(self) -> None:
         message = Capabilities(quality=Capabilities.UNCALIBRATED)
         message.header.stamp = self.get_clock().now().to_msg()
-        message.residual_tolerance = self._parameters_by_name["reachable_tolerance"]
+        message.residual_tolerance = self._values["reachable_tolerance"]
         if self._calibrated is None or self._calibration is None:
             message.message = self._not_calibrated[1]
         else:

@@ -1,0 +1,123 @@
+"""The action `move_focus`: plan, command, wait until the driver reports the shape, settle."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from dm_msgs.action import MoveFocus
+from dm_msgs.msg import ActuatorState, ErrorCode, FocusRequest, FocusState
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+
+from dm_runtime.worker import WorkerActionServer, sleep
+
+
+class MoveFocusAction:
+    """Serves `move_focus` in worker threads; the newest goal pre-empts.
+
+    Args:
+        node: hosts the action.
+        carry_out: (request, dry_run) -> FocusState: judge a request and, unless it is refused or a dry run, send it.
+        send: publish signals (N,) as a command.
+        driver: the driver's latest state; None before the first.
+        values: parameters `settle_time` and `move_timeout`.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        carry_out: Callable[[FocusRequest, bool], FocusState],
+        send: Callable[[Any], Any],
+        driver: Callable[[], ActuatorState | None],
+        values: Mapping[str, Any],
+    ) -> None:
+        self._clock = node.get_clock()
+        self._carry_out, self._send, self._driver, self._values = carry_out, send, driver, values
+        self._server = WorkerActionServer(node, MoveFocus, "move_focus", self._run, exclusive="preempt")
+
+    def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
+        started = time.monotonic()
+        goal, result = goal_handle.request, MoveFocus.Result()
+
+        def end(outcome: str, error_code: int, message: str) -> tuple[str, Any]:
+            result.error_code, result.message = error_code, message
+            result.duration = time.monotonic() - started
+            return outcome, result
+
+        goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
+        if goal.tolerance > 0.0:
+            preview = self._carry_out(goal.request, True)
+            if preview.error_code == ErrorCode.OK and preview.predicted_max_zernike > goal.tolerance:
+                result.state = preview
+                return end(
+                    "abort",
+                    ErrorCode.OUT_OF_RANGE,
+                    f"tolerance = {goal.tolerance * 1e9:.2f} nm: the predicted largest coefficient error is "
+                    f"{preview.predicted_max_zernike * 1e9:.2f} nm; nothing moved",
+                )
+        result.state = self._carry_out(goal.request, False)
+        if result.state.error_code != ErrorCode.OK:
+            return end("abort", result.state.error_code, result.state.message)
+        wanted = np.asarray(result.state.signals)
+        stopped = self._await_shape(goal_handle, wanted)
+        if stopped is not None:
+            outcome, error_code, message = stopped
+            return end(outcome, error_code, message)
+        settle = goal.settle_time or self._values["settle_time"]
+        goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))
+        if not sleep(self._clock, settle, lambda: self._told_to_stop(goal_handle)):
+            return end(*self._stop(goal_handle))
+        return end(
+            "succeed", ErrorCode.OK, f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
+        )
+
+    def _told_to_stop(self, goal_handle: ServerGoalHandle) -> bool:
+        return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
+
+    def _stop(self, goal_handle: ServerGoalHandle) -> tuple[str, int, str]:
+        """End a goal early: on cancel the mirror holds the shape it has; a newer goal goes on from there by itself."""
+        if goal_handle.is_cancel_requested:
+            driver = self._driver()
+            if driver is not None and len(driver.applied):
+                self._send(driver.applied)
+            return "canceled", ErrorCode.CANCELED, "canceled; the mirror holds the shape it had reached"
+        return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
+
+    def _await_shape(self, goal_handle: ServerGoalHandle, wanted: np.ndarray) -> tuple[str, int, str] | None:
+        """Wait until the driver reports the wanted shape; None when it stands."""
+        deadline = time.monotonic() + self._values["move_timeout"]
+        next_feedback, first_gap = 0.0, 0.0
+        while True:
+            if self._told_to_stop(goal_handle):
+                return self._stop(goal_handle)
+            driver = self._driver()
+            if driver is not None and len(driver.requested) == len(wanted):
+                gap = float(np.abs(np.asarray(driver.applied) - wanted).max())
+                first_gap = max(first_gap, gap)
+                ours = np.allclose(driver.requested, wanted, atol=1e-9)
+                if ours and not driver.moving and driver.driver_state == ActuatorState.STATE_ACTIVE:
+                    return None
+                if driver.driver_state != ActuatorState.STATE_ACTIVE:
+                    return (
+                        "abort",
+                        ErrorCode.ELECTRONICS_UNREACHABLE,
+                        f"the driver left its active state: {driver.message}",
+                    )
+                if time.monotonic() >= next_feedback:
+                    next_feedback = time.monotonic() + 0.1
+                    goal_handle.publish_feedback(
+                        MoveFocus.Feedback(
+                            phase=MoveFocus.Feedback.PHASE_MOVE,
+                            progress=1.0 - gap / first_gap if first_gap else 1.0,
+                            remaining=gap,
+                        )
+                    )
+            if time.monotonic() > deadline:
+                message = (
+                    driver.message if driver is not None and driver.message else "the driver did not report the shape"
+                )
+                return "abort", ErrorCode.TIMEOUT, message
+            time.sleep(0.002)
