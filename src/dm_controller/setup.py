@@ -15,6 +15,7 @@ setup(
         (f"share/{package_name}/config", [str(path) for path in Path("config").glob("*.*")]),
     ],
     install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # tells `colcon test` to use pytest
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
