@@ -10,6 +10,8 @@ with DeformableMirrorClient() as mirror:
 
 from __future__ import annotations
 
+import itertools
+import os
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -48,6 +50,8 @@ SERVICES = {
     LoadCalibration: "load_calibration",
 }
 ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus"}
+#: Two clients of one process need two names.
+_NUMBERS = itertools.count(1)
 #: Time the nodes may take to discover a new client on a busy machine.
 DISCOVERY_S = 1.0
 
@@ -78,7 +82,7 @@ class DeformableMirrorClient:
     def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node("dm_client", namespace=namespace, context=self._context)
+        self.node = Node(f"dm_client_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
         self._timeout_s = timeout_s
         self._latest: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}

@@ -119,15 +119,22 @@ def _bench_checks(config: Path) -> Iterator[tuple[str, Callable[[], Finding]]]:
             else None
         ),
     )
+    unset = [
+        f"{node}.{name}" for node, values in content.items() for name, value in values.items() if value == "CHANGE"
+    ]
+    yield (
+        "values of your own",
+        lambda: (f"still CHANGE: {', '.join(unset)}", "put in the values of your bench") if unset else None,
+    )
     kind, address = driver.get("electronics.kind"), str(driver.get("electronics.address", ""))
     port = int(driver.get("electronics.port", 1234))
-    if kind == "edac40_tcp" and "virtual_bench" not in content:
+    if kind == "edac40_tcp" and address != "CHANGE" and "virtual_bench" not in content:
         yield f"electronics at {address}:{port}", lambda: _tcp(address, port)
     if kind == "usb_dac40":
         device = str(driver.get("electronics.serial_port", ""))
         yield f"serial port {device}", lambda: _serial(device)
     folder = str(content.get("interferometer", {}).get("watch_folder", ""))
-    if folder:
+    if folder and folder != "CHANGE":
         yield f"watched folder {folder}", lambda: _folder(Path(folder).expanduser(), "virtual_bench" in content)
 
 

@@ -82,6 +82,8 @@ class VirtualBench:
         self.monitor = Monitor(config.monitor, neighbour_pairs(self.plate.x, self.plate.y), signals)
         self.maps_written = 0
         self._measuring = threading.Lock()
+        # At once, as on the instrument's PC: whoever watches the folder finds it before the first map.
+        config.files.folder.mkdir(parents=True, exist_ok=True)
         self.electronics = ElectronicsServer(
             self.unit, config.ports, self._on_frame, lambda text: on_event(text.startswith("malformed"), text)
         )
@@ -143,7 +145,6 @@ class VirtualBench:
 
     def _next_path(self) -> Path:
         files, number = self.config.files, self.maps_written
-        files.folder.mkdir(parents=True, exist_ok=True)
         while (path := files.folder.absolute() / f"map_{number:06d}.{files.format}").exists():
             number += 1
         return path

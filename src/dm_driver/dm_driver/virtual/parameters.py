@@ -138,7 +138,7 @@ def bench_config(values: Mapping[str, Any]) -> BenchConfig:
         ports=PortsConfig(**ports),
         monitor=MonitorConfig(**group("monitor")),
         files=FilesConfig(
-            folder=Path(values["output_folder"]),
+            folder=Path(values["output_folder"]).expanduser(),
             format=values["output_format"],
             datx_unit=values["output_datx_unit"],
             intensity=values["output_intensity"],
