@@ -17,6 +17,9 @@ FREE_TERMS = 3
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
 #: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
 COEFFICIENT_WEIGHT = 100.0
+#: Ridge on the signals, as a share of a typical actuator's rms response. On a PDM30-37 twin it costs less than 1 % of the
+#: predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3: smaller moves, less hysteresis.
+RIDGE_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,8 @@ class CalibratedMirror:
 
     The command makes the coefficients beyond tilt equal to the wanted ones and the sag beyond the terms as small as
     possible, with piston and tilt free, inside the limits; where the limits forbid equality it is the closest in the
-    weighted least-squares sense. A ridge of the influence function's own uncertainty keeps actuators that the aperture
-    hardly sees from running to their limits for nothing.
+    weighted least-squares sense. A small ridge keeps actuators that the aperture hardly sees from running to their
+    limits for nothing.
     """
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
@@ -95,14 +98,14 @@ class CalibratedMirror:
         self._weights = weights
         self._tilt_free = orthogonal[:, :FREE_TERMS]
         self._beyond_terms = orthogonal
-        uncertainty = model.in_sample_rms / np.sqrt(max(model.maps_used, 1))
+        response = np.linalg.norm(self._reduce(model.influence_sag, self._tilt_free), axis=0)
         matrix = np.vstack(
             [
                 COEFFICIENT_WEIGHT * model.influence_zernike[FREE_TERMS:],
                 self._reduce(model.influence_sag, self._beyond_terms),
             ]
         )
-        self._programme = BoundedProgramme(matrix, limits, ridge=max(uncertainty, 1e-11) ** 2)
+        self._programme = BoundedProgramme(matrix, limits, ridge=(RIDGE_SHARE * float(np.median(response))) ** 2)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
     def _reduce(self, sag: NDArray[np.float64], removed: NDArray[np.float64]) -> NDArray[np.float64]:

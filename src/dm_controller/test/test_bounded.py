@@ -56,6 +56,23 @@ def test_result_is_feasible_and_optimal(seed: int, demand: float, difference: fl
     assert cost(signals) <= cost(np.clip(other.x, -1, 1)) * (1 + 1e-6) + 1e-6
 
 
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), demand=st.floats(0.5, 5.0), spread=st.floats(1.0, 4.5))
+def test_optimality_conditions_hold_for_ill_conditioned_mirrors(seed: int, demand: float, spread: float) -> None:
+    """37 signals, condition numbers up to 3e4: at the optimum the gradient vanishes, or pushes outwards at a limit."""
+    generator = np.random.default_rng(seed)
+    left, right = (np.linalg.qr(generator.normal(size=(60, 37)))[0], np.linalg.qr(generator.normal(size=(37, 37)))[0])
+    matrix = left * np.logspace(0, -spread, 37) @ right
+    # A part that the signals cannot make, as print-through; unconstrained it asks for signals some times the range.
+    wanted = matrix @ (demand * generator.normal(size=37)) + 10.0**-spread * generator.normal(size=60)
+    signals = BoundedProgramme(matrix, Limits(-1.0, 1.0, NO_PAIRS, 2.0)).solve(wanted)
+    gradient = matrix.T @ (matrix @ signals - wanted)
+    scale = np.abs(matrix.T @ wanted).max()
+    free = np.abs(signals) < 1.0 - 1e-9
+    assert np.abs(gradient[free]).max(initial=0.0) < 1e-7 * scale
+    assert (gradient[~free] * np.sign(signals[~free])).max(initial=0.0) < 1e-7 * scale
+
+
 def test_it_beats_clipping_when_saturated() -> None:
     # Overlapping bumps on a line, asked for a parabola that is too deep for them.
     points, centres = np.linspace(-1, 1, 80), np.linspace(-1.1, 1.1, 12)

@@ -3,14 +3,13 @@
     minimise   |M s - b|^2 + ridge |s|^2
     subject to low <= s_i <= high,   |s_i - s_j| <= d for neighbours i, j
 
-M is factored once (M = Q R), so that a solve works on N x N numbers however many rows M has. Three methods, cheapest
-first; each result satisfies the optimality conditions of the whole programme:
+M is factored once (M = Q R), so that a solve works on N x N numbers however many rows M has. The unconstrained solution
+is taken when it lies inside all limits; else the problem becomes one of least distance, solved exactly by non-negative
+least squares (Lawson and Hanson 1974, chapter 23). `scipy.optimize.lsq_linear` was tried and left: its BVLS stops far
+from the optimum at its default number of iterations (measured on a PDM30-37: 13 nm rms instead of 6) and takes many
+times longer when it does not.
 
-1. the unconstrained solution, when it lies inside all limits;
-2. bounded-variable least squares (Stark and Parker 1995, `scipy.optimize.lsq_linear`), when only the range binds;
-3. least distance programming by non-negative least squares (Lawson and Hanson 1974, ch. 23), when neighbours bind.
-
-Clipping the unconstrained solution instead doubles the residual of a saturated sphere.
+Clipping the unconstrained solution instead can double the residual of a saturated sphere.
 """
 
 from __future__ import annotations
@@ -20,10 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.optimize import lsq_linear, nnls
+from scipy.optimize import nnls
 
 #: Signals closer to a limit than this count as standing at it.
 AT_LIMIT = 1e-6
+#: A signal this close to an end of its range is taken to be bound there.
+NEAR_LIMIT = 1e-5
 #: Violations below this are rounding, far below a DAC step (1.5e-5).
 SLACK = 1e-9
 
@@ -49,6 +50,11 @@ class Limits:
         if not self.neighbour_difference > 0:
             raise ValueError(f"neighbour_difference = {self.neighbour_difference:g}: must be positive")
 
+    @property
+    def neighbours_can_bind(self) -> bool:
+        """Whether neighbours can differ by more than their limit inside the range."""
+        return len(self.pairs) > 0 and self.neighbour_difference < self.high - self.low
+
     def allow(self, signals: NDArray[np.float64]) -> bool:
         """Whether `signals` (N,) break none of the limits."""
         return self.allow_range(signals) and self.allow_neighbours(signals)
@@ -57,7 +63,7 @@ class Limits:
         return bool(signals.min() >= self.low - SLACK and signals.max() <= self.high + SLACK)
 
     def allow_neighbours(self, signals: NDArray[np.float64]) -> bool:
-        if len(self.pairs) == 0 or self.neighbour_difference >= self.high - self.low:
+        if not self.neighbours_can_bind:
             return True
         differences = signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]]
         return bool(np.abs(differences).max() <= self.neighbour_difference + SLACK)
@@ -65,7 +71,7 @@ class Limits:
     def at_limit(self, signals: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(N,) which actuators stand at a limit."""
         result = (signals <= self.low + AT_LIMIT) | (signals >= self.high - AT_LIMIT)
-        if len(self.pairs) and self.neighbour_difference < self.high - self.low:
+        if self.neighbours_can_bind:
             differences = np.abs(signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]])
             result[self.pairs[differences >= self.neighbour_difference - AT_LIMIT].ravel()] = True
         return result
@@ -102,7 +108,8 @@ class BoundedProgramme:
     def _linear_constraints(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(C, c) of C y >= c0 - C d in terms of y = R s - d, see `_least_distance`."""
         limits, identity = self.limits, np.eye(count)
-        differences = identity[limits.pairs[:, 0]] - identity[limits.pairs[:, 1]] if len(limits.pairs) else identity[:0]
+        pairs = limits.pairs if limits.neighbours_can_bind else limits.pairs[:0]
+        differences = identity[pairs[:, 0]] - identity[pairs[:, 1]]
         constraints = np.vstack([identity, -identity, differences, -differences])
         bounds = np.concatenate(
             [
@@ -126,10 +133,23 @@ class BoundedProgramme:
         signals: NDArray[np.float64] = solve_triangular(self._triangle, projected)
         if self.limits.allow(signals):
             return signals
-        signals = lsq_linear(self._triangle, projected, (self.limits.low, self.limits.high), method="bvls").x
-        if not self.limits.allow_neighbours(signals):
-            signals = self._least_distance(projected)
-        return np.clip(signals, self.limits.low, self.limits.high)
+        return self._polished(np.clip(self._least_distance(projected), self.limits.low, self.limits.high), projected)
+
+    def _polished(self, signals: NDArray[np.float64], projected: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Put the signals that stand at an end of the range exactly there and solve for the others once more.
+
+        The multipliers above are found to the accuracy of an ill-conditioned problem; with the set of bound signals
+        known, what remains is plain least squares.
+        """
+        middle = 0.5 * (self.limits.low + self.limits.high)
+        ends = np.where(signals < middle, self.limits.low, self.limits.high)
+        bound = np.abs(signals - ends) < NEAR_LIMIT
+        if bound.all():
+            return signals
+        result = np.where(bound, ends, signals)
+        rest = projected - self._triangle[:, bound] @ ends[bound]
+        result[~bound] = np.linalg.lstsq(self._triangle[:, ~bound], rest, rcond=None)[0]
+        return result if self.limits.allow(result) else signals
 
     def _least_distance(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
         """Lawson and Hanson's problem LDP: the shortest y = R s - d that satisfies all constraints."""
