@@ -107,6 +107,15 @@ def test_measured_surface_is_the_requested_one(
     assert abs(error.rms - prediction.predicted_rms) < 1.5e-9
 
 
+def test_closed_loop_ends_within_its_tolerance(mirror: DeformableMirrorClient, calibrated: Calibrate.Result) -> None:
+    seen: list[Any] = []
+    result = mirror.converge(0.03, tolerance=WAVELENGTH / 500, max_maps=3, on_feedback=seen.append)
+    assert result.max_zernike <= WAVELENGTH / 500
+    assert 1 <= result.maps <= 3
+    assert len(seen) == result.maps
+    assert measured_error(mirror, 0.03).rms == pytest.approx(result.residual_rms, abs=2e-9)
+
+
 def test_beyond_reach_nothing_moves_and_the_range_is_named(
     mirror: DeformableMirrorClient, calibrated: Calibrate.Result
 ) -> None:

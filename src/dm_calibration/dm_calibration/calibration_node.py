@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.msg import ErrorCode, MirrorInfo
-from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
+from dm_msgs.srv import FitInfluenceFunction, FitRegression, ListCalibrations, LoadCalibration, PredictError
 from rclpy.node import Node
 
 from dm_calibration.calibration import Calibration
@@ -22,6 +23,7 @@ from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
 from dm_calibration.calibration_messages import calibration_message, mirror_from, time_message
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options
 from dm_calibration.calibrator import refit
+from dm_calibration.error_prediction import ErrorPrediction
 from dm_calibration.store import CalibrationStore
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
@@ -51,6 +53,12 @@ class CalibrationNode(Node):
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load)
         WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)
+        prediction = ErrorPrediction(self._desk, self._values)
+        for kind, name, work in (
+            (FitRegression, "fit_regression", prediction.fit),
+            (PredictError, "predict_error", prediction.predict),
+        ):
+            WorkerService(self, kind, name, partial(self._serve, work))
         self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
         self._publish(None, None)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
@@ -96,6 +104,9 @@ class CalibrationNode(Node):
             response.error_code, response.message = error_code(error), str(error)
             self.get_logger().warning(str(error))
         return response
+
+    def _serve(self, work: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
+        return self._answer(response, lambda: work(request, response))
 
     def _on_list(self, _request: Any, response: Any) -> Any:
         in_use = self._desk.in_use

@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any
 
 import rclpy
-from dm_msgs.action import Calibrate, MoveFocus
+from dm_msgs.action import Calibrate, Converge, MoveFocus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
 from dm_msgs.srv import (
     Degauss,
@@ -49,7 +49,7 @@ SERVICES = {
     ListCalibrations: "list_calibrations",
     LoadCalibration: "load_calibration",
 }
-ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus"}
+ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus", Converge: "converge"}
 #: Two clients of one process need two names.
 _NUMBERS = itertools.count(1)
 #: Time the nodes may take to discover a new client on a busy machine.
@@ -294,6 +294,22 @@ class DeformableMirrorClient:
         request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
         goal = MoveFocus.Goal(request=request, tolerance=float(tolerance), settle_time=float(settle_time))
         return self.run_action(MoveFocus, "move_focus", goal, on_feedback, timeout_s)
+
+    def converge(
+        self,
+        curvature: float,
+        conic_constant: float = 0.0,
+        *,
+        method: str = "",
+        tolerance: float = 0.0,
+        max_maps: int = 0,
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 600.0,
+    ) -> Converge.Result:
+        """Close the loop on the interferometer until the measured surface is the requested one."""
+        request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
+        goal = Converge.Goal(request=request, method=method, tolerance=float(tolerance), max_maps=max_maps)
+        return self.run_action(Converge, "converge", goal, on_feedback, timeout_s)
 
     def calibrate(
         self,

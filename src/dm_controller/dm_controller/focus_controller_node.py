@@ -23,6 +23,7 @@ from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 from rclpy.time import Time
 
+from dm_controller.converge_action import CONVERGE_PARAMETERS, ConvergeAction
 from dm_controller.conversions import doubles, limits_of, model_of, target_of
 from dm_controller.model import CalibratedMirror, Plan
 from dm_controller.move_focus_action import MoveFocusAction
@@ -54,6 +55,7 @@ PARAMETERS = (
         0.0,
         0.5,
     ),
+    *CONVERGE_PARAMETERS,
 )
 
 
@@ -98,6 +100,9 @@ class FocusControllerNode(Node):
         self.create_service(SetFocus, "set_focus", self._on_set_focus)
         self.create_service(Flatten, "flatten", self._on_flatten)
         self._move = MoveFocusAction(self, self._carry_out, self._send, lambda: self._driver, self._values)
+        self._converge = ConvergeAction(
+            self, self._values, self._decide, lambda: (self._calibration, self._mirror_info)
+        )
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         self._publish_capabilities()
 
@@ -225,6 +230,8 @@ class FocusControllerNode(Node):
             self._check_reachable(decision)
             if not dry_run:
                 self._check_driver()
+                if self._converge.busy:
+                    raise Refusal(ErrorCode.BUSY, "a closed loop (action converge) is running; cancel it first")
                 state.header.stamp = self._send(decision.plan.signals)
                 state.applied = True
         except Refusal as refusal:

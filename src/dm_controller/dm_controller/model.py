@@ -17,8 +17,8 @@ FREE_TERMS = 3
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
 #: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
 COEFFICIENT_WEIGHT = 100.0
-#: Ridge on the signals, as a share of a typical actuator's rms response. On a PDM30-37 twin it costs less than 1 % of the
-#: predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3: smaller moves, less hysteresis.
+#: Ridge on the signals, as a share of a typical actuator's rms response. On a PDM30-37 twin it costs less than 1 % of
+#: the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
 RIDGE_SHARE = 0.01
 
 

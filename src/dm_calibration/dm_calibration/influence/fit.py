@@ -34,12 +34,16 @@ PISTON_TILT = 3
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit: method (a name of METHODS), folds of the cross-validation, thresholds."""
+    """How to fit: method (a name of METHODS), folds of the cross-validation, thresholds.
+
+    `epsilon` (m^2, above 0) is the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
+    """
 
     method: str = "AZreg"
     folds: int = 10
     screening: ScreeningOptions = field(default_factory=ScreeningOptions)
     grades: GradeOptions = field(default_factory=GradeOptions)
+    epsilon: float | None = None
 
 
 @dataclass(frozen=True)
@@ -154,7 +158,7 @@ def fit_influence(
     if method.region_weighted:
         # The outliers do not depend on it: they are found in the sag, which the weights do not touch.
         filled = responses[:, maps.terms :]
-        weighting = choose_weighting(design, good, filled, options.folds)
+        weighting = choose_weighting(design, good, filled, options.folds, options.epsilon)
         responses = np.hstack((weighted_coefficients(good, filled, weighting.weights), filled))
         fitted = method.estimate(design, responses)
         remarks.append(weighting.sentence())

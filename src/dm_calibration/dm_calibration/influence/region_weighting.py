@@ -6,7 +6,8 @@ Epsilon. The paper calls it a prior parameter. As epsilon goes from 0 to infinit
 common factor does not matter) to 1, so some candidates around the median of the r_i cover both limits. The one is
 chosen whose influence function predicts maps it has not seen best, in the measure the paper judges by: the rms surface
 error inside the ten concentric regions, each region counting alike. The figure at rest, which no weights can change, is
-part of the prediction. Weights of a fold come from the other folds alone.
+part of the prediction. Weights of a fold come from the other folds alone. Where no weights predict better than equal
+ones, the mildest candidate is chosen and the result says so; a prior epsilon can be given instead.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence import quality
+from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import SURFACE, MapSet
-from dm_calibration.influence.regression import Design, TooFewMapsError
+from dm_calibration.influence.regression import Design, TooFewMapsError, least_squares, make_design
 from dm_calibration.influence.sag import remove_piston_tilt, weighted_fit
 from dm_calibration.influence.weights import coefficient_operator, region_weights, surface_control_error
 from dm_calibration.optics.regions import AREA_FRACTIONS, region_statistics
@@ -43,6 +45,7 @@ class RegionWeighting:
         variance: (R,) r_i, m^2.
         epsilon: m^2.
         weights: (R,) Eq. (8).
+        prior: whether epsilon was given rather than chosen.
         candidates: (E,) m^2, the values of epsilon tried, rising.
         score: (E,) m, held-out rms surface error of each, mean square over maps and regions.
         score_unweighted: m, the same with all weights 1.
@@ -53,19 +56,27 @@ class RegionWeighting:
     variance: Floats
     epsilon: float
     weights: Floats
+    prior: bool
     candidates: Floats
     score: Floats
     score_unweighted: float
     surfaces: int
     folds: int
 
+    @property
+    def helps(self) -> bool:
+        """Whether some candidate predicts unseen maps better than equal weights."""
+        return bool(self.score.min() < self.score_unweighted)
+
     def sentence(self) -> str:
         """What a user of the influence function must know."""
+        origin = "given" if self.prior else f"by {self.folds}-fold cross-validation"
+        verdict = "" if self.helps else "; no weights predict unseen maps better than equal ones"
         return (
             f"AZWreg: coefficients fitted to the sag with region weights {', '.join(f'{w:.2f}' for w in self.weights)} "
-            f"from the centre outwards (Eq. 8, epsilon {self.epsilon * 1e18:.3g} nm^2 by {self.folds}-fold "
-            f"cross-validation over {self.surfaces} surfaces: held-out regional error {self.score.min() * 1e9:.2f} nm, "
-            f"without weights {self.score_unweighted * 1e9:.2f} nm)."
+            f"from the centre outwards (Eq. 8, epsilon {self.epsilon * 1e18:.3g} nm^2 {origin}, {self.surfaces} "
+            f"surfaces; held-out regional error at best {self.score.min() * 1e9:.2f} nm, with equal weights "
+            f"{self.score_unweighted * 1e9:.2f} nm{verdict})."
         )
 
 
@@ -75,8 +86,10 @@ def sample_surfaces(maps: MapSet) -> NDArray[np.bool_]:
     return chosen if np.unique(maps.step[chosen]).size >= SURFACES_MIN else ~maps.reference
 
 
-def choose_weighting(design: Design, maps: MapSet, sag: Floats, folds: int = 10) -> RegionWeighting:
-    """Region weights of `maps` with epsilon by k-fold cross-validation.
+def choose_weighting(
+    design: Design, maps: MapSet, sag: Floats, folds: int = 10, epsilon: float | None = None
+) -> RegionWeighting:
+    """Region weights of `maps` with epsilon by k-fold cross-validation, or with a given one.
 
     Folds go by commanded state in order, so that they are the same in every run and repeated maps leave together.
 
@@ -84,11 +97,12 @@ def choose_weighting(design: Design, maps: MapSet, sag: Floats, folds: int = 10)
         design: of these maps, (M, p).
         sag: (M, P) m, without gaps, piston and tilt removed.
         folds: at least 2.
+        epsilon: m^2, taken instead of the one cross-validation prefers; the curve is found all the same.
 
     Raises:
         TooFewMapsError: fewer than four sample surfaces.
-        ValueError: regional errors that are the same for all surfaces, so that no weights follow; folds below 2; maps
-            with other than 21 terms.
+        ValueError: regional errors that are the same for all surfaces, so that no weights follow; folds below 2;
+            epsilon not above 0; maps with other than 21 terms.
     """
     if maps.terms != len(TERMS):
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
@@ -114,17 +128,38 @@ def choose_weighting(design: Design, maps: MapSet, sag: Floats, folds: int = 10)
             squares[e] += _squares(predicted, sag[judged], maps, weights)
     score = np.sqrt(squares / (len(AREA_FRACTIONS) * max(int((tested & chosen).sum()), 1)))
     candidates = fractions[1:] * scale
-    epsilon = float(candidates[::-1][np.argmin(score[1:][::-1])])  # the mildest weights of several that do as well
+    mildest_best = float(candidates[::-1][np.argmin(score[1:][::-1])])
+    chosen_epsilon = mildest_best if epsilon is None else epsilon
     return RegionWeighting(
         variance=variance,
-        epsilon=epsilon,
-        weights=region_weights(variance, epsilon),
+        epsilon=chosen_epsilon,
+        weights=region_weights(variance, chosen_epsilon),
+        prior=epsilon is not None,
         candidates=candidates,
         score=score[1:],
         score_unweighted=float(score[0]),
         surfaces=int(chosen.sum()),
         folds=int(fold.max()) + 1,
     )
+
+
+def weighting_of(
+    maps: MapSet, used: NDArray[np.bool_] | None = None, folds: int = 10, epsilon: float | None = None
+) -> RegionWeighting:
+    """Region weights of the maps of a calibration, for a command solve or a report; see :func:`choose_weighting`.
+
+    Args:
+        used: (M,) which maps entered the fit; None = all.
+
+    Raises:
+        TooFewMapsError: the maps do not determine the influence function, or fewer than four sample surfaces.
+        ValueError: as :func:`choose_weighting`.
+    """
+    good = maps if used is None else maps.select(used)
+    design = make_design(good)
+    sag = usable_sag(good, [""] * len(good))
+    _, responses = regress(least_squares, design, good, sag)
+    return choose_weighting(design, good, responses[:, maps.terms :], folds, epsilon)
 
 
 def weighted_coefficients(maps: MapSet, sag: Floats, weights: Floats) -> Floats:

@@ -48,14 +48,24 @@ def disc_shares(points: SamplePoints, area_fractions: ArrayLike = AREA_FRACTIONS
 
 
 def regional_rms(
-    sag: Floats, points: SamplePoints, area_fractions: ArrayLike = AREA_FRACTIONS, labels: Sequence[str] = ()
+    sag: Floats,
+    points: SamplePoints,
+    area_fractions: ArrayLike = AREA_FRACTIONS,
+    labels: Sequence[str] = (),
+    *,
+    level_each: bool = False,
 ) -> Floats:
-    """Root mean square about zero of sag samples inside concentric discs, area-weighted.
+    """Root mean square of sag samples inside concentric discs, area-weighted.
+
+    The paper does not say whether a partial aperture is levelled on its own. Both readings are here: about zero, with
+    piston and tilt removed once over the whole aperture by the caller; or about each region's own best plane, as an
+    interferometer with that aperture would show it.
 
     Args:
         sag: (M, P) at the points, NaN = no data; the points that are left then share the region.
         area_fractions: (R,) shares of the aperture's area.
         labels: (M,) names of the maps for messages.
+        level_each: remove piston and tilt from every region on its own.
 
     Returns:
         (M, R), in the unit of the sag; all finite.
@@ -70,8 +80,20 @@ def regional_rms(
     seen = np.isfinite(sag)
     energy = np.where(seen, np.square(sag), 0.0) @ shares
     area = seen.astype(float) @ shares
+    if level_each:
+        energy = np.maximum(energy - _in_plane(sag, seen, points, shares), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.where(area > 0.0, np.sqrt(energy / area), np.nan)
     names = tuple(labels) or tuple(f"map {k + 1}" for k in range(len(sag)))
     check_regions(rms, checked_fractions(area_fractions), names)
     return np.asarray(rms)
+
+
+def _in_plane(sag: Floats, seen: NDArray[np.bool_], points: SamplePoints, shares: Floats) -> Floats:
+    """(M, R): the part of the energy in each region that its best plane holds."""
+    plane = np.column_stack((np.ones_like(points.x), points.x, points.y))
+    products = plane[:, :, np.newaxis] * plane[:, np.newaxis, :]
+    gram = np.einsum("mp,pr,pij->mrij", seen.astype(float), shares, products, optimize=True)
+    moments = np.einsum("mp,pr,pi->mri", np.where(seen, sag, 0.0), shares, plane, optimize=True)
+    # The pseudo-inverse serves regions with too few points for a plane.
+    return np.asarray(np.einsum("mri,mrij,mrj->mr", moments, np.linalg.pinv(gram, hermitian=True), moments))

@@ -8,6 +8,7 @@ import typer
 
 from dm_controller.cli.calibrate import calibrate
 from dm_controller.cli.checks import check
+from dm_controller.cli.compare import compare
 from dm_controller.cli.demo import demo
 from dm_controller.cli.doctor import doctor
 from dm_controller.cli.focus import focus
@@ -22,7 +23,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for command in (demo, up, calibrate, focus, doctor):
+for command in (demo, up, calibrate, focus, compare, doctor):
     app.command()(command)
 app.command(name="test", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(check)
 

@@ -1,0 +1,39 @@
+"""What F, the number of samples and the number of variables say together, to check published tables.
+
+The paper's Table 2 gives adjusted R^2, F and p(F) without n and k. Only n = 50, k = 6 fits its AZreg and n = 49, k = 17
+its AZWreg.
+"""
+
+from __future__ import annotations
+
+from scipy import stats
+
+
+def adjusted_r2_of_f(f_statistic: float, n: int, k: int) -> float:
+    """Adjusted R^2 of a model of k variables and a constant on n samples that has this F: R^2 = kF / (kF + n - k - 1).
+
+    Raises:
+        ValueError: F negative, k below 1, or n not above k + 1.
+    """
+    freedom = _freedom(f_statistic, n, k)
+    r2 = k * f_statistic / (k * f_statistic + freedom)
+    return 1.0 - (1.0 - r2) * (n - 1) / freedom
+
+
+def p_of_f(f_statistic: float, n: int, k: int) -> float:
+    """Probability of this F or a larger one by chance, for a model of k variables chosen beforehand, on n samples.
+
+    Raises:
+        ValueError: as :func:`adjusted_r2_of_f`.
+    """
+    return float(stats.f.sf(f_statistic, k, _freedom(f_statistic, n, k)))
+
+
+def _freedom(f_statistic: float, n: int, k: int) -> int:
+    if k < 1:
+        raise ValueError(f"k = {k}: must be at least 1, the constant not counted")
+    if n <= k + 1:
+        raise ValueError(f"n = {n}: must be above k + 1 = {k + 1}, or no freedom is left for the residual")
+    if not f_statistic >= 0.0:
+        raise ValueError(f"F = {f_statistic:g}: must be 0 or more")
+    return n - k - 1

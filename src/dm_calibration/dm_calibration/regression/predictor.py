@@ -1,0 +1,106 @@
+"""The surface control error of a command that is still to come, with an interval.
+
+The regression of the reading HISTORY says how the error follows from a command and those before it. Whoever asks about
+a command gives no history, and the actuators remember: so the answer is taken over many histories, as the mirror may
+have in use: smooth shapes (the spheres and Zernike surfaces of the calibration) of any size the range allows, in random
+order from a rested mirror. The interval holds 95 % of them, widened by the uncertainty of the regression.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.sag import rms
+from dm_calibration.influence.surfaces import MODEL_NAMES
+from dm_calibration.influence.weights import surface_control_error
+from dm_calibration.regression.history import RunHistory, SagLaw, effective_signals
+from dm_calibration.regression.stepwise import SelectionOptions
+from dm_calibration.regression.surface_error import ErrorRegression, Reading, regress_surface_errors
+
+Floats = NDArray[np.float64]
+
+#: Number of histories, commands in each, and time between commands, s.
+HISTORIES = 200
+COMMANDS = 8
+DWELL = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorPredictor:
+    """Predicts the error of commands with unknown history.
+
+    Attributes:
+        influence: the influence function that nominal surfaces come from.
+        regression: of the reading HISTORY, fitted to all surfaces p01-p58.
+        law: of the sag, from all good maps.
+        histories: (COMMANDS, HISTORIES, N) normalised.
+    """
+
+    influence: InfluenceFit
+    regression: ErrorRegression
+    law: SagLaw
+    histories: Floats
+
+    def predict(self, signals: Floats) -> tuple[float, float, float]:
+        """Mean and 95 % interval over histories of the rms surface control error of one command.
+
+        Args:
+            signals: (N,) normalised.
+
+        Returns:
+            mean, lower, upper: m, none below 0.
+
+        Raises:
+            ValueError: another number of signals than actuators, or values that are not finite.
+        """
+        if signals.shape != (self.influence.actuators,) or not np.isfinite(signals).all():
+            raise ValueError(f"signals {signals.shape}: must be {self.influence.actuators} finite numbers")
+        commands, count, actuators = self.histories.shape
+        applied = np.concatenate((self.histories, np.broadcast_to(signals, (1, count, actuators))))
+        # Histories side by side, as if each had a mirror of its own.
+        features = effective_signals(applied.reshape(commands + 1, -1), DWELL * np.arange(commands + 1))[-1]
+        effective = (self.law.weights @ features).reshape(count, actuators)
+        sag = self.law.figure[-1] + effective @ self.law.influence
+        same = np.broadcast_to(signals, (count, actuators))
+        fit = self.influence
+        model = rms(surface_control_error(sag, same, fit.influence_zernike, fit.points), fit.points.weight)
+        mean, lower, upper = self.regression.fit.predict(np.column_stack((model, same)))
+        return (
+            max(float(mean.mean()), 0.0),
+            max(float(np.percentile(lower, 2.5)), 0.0),
+            max(float(np.percentile(upper, 97.5)), 0.0),
+        )
+
+
+def fit_predictor(
+    maps: MapSet, influence: InfluenceFit, options: SelectionOptions | None = None, seed: int = 0
+) -> ErrorPredictor:
+    """A predictor from all surfaces p01-p58 of a calibration; its held-out error is the leave-one-out one.
+
+    Args:
+        seed: of the random histories.
+
+    Raises:
+        As :func:`~dm_calibration.regression.surface_error.regress_surface_errors`.
+    """
+    regression = regress_surface_errors(maps, influence, Reading.HISTORY, options, test_set=())
+    law = RunHistory(maps, influence.sag_offset + maps.applied @ influence.influence_sag.T).fit(influence.used)
+    return ErrorPredictor(influence, regression, law, _histories(maps, influence, np.random.default_rng(seed)))
+
+
+def _histories(maps: MapSet, influence: InfluenceFit, rng: np.random.Generator) -> Floats:
+    """(COMMANDS, HISTORIES, N) random smooth shapes inside the range of signals of the calibration."""
+    low, high = influence.signal_min, influence.signal_max
+    middle = 0.5 * (low + high)
+    shapes = maps.applied[[name in MODEL_NAMES for name in maps.label]] - middle
+    shapes = shapes[np.abs(shapes).max(axis=1, initial=0.0) > 0.0]
+    if not len(shapes):  # no smooth shape is known: every actuator on its own
+        return np.asarray(rng.uniform(low, high, (COMMANDS, HISTORIES, maps.actuators)))
+    largest = shapes * (0.5 * (high - low) / np.abs(shapes).max(axis=1, keepdims=True))
+    chosen = largest[rng.integers(0, len(largest), (COMMANDS, HISTORIES))]
+    return np.asarray(middle + rng.uniform(-1.0, 1.0, (COMMANDS, HISTORIES, 1)) * chosen)

@@ -1,0 +1,123 @@
+"""Errors inside concentric regions, on pixels and on sampling points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dm_calibration.influence.sag import remove_piston_tilt
+from dm_calibration.optics.aperture import Aperture
+from dm_calibration.optics.regions import (
+    AREA_FRACTIONS,
+    ConcentricRegions,
+    EmptyRegionError,
+    figure_5,
+    region_statistics,
+)
+from dm_calibration.optics.sample_regions import disc_shares, regional_rms
+from dm_calibration.optics.sampling import SamplePoints, edge_clustered_points, sample_map, uniform_points
+
+SIZE = 301
+APERTURE = Aperture(150.0, 150.0, 150.0)
+
+
+def smooth_map(seed: int) -> np.ndarray:
+    """Bumps about as wide as an actuator spacing, NaN outside the aperture."""
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[1 : -1 : SIZE * 1j, -1 : 1 : SIZE * 1j]
+    sag = np.zeros((SIZE, SIZE))
+    for cx, cy, height in random.uniform(-1, 1, (12, 3)):
+        sag += height * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * 0.25**2))
+    return np.where(APERTURE.disc(sag.shape), sag, np.nan)
+
+
+@pytest.mark.parametrize("points", [edge_clustered_points(500), edge_clustered_points(300), uniform_points(500)])
+def test_shares_of_the_points_make_up_the_area_of_each_disc(points: SamplePoints) -> None:
+    shares = disc_shares(points)
+    assert points.weight @ shares == pytest.approx(AREA_FRACTIONS, abs=1e-12)
+    assert (np.diff(shares, axis=1) >= 0).all()
+    # Points well inside or outside a disc are in or out.
+    squared = points.x**2 + points.y**2
+    for fraction, share in zip(AREA_FRACTIONS, shares.T, strict=True):
+        assert (share[squared < fraction - 0.15] == 1.0).all()
+        assert (share[squared > fraction + 0.15] == 0.0).all()
+
+
+def test_weights_that_are_no_shares_of_an_area_are_refused() -> None:
+    points = edge_clustered_points(100)
+    with pytest.raises(ValueError, match="must be positive shares of the area that sum to 1"):
+        disc_shares(SamplePoints(points.x, points.y, 2 * points.weight))
+
+
+def test_points_tell_the_regional_errors_of_the_map() -> None:
+    maps = [smooth_map(seed) for seed in range(6)]
+    on_pixels = ConcentricRegions((SIZE, SIZE), APERTURE).rms_of_each(maps)
+    points = edge_clustered_points(500)
+    sag = np.stack([sample_map(m, 150.0, 150.0, 150.0, points) for m in maps])
+    on_points = regional_rms(sag, points)
+    assert on_points.shape == (6, 10)
+    assert on_points == pytest.approx(on_pixels, rel=0.12)
+    assert on_points[:, -1] == pytest.approx(on_pixels[:, -1], rel=0.02)
+    assert np.sqrt(np.square(sag) @ points.weight) == pytest.approx(on_points[:, -1])
+
+
+def test_levelled_regions() -> None:
+    points = edge_clustered_points(500)
+    sag = np.stack([sample_map(smooth_map(seed), 150.0, 150.0, 150.0, points) for seed in (7, 8)])
+    sag[0, :40] = np.nan
+    found = regional_rms(sag, points, level_each=True)
+    plane = np.column_stack((np.ones(500), points.x, points.y))
+    shares = points.weight[:, None] * disc_shares(points)
+    for m, r in ((0, 4), (1, 0), (1, 9)):
+        weight = np.where(np.isfinite(sag[m]), shares[:, r], 0.0)
+        root = np.sqrt(weight)
+        z = np.nan_to_num(sag[m])
+        fit = np.linalg.lstsq(root[:, None] * plane, root * z, rcond=None)[0]
+        assert found[m, r] == pytest.approx(np.sqrt(weight @ (z - plane @ fit) ** 2 / weight.sum()), rel=1e-6)
+    tilted = sag + 3.0 - 2.0 * points.x + points.y
+    assert regional_rms(tilted, points, level_each=True) == pytest.approx(found, rel=1e-6)
+    levelled = remove_piston_tilt(sag, points)
+    assert (found <= regional_rms(levelled, points) * (1 + 1e-9)).all()
+    assert found[:, -1] == pytest.approx(regional_rms(levelled, points)[:, -1])
+
+
+def test_a_region_without_data_is_named() -> None:
+    regions = ConcentricRegions((SIZE, SIZE), APERTURE)
+    whole, holed = smooth_map(1), smooth_map(2)
+    holed[APERTURE.squared_distance(holed.shape) <= 0.25] = np.nan
+    with pytest.raises(EmptyRegionError, match=r"p07: the concentric region of 10% of the area holds no valid data"):
+        regions.rms_of_each([whole, holed], ["p06", "p07"])
+    points = edge_clustered_points(500)
+    sag = np.stack([sample_map(m, 150.0, 150.0, 150.0, points) for m in (whole, holed)])
+    with pytest.raises(EmptyRegionError, match="map 2: the concentric region of 10%"):
+        regional_rms(sag, points)
+    with pytest.raises(ValueError, match="compare only maps of one camera and one aperture"):
+        regions.rms_of_each([whole, whole[1:]])
+    with pytest.raises(ValueError, match="no map given"):
+        regions.rms_of_each([])
+    with pytest.raises(ValueError, match=r"must be \(maps, 500 sampling points\)"):
+        regional_rms(sag[:, 1:], points)
+
+
+def test_mean_and_variance_over_surfaces() -> None:
+    rms = np.random.default_rng(3).uniform(1.0, 2.0, (5, 10))
+    found = region_statistics(rms)
+    assert found.mean == pytest.approx(rms.sum(axis=0) / 5)
+    assert found.variance == pytest.approx(((rms - rms.mean(axis=0)) ** 2).sum(axis=0) / 4)
+    with pytest.raises(ValueError, match="1 surfaces to average: a variance needs at least 2"):
+        region_statistics(rms[:1])
+    with pytest.raises(ValueError, match=r"must be \(5 surfaces, 10 regions\)"):
+        region_statistics(rms[:, 1:])
+
+
+def test_both_panels_of_figure_5() -> None:
+    labels = ["reference 1", *(f"p{k:02d}" for k in range(1, 59)), *(f"pz{k:02d}" for k in range(1, 12)), "poke+01"]
+    rms = np.random.default_rng(4).uniform(1.0, 2.0, (len(labels), 10))
+    rms[[labels.index("pz02"), labels.index("pz03")]] = 9.0
+    actuators, zernikes = figure_5(rms, labels)
+    assert actuators.labels == tuple(labels[1:59]) and actuators.averaged.all()
+    assert actuators.mean == pytest.approx(rms[1:59].mean(axis=0))
+    assert zernikes.labels == tuple(labels[59:70]) and zernikes.averaged.sum() == 9
+    assert (zernikes.mean < 2.0).all() and zernikes.rms.max() == 9.0
+    with pytest.raises(ValueError, match="0 surfaces to average"):
+        figure_5(rms[:59], labels[:59])

@@ -1,0 +1,204 @@
+"""Stepwise selection: what it finds, its statistics, its intervals, and what it refuses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import statsmodels.api as sm
+
+from dm_calibration.regression.f_statistic import adjusted_r2_of_f, p_of_f
+from dm_calibration.regression.stepwise import (
+    CollinearError,
+    SelectionOptions,
+    TooFewSamplesError,
+    leave_one_out,
+    stepwise,
+)
+
+NAMES = [f"x{k}" for k in range(58)]
+
+
+def candidates(seed: int, n: int = 50, count: int = 58) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((n, count))
+
+
+def test_finds_the_variables_that_matter_and_agrees_with_statsmodels() -> None:
+    x = candidates(1)
+    # Scales as apart as signals (1) and coefficients (1e-6 m).
+    x[:, 40] *= 1e-6
+    y = 50e-9 + 8e-9 * x[:, 3] - 5e-3 * x[:, 40] + 1e-9 * np.random.default_rng(2).standard_normal(50)
+    fit = stepwise(x, y, NAMES, options=SelectionOptions(1e-4, 2e-4))
+    assert set(fit.variables) == {"x3", "x40"}
+    assert (fit.n, fit.k) == (50, 2)
+    reference = sm.OLS(y, sm.add_constant(x[:, list(fit.columns)])).fit()
+    assert fit.parameters == pytest.approx(reference.params, rel=1e-9)
+    assert (fit.adjusted_r2, fit.f_statistic) == pytest.approx((reference.rsquared_adj, reference.fvalue))
+    assert fit.residual_sd == pytest.approx(np.sqrt(reference.mse_resid))
+    assert fit.p_value == pytest.approx(p_of_f(fit.f_statistic, fit.n, fit.k))
+    assert fit.adjusted_r2 == pytest.approx(adjusted_r2_of_f(fit.f_statistic, fit.n, fit.k))
+    frame = reference.get_prediction(np.column_stack((np.ones(5), x[:5, list(fit.columns)]))).summary_frame()
+    mean, lower, upper = fit.predict(x[:5])
+    assert mean == pytest.approx(frame["mean"].to_numpy())
+    assert lower == pytest.approx(frame["obs_ci_lower"].to_numpy())
+    assert upper == pytest.approx(frame["obs_ci_upper"].to_numpy())
+
+
+@pytest.mark.parametrize(
+    ("n", "k", "f", "adjusted_r2", "p"),
+    [(50, 6, 3.055, 0.2010, 1.404e-2), (49, 17, 10.123, 0.7637, 2.4776e-8)],
+)
+def test_table_2_of_the_paper_is_consistent(n: int, k: int, f: float, adjusted_r2: float, p: float) -> None:
+    assert adjusted_r2_of_f(f, n, k) == pytest.approx(adjusted_r2, abs=5e-5)
+    assert p_of_f(f, n, k) == pytest.approx(p, rel=1e-3)
+
+
+def test_a_variable_made_superfluous_by_later_ones_leaves_again() -> None:
+    rng = np.random.default_rng(3)
+    x = candidates(3, count=6)
+    x[:, 2] = x[:, 0] + x[:, 1] + 0.3 * rng.standard_normal(50)
+    y = x[:, 0] + 0.7 * x[:, 1] + 0.05 * rng.standard_normal(50)
+    first = stepwise(x, y, NAMES[:6], options=SelectionOptions(1e-20, 1e-19))
+    assert first.variables == ("x2",)  # the best single one
+    fit = stepwise(x, y, NAMES[:6], options=SelectionOptions(1e-3, 2e-3))
+    assert set(fit.variables) == {"x0", "x1"}
+
+
+def test_weights_are_those_of_weighted_least_squares() -> None:
+    rng = np.random.default_rng(4)
+    x = candidates(4, n=400, count=3)
+    weights = rng.uniform(0.05, 1.0, 400)
+    y = 1.0 + 2.0 * x[:, 1] + 0.1 * rng.standard_normal(400) / np.sqrt(weights)
+    fit = stepwise(x, y, NAMES[:3], weights, SelectionOptions(1e-6, 1e-5))
+    assert fit.variables == ("x1",) and fit.weighted
+    reference = sm.WLS(y, sm.add_constant(x[:, 1]), weights=weights).fit()
+    assert fit.parameters == pytest.approx(reference.params, rel=1e-9)
+    mean, lower, upper = fit.predict(x, weights)
+    inside = (lower <= y) & (y <= upper)
+    light = weights < 0.2
+    assert 0.90 < inside.mean() < 0.99
+    assert inside[light].mean() > 0.87
+    assert ((upper - mean)[light].mean()) > 2.0 * (upper - mean)[weights > 0.8].mean()
+
+
+def test_intervals_hold_their_share_of_new_samples() -> None:
+    rng = np.random.default_rng(5)
+    x = candidates(5, n=60, count=4)
+    fit = stepwise(x, x[:, 0] + 0.5 * rng.standard_normal(60), NAMES[:4], options=SelectionOptions(1e-6, 1e-5))
+    new = rng.standard_normal((4000, 4))
+    _, lower, upper = fit.predict(new)
+    y = new[:, 0] + 0.5 * rng.standard_normal(4000)
+    assert 0.90 < ((lower <= y) & (y <= upper)).mean() < 0.99
+
+
+def test_selection_makes_p_optimistic_and_leaving_out_tells() -> None:
+    significant, worse = 0, 0
+    for seed in range(10):
+        x = candidates(100 + seed)
+        y = np.random.default_rng(seed).standard_normal(50)  # has nothing to do with x
+        fit = stepwise(x, y, NAMES)
+        significant += fit.p_value < 0.05
+        held_out = leave_one_out(x, y, NAMES) - y
+        worse += np.sqrt(np.mean(held_out**2)) > np.std(y)
+    assert significant >= 8 and worse >= 8
+
+
+def test_leaving_out_means_that_the_sample_has_no_say() -> None:
+    x = candidates(6, count=8)
+    y = x[:, 2] + 0.2 * np.random.default_rng(6).standard_normal(50)
+    before = leave_one_out(x, y, NAMES[:8])
+    y[7] += 100.0
+    after = leave_one_out(x, y, NAMES[:8])
+    assert after[7] == pytest.approx(before[7], rel=1e-12)
+    assert np.abs(np.delete(after - before, 7)).max() > 1.0
+
+
+def test_an_unexplained_response_gives_the_mean_alone() -> None:
+    x = candidates(7, count=2)
+    y = np.random.default_rng(8).standard_normal(50)
+    fit = stepwise(x, y, NAMES[:2], options=SelectionOptions(1e-9, 1e-8))
+    assert fit.variables == () and (fit.f_statistic, fit.p_value, fit.adjusted_r2) == (0.0, 1.0, 0.0)
+    assert fit.predict(x)[0] == pytest.approx(np.full(50, y.mean()))
+
+
+def test_an_exact_relation_is_found_and_ends_there() -> None:
+    x = candidates(9)
+    fit = stepwise(x, 3.0 + 2.0 * x[:, 5], NAMES)
+    assert fit.variables[0] == "x5" and fit.predict(x)[0] == pytest.approx(3.0 + 2.0 * x[:, 5])
+
+
+def test_freedom_is_left_however_mild_the_thresholds() -> None:
+    x = candidates(10)
+    y = np.random.default_rng(11).standard_normal(50)
+    fit = stepwise(x, y, NAMES, options=SelectionOptions(0.98, 0.99, freedom_min=20))
+    assert fit.n - fit.k - 1 >= 20 and fit.k > 10
+
+
+def _duplicate(x: np.ndarray) -> None:
+    x[:, 3] = 2.0 - 5.0 * x[:, 1]
+
+
+def _sum(x: np.ndarray) -> None:
+    x[:, 3] = x[:, 0] + x[:, 1] - x[:, 2]
+
+
+def _constant(x: np.ndarray) -> None:
+    x[:, 2] = 0.7
+
+
+def _gap(x: np.ndarray) -> None:
+    x[4, 1] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "words"),
+    [
+        (_duplicate, CollinearError, "x1 and x3 are proportional"),
+        (_sum, CollinearError, "the other candidates determine x"),
+        (_constant, CollinearError, "x2 is the same for all samples"),
+        (_gap, ValueError, "candidate x1, sample 5: not finite"),
+    ],
+)
+def test_candidates_refused(spoil: Any, error: type[Exception], words: str) -> None:
+    x = candidates(12, count=5)
+    y = x[:, 0].copy()
+    spoil(x)
+    with pytest.raises(error, match=words):
+        stepwise(x, y, NAMES[:5])
+
+
+def test_dependent_candidates_are_never_selected_together_when_samples_are_few() -> None:
+    x = candidates(13, n=30, count=40)
+    x[:, 3] = x[:, 0] + x[:, 1]
+    y = x[:, 3] + 0.01 * np.random.default_rng(14).standard_normal(30)
+    fit = stepwise(x, y, NAMES[:40])
+    assert not {"x0", "x1", "x3"} <= set(fit.variables)
+    assert np.isfinite(fit.standard_errors).all()
+
+
+def test_other_bad_input_is_refused_in_words() -> None:
+    x, y = candidates(15, count=4), np.arange(50.0)
+    with pytest.raises(TooFewSamplesError, match=r"11 samples: .* need at least 12"):
+        stepwise(x[:11], y[:11], NAMES[:4])
+    with pytest.raises(TooFewSamplesError, match="11 samples"):
+        leave_one_out(x[:12], y[:12], NAMES[:4])
+    with pytest.raises(ValueError, match="the response is the same for all samples"):
+        stepwise(x, np.full(50, 3e-8), NAMES[:4])
+    with pytest.raises(ValueError, match="response of sample 1: not finite"):
+        stepwise(x, np.full(50, np.nan), NAMES[:4])
+    with pytest.raises(ValueError, match="4 names"):
+        stepwise(x, y[:-1], NAMES[:4])
+    with pytest.raises(ValueError, match="unique"):
+        stepwise(x, y, ["a", "a", "b", "c"])
+    with pytest.raises(ValueError, match="weights: must be 50 finite numbers above 0"):
+        stepwise(x, y, NAMES[:4], np.zeros(50))
+    with pytest.raises(ValueError, match=r"p_enter = 1\.5: must be above 0 and below 1"):
+        SelectionOptions(p_enter=1.5)
+    with pytest.raises(ValueError, match=r"p_remove = 0\.01: must be at least p_enter = 0\.05"):
+        SelectionOptions(p_remove=0.01)
+    with pytest.raises(ValueError, match="freedom_min = 0"):
+        SelectionOptions(freedom_min=0)
+    for arguments in ((3.0, 50, 0), (3.0, 7, 6), (-1.0, 50, 6)):
+        with pytest.raises(ValueError, match="must be"):
+            adjusted_r2_of_f(*arguments)

@@ -1,0 +1,80 @@
+"""`dm paper`: the paper's tables and figures on the virtual bench, beside the paper's own values."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dm_controller.cli.output import JsonOption, console, nanometres, progress_bar, write_json
+
+
+def show(results: Any) -> None:
+    """Print the main figures."""
+    import numpy as np
+    from rich.table import Table
+
+    from dm_controller.paper import reported
+    from dm_controller.paper.regressions import TAKEN, relative_errors
+
+    table = Table(title=f"regression of the surface control error, reading {TAKEN.value!r}, beside the paper's")
+    for heading in ("model", "adj. R²", "paper", "held-out rms nm", "worst RelErr %", "paper"):
+        table.add_column(heading, justify="left" if heading == "model" else "right")
+    for model, regression in results.standard.regressions.taken.items():
+        table.add_row(
+            model,
+            f"{regression.table2.adjusted_r2:.3f}",
+            f"{reported.TABLE_2[model].adj_r2:.3f}",
+            f"{nanometres(regression.table2.leave_one_out_rms):.2f}",
+            f"{100 * np.nanmax(relative_errors(regression)):.2f}",
+            f"{max(pair[model].rel_err_pct for pair in reported.TABLE_3.values()):.2f}",
+        )
+    console.print(table)
+    console.print(
+        f"row weights cancel: G changes by {results.standard.samples.weights_cancel:.1e} m per unit signal at most"
+    )
+
+
+def paper(
+    out: Annotated[Path, typer.Option(help="Folder for the page, its pictures and the PDF.")] = Path("runs/paper"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the twin.")] = 1,
+    quick: Annotated[
+        bool, typer.Option(help="A small camera, few spheres and one further twin: under half a minute.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Reproduce the paper: Tables 1-3 and Figs. 4-9 as an HTML page with PNGs and a PDF, beside the paper's values.
+
+    Runs on the virtual bench in process, without nodes: 10 % hysteresis and 1 % creep, and ideal actuators beside it.
+    """
+    from dm_controller.paper.page import write_page
+    from dm_controller.paper.results import PaperOptions, measure
+    from dm_controller.paper.summary import figures_of
+
+    started = time.monotonic()
+    folder = out.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    options = PaperOptions.quick(seed) if quick else PaperOptions.full(seed)
+    with progress_bar() as bar:
+        task = bar.add_task("paper", total=options.steps + 1)
+        begun = False
+
+        def step(what: str) -> None:
+            # A step is told of before it begins, so the bar counts the one before.
+            nonlocal begun
+            bar.update(task, advance=1 if begun else 0, description=what)
+            begun = True
+
+        results = measure(options, step)
+        step("page, pictures and PDF")
+        page, pdf = write_page(results, folder)
+        bar.update(task, description="paper: done", completed=options.steps + 1)
+    show(results)
+    console.print(f"page: {os.path.relpath(page)}\nPDF: {os.path.relpath(pdf)}")
+    figures = {"quick": quick} | figures_of(results)
+    files = {"html": str(page), "pdf": str(pdf), "pictures": sorted(path.name for path in folder.glob("*.png"))}
+    write_json(json, figures | {"files": files, "seconds": time.monotonic() - started})
+    console.print(f"done in {time.monotonic() - started:.0f} s")

@@ -1,0 +1,1 @@
+"""Experiments on the virtual bench, in process and without ROS: the methods side by side, the paper's tables."""

@@ -1,0 +1,298 @@
+"""The virtual bench in process: the twin's mirror, electronics and interferometer without sockets, files or waiting.
+
+Implements `dm_calibration.procedure.Bench`, so calibrations and closed loops on it run the code they run on hardware.
+What a seed stands for is the same as on the bench behind the sockets: gains, initial figure and noise.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.mirror import Mirror
+from dm_calibration.influence.surfaces import LinearModel
+from dm_calibration.optics.aperture import Aperture, configured_aperture
+from dm_calibration.optics.map_fit import MapFitter
+from dm_calibration.optics.sampling import edge_clustered_points, sample_map
+from dm_calibration.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure import Measurement, Procedure, ProcedureOptions, Progress
+from dm_controller.model import InfluenceModel
+from dm_controller.solvers.bounded import Limits
+from dm_driver.degauss import degauss_waypoints
+from dm_driver.safety_limiter import Limits as DriverLimits
+from dm_driver.safety_limiter import SafetyLimiter
+from dm_driver.virtual.drive_unit import EDAC40_FULL_SCALE, DriveConfig, DriveUnit
+from dm_driver.virtual.frames import EDAC40_VALUE, EdacFrame
+from dm_driver.virtual.interferometer import Interferometer, InterferometerConfig
+from dm_driver.virtual.piezo import PiezoActuators, PiezoConfig
+from dm_driver.virtual.plate import Plate, PlateConfig, neighbour_pairs
+from dm_driver.volts import VoltScale
+
+Floats = NDArray[np.float64]
+
+#: Pixels of the instrument that speck counts are stated for.
+FULL_CAMERA = InterferometerConfig().pixels
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """Which twin, and how it is operated.
+
+    Attributes:
+        law: hysteresis law: none, prandtl_ishlinskii, preisach or bouc_wen.
+        seed: of gains, figure and noise.
+        hysteresis: loop opening as a share of the stroke.
+        creep: per decade of time.
+        pixels: the camera has pixels x pixels; a small one is quicker, its terms hardly noisier, for the low-order
+            noise of an interferometer does not average out.
+        samples: sampling points.
+        settle_time: between command and map, s.
+        exposure: one map takes this long, s.
+        degauss_steps: half-swings of a degauss.
+        neighbour_difference: largest difference between neighbours, normalised.
+    """
+
+    law: str = "prandtl_ishlinskii"
+    seed: int = 1
+    hysteresis: float = 0.10
+    creep: float = 0.01
+    pixels: int = 236
+    samples: int = 500
+    settle_time: float = 0.5
+    exposure: float = 0.5
+    degauss_steps: int = 100
+    neighbour_difference: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.pixels < 64:
+            raise ValueError(f"pixels = {self.pixels}: must be at least 64, or the terms cannot be told apart well")
+        for name in ("settle_time", "exposure"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"{name} = {getattr(self, name)} s: must not be negative")
+        if self.degauss_steps < 1:
+            raise ValueError(f"degauss_steps = {self.degauss_steps}: must be at least 1")
+
+
+class TwinBench:
+    """One twin with its time, which only waits and maps advance.
+
+    Raises:
+        ValueError: a configuration that makes no sense, naming the parameter.
+
+    Attributes:
+        mirror: what the calibration is told of it.
+        limits: what solvers are told of it.
+        time: s since the start.
+        maps: maps taken so far.
+    """
+
+    def __init__(self, config: TwinConfig | None = None) -> None:
+        self.config = config = config or TwinConfig()
+        gains, figure, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(config.seed).spawn(3))
+        self.plate = Plate(PlateConfig())
+        self._drive = DriveUnit(DriveConfig())
+        drive = self._drive.config
+        self._scale = VoltScale(
+            EDAC40_FULL_SCALE,
+            drive.dac_volts_at_zero,
+            drive.dac_volts_at_full,
+            drive.amplifier_gain,
+            drive.volts_min,
+            drive.volts_max,
+        )
+        self._channels = np.asarray(drive.wiring)
+        piezo = PiezoConfig(law=config.law, hysteresis=config.hysteresis, creep=config.creep)
+        self._piezo = PiezoActuators(piezo, gains, self._drive.signals(), 0.0)
+        share = (config.pixels / FULL_CAMERA) ** 2
+        camera = InterferometerConfig(pixels=config.pixels, specks=round(InterferometerConfig().specks * share))
+        self._interferometer = Interferometer(camera, self.plate, figure, noise)
+        self._noise = noise
+        self._points = edge_clustered_points(config.samples)
+        pairs = neighbour_pairs(self.plate.x, self.plate.y)
+        self._limiter = SafetyLimiter(
+            DriverLimits(
+                actuators=len(self.plate.x),
+                neighbour_difference=config.neighbour_difference,
+                neighbour_a=pairs[:, 0],
+                neighbour_b=pairs[:, 1],
+            )
+        )
+        self._fitter: MapFitter | None = None
+        self._written: Floats = self._drive.signals()
+        self.time = 0.0
+        self.maps = 0
+        self.mirror = Mirror(
+            "PDM30-37",
+            f"twin-{config.seed}",
+            self.plate.x,
+            self.plate.y,
+            camera.field_diameter / 2,
+            neighbours=pairs,
+            neighbour_difference_max=config.neighbour_difference,
+        )
+        self.limits = Limits(-1.0, 1.0, pairs, config.neighbour_difference)
+
+    def fork(self) -> TwinBench:
+        """A second bench in exactly this state, noise to come included, so that methods can be compared."""
+        other = copy.copy(self)
+        other._drive, other._piezo = copy.deepcopy(self._drive), copy.deepcopy(self._piezo)
+        other._noise = copy.deepcopy(self._noise)
+        # The plate and the camera's polynomials never change and are shared.
+        other._interferometer = copy.copy(self._interferometer)
+        other._interferometer._noise = other._noise
+        other._fitter = None
+        return other
+
+    # --- dm_calibration.procedure.Bench ---
+
+    def degauss(self) -> None:
+        """Wipe the hysteresis memory as the driver does, and end at mid range."""
+        rest = self.mirror.rest
+        points = degauss_waypoints(len(rest), float(rest[0]), 1.0, self.config.degauss_steps, rest)
+        self._write(list(self._limiter.path(self._written, points)))
+
+    def apply(self, signals: Floats) -> Floats:
+        """Ramp to `signals` (N,) by the driver's limiter, through the codes of the DAC; returns what was written.
+
+        Raises:
+            dm_driver.refusal.Refusal: signals that the driver would refuse.
+        """
+        target = self._limiter.check_shape(signals)
+        self._write(list(self._limiter.ramp(self._written, target)))
+        return self._drive.signals()
+
+    def _write(self, shapes: list[Floats]) -> None:
+        for shape in shapes:
+            self._drive.take_edac40(EdacFrame(EDAC40_VALUE, self._channels, self._scale.codes(shape)))
+            self._piezo.apply(self._drive.signals(), self.time)
+            self.time += self._limiter.pause_after(self._written, shape)
+            self._written = shape
+
+    def settle(self) -> bool:
+        """Let the settle time pass."""
+        self.time += self.config.settle_time
+        return True
+
+    def measure(self, label: str) -> Measurement:
+        """Take one map, fit and sample it as the interferometer node does a file."""
+        self.time += self.config.exposure
+        self.maps += 1
+        return self.measurement_of(self.take_map())
+
+    # --- the map itself ---
+
+    def take_map(self) -> Floats:
+        """One noisy map (pixels, pixels), m, at this moment; row 0 = top, NaN = no data."""
+        self._piezo.advance(self.time)
+        return self._interferometer.measure(self._piezo.displacement)
+
+    def true_map(self) -> Floats:
+        """The noise-free surface (pixels, pixels), m, at this moment: for judging only."""
+        self._piezo.advance(self.time)
+        return self._interferometer.true_sag(self._piezo.displacement)
+
+    @property
+    def pitch(self) -> float:
+        """m per pixel."""
+        return self._interferometer.pitch
+
+    @property
+    def aperture(self) -> Aperture:
+        """The working aperture on the maps."""
+        pixels = self.config.pixels
+        return configured_aperture((pixels, pixels), self.pitch, self.mirror.working_radius)
+
+    def measurement_of(self, sag: Floats) -> Measurement:
+        """Fit and sample a map: the same steps as `dm_calibration.ingest.Ingest`, without a file."""
+        aperture = self.aperture
+        valid = np.isfinite(sag)
+        if self._fitter is None or not self._fitter.fits(valid, aperture):
+            self._fitter = MapFitter(valid, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
+        fit = self._fitter.fit(sag)
+        samples = sample_map(sag, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px, self._points)
+        return Measurement(
+            points=self._points,
+            sag=samples,
+            coefficients=fit.coefficients,
+            sigma=fit.sigma,
+            stamp_ns=round(self.time * 1e9),
+            residual_rms=fit.residual_rms,
+            valid_fraction=fit.valid_fraction,
+            radius=aperture.radius_px * self.pitch,
+            wavelength=self._interferometer.config.wavelength,
+        )
+
+    def true_influence(self) -> tuple[Floats, Floats]:
+        """(V, N) m per m of base displacement at the valid pixels, and the initial figure (V,) m: for judging only."""
+        count = len(self.plate.x)
+        inside = self._interferometer.aperture
+        figure = self._interferometer.true_sag(np.zeros(count))[inside]
+        columns = [self._interferometer.true_sag(unit)[inside] - figure for unit in np.eye(count)]
+        return np.column_stack(columns), figure
+
+    @property
+    def true_stroke(self) -> Floats:
+        """(N,) largest base displacement from mid range of each actuator, m: for judging only."""
+        config = self._piezo.config
+        return np.asarray(0.5 * config.stroke * self._piezo.gain)
+
+    # --- calibration ---
+
+    def calibrate(
+        self,
+        kind: PlanKind = PlanKind.FULL,
+        plan_options: PlanOptions | None = None,
+        options: ProcedureOptions | None = None,
+        *,
+        model: LinearModel | None = None,
+        progress: Callable[[Progress], None] = lambda progress: None,
+    ) -> Calibration:
+        """Run a plan and fit it, as the node `calibration` does, and go back to mid range.
+
+        Raises:
+            TooFewMapsError, BenchError, ValueError: as `Procedure` and `evaluate`.
+        """
+        options = options or ProcedureOptions()
+        plan = make_plan(kind, self.mirror, plan_options)
+        procedure = Procedure(plan, self.mirror, self, options, model=model, progress=progress)
+        try:
+            procedure.run()
+        finally:
+            self.apply(self.mirror.rest)
+        provenance = Provenance(f"{self.mirror.serial}-{self.config.law}", round(self.time * 1e9))
+        return evaluate(procedure.outcome, self.mirror, options.fit, provenance)[0]
+
+
+def plan_steps(kind: PlanKind = PlanKind.FULL, options: PlanOptions | None = None) -> int:
+    """Steps of a plan on the twin's mirror, for progress bars."""
+    plate = Plate(PlateConfig())
+    mirror = Mirror(
+        "PDM30-37", "", plate.x, plate.y, InterferometerConfig().field_diameter / 2,
+        neighbours=neighbour_pairs(plate.x, plate.y),
+    )  # fmt: skip
+    return len(make_plan(kind, mirror, options).steps)
+
+
+def influence_model(fit: InfluenceFit, aperture_radius: float) -> InfluenceModel:
+    """The model that the focus controller would make of a calibration's message."""
+    return InfluenceModel(
+        aperture_radius=aperture_radius,
+        influence_zernike=fit.influence_zernike,
+        zernike_offset=fit.zernike_offset,
+        sample_x=fit.points.x,
+        sample_y=fit.points.y,
+        sample_weight=fit.points.weight,
+        influence_sag=fit.influence_sag,
+        sag_offset=fit.sag_offset,
+        in_sample_rms=fit.in_sample_rms,
+        held_out_rms=fit.held_out_rms,
+        held_out_max_zernike=fit.held_out_max_zernike,
+        maps_used=int(fit.used.sum()),
+    )

@@ -1,0 +1,1 @@
+"""The paper's tables and figures, made on the virtual bench and set beside the paper's own values."""

@@ -1,0 +1,207 @@
+"""A page of sections with tables and pictures, written as HTML with PNGs and as PDF. Knows nothing of mirrors."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from string import Template
+
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+
+PNG_DPI = 110
+#: A4 upright, inches.
+PAGE = (8.27, 11.69)
+MARGIN = 0.08
+#: Height of a line of body text and of a table row, as a share of a PDF page.
+LINE, ROW = 0.0155, 0.019
+#: Characters on a line of body text of a PDF page.
+CHARACTERS = 104
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a header; the first column is a name, the others are set to the right."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.header):
+                raise ValueError(f"{self.caption}: a row of {len(row)} cells under {len(self.header)} headings")
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A figure; `name` is the stem of its file."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A heading with paragraphs, then tables, then pictures."""
+
+    title: str
+    paragraphs: Sequence[str]
+    tables: Sequence[Table] = ()
+    pictures: Sequence[Picture] = ()
+
+
+_PAGE = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title</title>
+<style>
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff; max-width: 68rem; margin: 2rem auto;
+  padding: 0 1rem; }
+p { max-width: 48rem; }
+h1 { font-size: 1.6rem; line-height: 1.25; }
+h2 { font-size: 1.25rem; margin-top: 2.6rem; border-top: 1px solid #ccc; padding-top: 1rem; }
+nav a { margin-right: 1rem; white-space: nowrap; }
+.scroll { overflow-x: auto; margin: 1rem 0; }
+table { border-collapse: collapse; font-size: 0.88rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; font-weight: 600; padding-bottom: 0.4rem; }
+th, td { padding: 0.22rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; }
+th:first-child, td:first-child { text-align: left; }
+thead th { border-bottom: 2px solid #555; vertical-align: bottom; }
+figure { margin: 1.2rem 0; }
+figure img { max-width: 100%; height: auto; }
+figcaption { font-size: 0.88rem; color: #444; max-width: 48rem; }
+</style>
+</head>
+<body>
+<h1>$title</h1>
+<nav>$links</nav>
+$sections
+</body>
+</html>
+""")
+
+
+def write_html(folder: Path, title: str, sections: Sequence[Section]) -> Path:
+    """Write `index.html` and its pictures into `folder`; returns the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    parts, links = [], []
+    for number, section in enumerate(sections, start=1):
+        links.append(f'<a href="#s{number}">{escape(section.title)}</a>')
+        parts.append(f'<section id="s{number}">\n<h2>{escape(section.title)}</h2>')
+        parts += [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
+        parts += [_html_table(table) for table in section.tables]
+        for picture in section.pictures:
+            file = f"{picture.name}.png"
+            picture.figure.savefig(folder / file, dpi=PNG_DPI)
+            # The layout stands now; finding it again for the PDF would take longer than drawing.
+            picture.figure.set_layout_engine("none")
+            caption = escape(picture.caption)
+            parts.append(
+                f'<figure><img src="{escape(file)}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
+            )
+        parts.append("</section>")
+    page = folder / "index.html"
+    page.write_text(_PAGE.substitute(title=escape(title), links="\n".join(links), sections="\n".join(parts)))
+    return page
+
+
+def _html_table(table: Table) -> str:
+    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.header)
+    body = "\n".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in table.rows)
+    return (
+        f'<div class="scroll"><table><caption>{escape(table.caption)}</caption>\n'
+        f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def write_pdf(path: Path, title: str, sections: Sequence[Section]) -> Path:
+    """Write all sections to a PDF: pages of text and tables, each followed by its pictures, one to a page."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Without a date, the same run gives the same file.
+    with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as pages:
+        paper = _Paper(pages, title)
+        for section in sections:
+            paper.text(section.title, size=13, weight="bold", keep=4)
+            for paragraph in section.paragraphs:
+                paper.text(paragraph)
+            for table in section.tables:
+                paper.table(table)
+            if section.pictures:
+                paper.end()
+            for picture in section.pictures:
+                pages.savefig(picture.figure)
+        paper.end()
+    return path
+
+
+class _Paper:
+    """Text from the top of a page downwards, on as many pages as it takes."""
+
+    def __init__(self, pages: PdfPages, title: str) -> None:
+        self._pages = pages
+        self._page: Figure | None = None
+        self._y = 0.0
+        self.text(title, size=15, weight="bold")
+
+    def end(self) -> None:
+        """Finish the page, if one was begun."""
+        if self._page is not None:
+            self._pages.savefig(self._page)
+        self._page = None
+
+    def _room(self, height: float) -> Figure:
+        """The page, a new one unless `height` is left on it."""
+        if self._page is None or self._y - height < MARGIN:
+            self.end()
+            self._page, self._y = Figure(figsize=PAGE), 1.0 - MARGIN
+        return self._page
+
+    def text(self, text: str, size: float = 9.5, weight: str = "normal", keep: int = 0) -> None:
+        """A paragraph; `keep` lines must fit below it on the same page."""
+        rows = textwrap.wrap(text, int(CHARACTERS * 9.5 / size))
+        line = LINE * size / 9.5
+        self._room(line * (len(rows) + 1) + LINE * keep)
+        for row in rows:
+            self._room(line).text(MARGIN, self._y, row, fontsize=size, fontweight=weight, va="top")
+            self._y -= line
+        self._y -= 0.6 * line
+
+    def table(self, table: Table) -> None:
+        """A table whose columns are as wide as their longest cell."""
+        widths = [max(len(row[k]) for row in (table.header, *table.rows)) for k in range(len(table.header))]
+        size = min(8.0, 8.0 * 92 / (sum(widths) + 2 * len(widths)))
+        right = [MARGIN + edge for edge in _edges(widths)]
+        self.text(table.caption, size=9.0, weight="bold", keep=min(len(table.rows) + 2, 12))
+        for number, row in enumerate((table.header, *table.rows)):
+            page = self._room(ROW)
+            for k, cell in enumerate(row):
+                page.text(
+                    MARGIN if k == 0 else right[k],
+                    self._y,
+                    cell,
+                    fontsize=size,
+                    fontweight="bold" if number == 0 else "normal",
+                    ha="left" if k == 0 else "right",
+                    va="top",
+                )
+            self._y -= ROW
+        self._y -= ROW
+
+
+def _edges(widths: Sequence[int]) -> list[float]:
+    """Right edges of columns of these widths in characters, as shares of the page beyond the margin."""
+    total = sum(widths) + 2 * len(widths)
+    span = min(1.0 - 2 * MARGIN, total * 0.0093)
+    edges, used = [], 0
+    for width in widths:
+        used += width + 2
+        edges.append(span * used / total)
+    return edges

@@ -1,0 +1,35 @@
+"""The page: all sections in the order of the paper, as HTML with pictures and as PDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dm_controller.paper import content, content_control, content_regressions
+from dm_controller.paper.document import Section, write_html, write_pdf
+from dm_controller.paper.results import Results
+
+TITLE = "Flexible spherical/aspherical surface control: the paper's tables and figures on the virtual bench"
+
+
+def sections(results: Results) -> list[Section]:
+    """All sections, in the order of the paper."""
+    return [
+        content.introduction(results),
+        content.table_1(results),
+        content.figure_4(results),
+        content.figure_5(results),
+        content.weights(results),
+        content_regressions.table_2(results),
+        content_regressions.table_3(results),
+        content_control.controlled_surfaces(results),
+        content_control.coefficient_errors(results),
+        content_control.conics(results),
+        content_control.readings(results),
+        content_control.claims(results),
+    ]
+
+
+def write_page(results: Results, folder: Path) -> tuple[Path, Path]:
+    """Write `index.html` with its PNGs and `paper.pdf` into `folder`; returns both."""
+    made = sections(results)
+    return write_html(folder, TITLE, made), write_pdf(folder / "paper.pdf", TITLE, made)

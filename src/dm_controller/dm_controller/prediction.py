@@ -1,0 +1,141 @@
+"""The residual to expect of a focus command, with an interval that knows of the actuators' memory.
+
+An influence function predicts a residual as if actuators had no memory. Service `predict_error` of the calibration node
+tells the error of a command over many histories. Its answers for some commands over the reachable range are fetched
+once per calibration, in the background; what they hold beyond the influence function's own error is the share of the
+memory, which then only has to be looked up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ErrorCode
+from dm_msgs.srv import PredictError
+from numpy.typing import NDArray
+from rclpy.node import Node
+
+from dm_calibration.optics.zernike import basis
+from dm_controller.conversions import doubles
+from dm_controller.model import CalibratedMirror, InfluenceModel
+from dm_controller.target import FocusTarget
+
+Floats = NDArray[np.float64]
+
+#: Number of curvatures over the reachable range for which the memory's share is fetched.
+GRID = 11
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Rms residual to expect, with a 95 % interval; m."""
+
+    rms: float
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True, eq=False)
+class MemoryShare:
+    """Mean square residual that the actuators' memory adds, over curvature.
+
+    Attributes:
+        curvature: (K,) 1/m, rising.
+        square: (K, 3) m^2: mean, lower and upper end of the 95 % interval.
+    """
+
+    curvature: Floats
+    square: Floats
+
+    def forecast(self, curvature: float, model_rms: float) -> Forecast:
+        """The residual to expect: what the influence function predicts (`Plan.rms`, m) and the memory, independent."""
+        squares = [np.interp(curvature, self.curvature, column) + model_rms**2 for column in self.square.T]
+        rms, lower, upper = (float(value) for value in np.sqrt(squares))
+        return Forecast(rms, lower, upper)
+
+
+def memory_share(curvature: Floats, answers: Floats, modelled: Floats) -> MemoryShare:
+    """From answers of `predict_error` to the share of the memory in them.
+
+    Args:
+        curvature: (K,) 1/m of the commands.
+        answers: (K, 3) m, predicted_rms, lower, upper.
+        modelled: (K,) m, :func:`surface_control_error_rms` of the same commands.
+    """
+    order = np.argsort(curvature)
+    square = np.maximum(np.square(answers) - np.square(modelled)[:, np.newaxis], 0.0)
+    return MemoryShare(curvature[order], square[order])
+
+
+def surface_control_error_rms(model: InfluenceModel, signals: Floats) -> float:
+    """Rms surface control error that figure and influence function alone predict: sag less nominal surface G s, m."""
+    nominal = basis(model.sample_x, model.sample_y) @ (model.influence_zernike @ signals)
+    error = model.sag_offset + model.influence_sag @ signals - nominal
+    root = np.sqrt(model.sample_weight)
+    plane = np.linalg.qr(root[:, np.newaxis] * np.column_stack((np.ones_like(root), model.sample_x, model.sample_y)))[0]
+    weighted = root * error
+    return float(np.linalg.norm(weighted - plane @ (plane.T @ weighted)))
+
+
+class ForecastClient:
+    """Keeps the share of the memory for the calibration in use; nothing here waits.
+
+    Attributes:
+        share: None before all answers are there, and where the calibration has no sample surfaces.
+    """
+
+    def __init__(self, node: Node, on_change: Callable[[], None] = lambda: None) -> None:
+        """`on_change` is called, in the executor, when there is a new share."""
+        self.share: MemoryShare | None = None
+        self._node, self._on_change = node, on_change
+        self._client = node.create_client(PredictError, "predict_error")
+        self._calibration_id = ""
+        self._asked = False
+
+    def use(self, calibration_id: str, mirror: CalibratedMirror | None, curvatures: tuple[float, float]) -> None:
+        """Have the share for this calibration fetched. Call it with every calibration and every request.
+
+        It returns at once. When the calibration node does not answer yet, a later call asks again.
+
+        Args:
+            calibration_id: "" = none.
+            mirror: that calibration's.
+            curvatures: 1/m, range to fetch it for; NaN = nothing is reachable.
+        """
+        if calibration_id != self._calibration_id:
+            self._calibration_id, self._asked, self.share = calibration_id, False, None
+        if self._asked or not calibration_id or mirror is None or not np.isfinite(curvatures).all():
+            return
+        if not self._client.service_is_ready():
+            return
+        self._asked = True
+        grid = np.linspace(*curvatures, GRID)
+        commands = [mirror.plan(FocusTarget(float(curvature))).signals for curvature in grid]
+        modelled = np.array([surface_control_error_rms(mirror.model, signals) for signals in commands])
+        answers = np.full((GRID, 3), np.nan)
+        for row, signals in enumerate(commands):
+            future = self._client.call_async(PredictError.Request(signals=doubles(signals)))
+            future.add_done_callback(
+                lambda done, row=row: self._on_answer(calibration_id, row, done, grid, answers, modelled)
+            )
+
+    def forecast(self, curvature: float, model_rms: float) -> Forecast | None:
+        """See :meth:`MemoryShare.forecast`; None while there is no share."""
+        return None if self.share is None else self.share.forecast(curvature, model_rms)
+
+    def _on_answer(
+        self, calibration_id: str, row: int, future: Any, grid: Floats, answers: Floats, modelled: Floats
+    ) -> None:
+        if calibration_id != self._calibration_id or future.cancelled() or future.exception() is not None:
+            return
+        answer = future.result()
+        if answer.error_code != ErrorCode.OK:
+            self._node.get_logger().info(f"no prediction of the surface error: {answer.message}", once=True)
+            return
+        answers[row] = answer.predicted_rms, answer.lower, answer.upper
+        if np.isfinite(answers).all():
+            self.share = memory_share(grid, answers, modelled)
+            self._on_change()

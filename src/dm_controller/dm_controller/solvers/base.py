@@ -1,0 +1,195 @@
+"""What all solvers have in common: shapes, commands, limits, and one correction step.
+
+A solver knows a mirror by its influence function and does two things: it finds signals for a shape without looking
+(`solve`, open loop), and it improves signals by a measured error (`correct`, one step of a closed loop). Both are the
+same question, "which signals change the surface by this much from here?", so a solver answers that one only.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.sag import remove_piston_tilt
+from dm_calibration.optics.sampling import SamplePoints
+from dm_calibration.optics.zernike import PISTON_TILT, TERM_RMS, basis
+from dm_controller.model import InfluenceModel
+from dm_controller.solvers.bounded import SLACK, Limits
+from dm_controller.target import FocusTarget
+
+Floats = NDArray[np.float64]
+
+#: Terms that an interferometer does not know and focus does not need: they are free in every solve.
+FREE = len(PISTON_TILT)
+#: Share by which an actuator may miss a move: hysteresis of such piezos (the paper's section 1: about 10 %).
+MISS = 0.10
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A surface, or a difference of two, as calibrations describe it.
+
+    Attributes:
+        coefficients: (K,) Born & Wolf, m.
+        sag: (P,) at the calibration's sampling points, m, finite.
+    """
+
+    coefficients: Floats
+    sag: Floats
+
+    def __add__(self, other: Shape) -> Shape:
+        return Shape(self.coefficients + other.coefficients, self.sag + other.sag)
+
+    def __sub__(self, other: Shape) -> Shape:
+        return Shape(self.coefficients - other.coefficients, self.sag - other.sag)
+
+    def __neg__(self) -> Shape:
+        return Shape(-self.coefficients, -self.sag)
+
+    @property
+    def max_zernike(self) -> float:
+        """Largest coefficient beyond tilt, m."""
+        return float(np.abs(self.coefficients[FREE:]).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """Signals inside all limits.
+
+    Attributes:
+        signals: (N,) normalised.
+        overflow: how far the signals that the method asked for lay outside the limits, normalised; 0 = nowhere. What
+            was cut off is missing from the surface.
+    """
+
+    signals: Floats
+    overflow: float = 0.0
+
+
+def points_of(model: InfluenceModel) -> SamplePoints:
+    """The sampling points of a model."""
+    return SamplePoints(model.sample_x, model.sample_y, model.sample_weight)
+
+
+def target_shape(target: FocusTarget, model: InfluenceModel) -> Shape:
+    """The wanted surface over the aperture of `model`.
+
+    Raises:
+        TargetError: no such surface exists over the aperture.
+    """
+    radius = model.aperture_radius
+    return Shape(target.coefficients(radius), target.sag(model.sample_x, model.sample_y, radius))
+
+
+def measured_shape(coefficients: Floats, sag: Floats, model: InfluenceModel) -> Shape:
+    """A measured surface; sampling points without data take the sag of the 21 terms.
+
+    Raises:
+        ValueError: other numbers of terms or points than the model has.
+    """
+    if coefficients.shape != model.zernike_offset.shape or sag.shape != model.sag_offset.shape:
+        raise ValueError(
+            f"the map has {coefficients.size} terms and {sag.size} sampling points, the calibration has "
+            f"{model.zernike_offset.size} and {model.sag_offset.size}: set the interferometer's sample_count to the "
+            "calibration's, or calibrate anew"
+        )
+    terms = basis(model.sample_x, model.sample_y) @ coefficients
+    return Shape(coefficients, np.where(np.isfinite(sag), sag, terms))
+
+
+def rms_sag(shape: Shape, model: InfluenceModel) -> float:
+    """Area-weighted rms sag of a shape, piston and tilt removed, m."""
+    sag = remove_piston_tilt(shape.sag[None, :], points_of(model))[0]
+    return float(np.sqrt(model.sample_weight @ sag**2))
+
+
+class Solver(ABC):
+    """One method on one mirror. See `dm_controller.solvers.registry` for all of them by name."""
+
+    #: Name in messages, tables and files.
+    name: ClassVar[str]
+    #: Where the method comes from.
+    source: ClassVar[str]
+
+    def __init__(self, model: InfluenceModel, limits: Limits) -> None:
+        """Prepare for a mirror.
+
+        Raises:
+            ValueError: a model that the method cannot work on, in words.
+        """
+        self.model = model
+        self.limits = limits
+        self.offset = Shape(model.zernike_offset, model.sag_offset)
+
+    def solve(self, wanted: Shape) -> Command:
+        """Signals for a surface, without measuring (open loop).
+
+        Raises:
+            ValueError: a shape of other size than the model's, or not finite.
+        """
+        self._check(wanted)
+        return self.limited(self._signals(self._start(), wanted - self.offset))
+
+    def correct(self, signals: Floats, error: Shape) -> Command:
+        """Better signals after `signals` were seen to leave `error` = measured minus wanted (one closed-loop step).
+
+        Raises:
+            ValueError: signals or a shape of other size than the model's, or not finite.
+        """
+        self._check(error)
+        self._check_signals(signals)
+        return self.limited(self._signals(signals, -error))
+
+    @abstractmethod
+    def _signals(self, start: Floats, change: Shape) -> Floats:
+        """Signals (N,), inside the limits or not, that change the surface by `change` from where `start` holds it."""
+
+    def _start(self) -> Floats:
+        """Signals at which the model's offset is the surface."""
+        return np.zeros(self.model.influence_zernike.shape[1])
+
+    def _check(self, shape: Shape) -> None:
+        for name, value, size in (
+            ("coefficients", shape.coefficients, self.model.zernike_offset.size),
+            ("sag", shape.sag, self.model.sag_offset.size),
+        ):
+            if value.shape != (size,) or not np.isfinite(value).all():
+                raise ValueError(f"{name}: must be {size} finite numbers, as many as the calibration has")
+
+    def _check_signals(self, signals: Floats) -> None:
+        count = self.model.influence_zernike.shape[1]
+        if signals.shape != (count,) or not np.isfinite(signals).all():
+            raise ValueError(f"signals: must be {count} finite numbers, one per actuator")
+
+    def limited(self, signals: Floats) -> Command:
+        """Cut signals to the range, then draw them together about their mean until neighbours keep their limit."""
+        limits = self.limits
+        result = np.clip(signals, limits.low, limits.high)
+        if not limits.allow_neighbours(result):
+            largest = np.abs(result[limits.pairs[:, 0]] - result[limits.pairs[:, 1]]).max()
+            result = result.mean() + (limits.neighbour_difference / largest) * (result - result.mean())
+        overflow = float(np.abs(signals - result).max())
+        return Command(result, overflow if overflow > SLACK else 0.0)
+
+
+def normalised_terms(model: InfluenceModel) -> tuple[Floats, Floats]:
+    """The influence function without piston and tilt in rms-normalised terms, (K - 3, N), and the factors (K - 3,).
+
+    A unit of each term is then the same rms sag, so that a norm of coefficients is an rms error.
+    """
+    factors = TERM_RMS[FREE : len(model.zernike_offset)]
+    return factors[:, None] * model.influence_zernike[FREE:], factors
+
+
+def miss_rows(matrix: Floats) -> Floats:
+    """(N, N) rows that make least squares shun moves whose miss would cost more than they mend.
+
+    When each actuator misses its move Δs_i by an independent share of MISS, the expected squared error of min|MΔs - b|²
+    grows by MISS² Σ |M_i|² Δs_i², M_i the columns: rows MISS |M_i| under M. Without them a correction chases sag that
+    only large, opposed moves of neighbours can mend, and their misses disturb the low orders by more than was won.
+    """
+    return np.diag(MISS * np.linalg.norm(matrix, axis=0))

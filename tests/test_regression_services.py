@@ -1,0 +1,188 @@
+"""Services `fit_regression` and `predict_error` of the node `calibration`, and the controller's use of them."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dm_msgs.msg import ErrorCode, MirrorInfo
+from dm_msgs.srv import FitRegression, LoadCalibration, PredictError
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.weights import surface_control_error
+from dm_calibration.store import CalibrationStore
+from dm_controller.model import CalibratedMirror, InfluenceModel
+from dm_controller.prediction import ForecastClient, memory_share, surface_control_error_rms
+from dm_controller.solvers.bounded import Limits
+from dm_runtime import qos
+from linear_mirror import RADIUS
+from remembering_mirror import MIRROR, calibrated, calibrated_by_pokes
+from support import NodeProcess, Observer, wait_until
+
+
+def doubles(values: np.ndarray) -> array[float]:
+    return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+def stored(identifier: str, maps: MapSet, fit: InfluenceFit, created_ns: int) -> Calibration:
+    return Calibration(
+        id=identifier,
+        mirror_name=MIRROR.name,
+        mirror_serial=MIRROR.serial,
+        wavelength=632.8e-9,
+        aperture_radius=RADIUS,
+        created_ns=created_ns,
+        actuator_x=MIRROR.x,
+        actuator_y=MIRROR.y,
+        maps=maps,
+        fit=fit,
+    )
+
+
+def model_of(fit: InfluenceFit) -> InfluenceModel:
+    return InfluenceModel(
+        RADIUS,
+        fit.influence_zernike,
+        fit.zernike_offset,
+        fit.points.x,
+        fit.points.y,
+        fit.points.weight,
+        fit.influence_sag,
+        fit.sag_offset,
+        fit.in_sample_rms,
+        fit.held_out_rms,
+        fit.held_out_max_zernike,
+        len(fit.used),
+    )
+
+
+@pytest.fixture
+def node(start: Callable[..., NodeProcess], observer: Observer, tmp_path: Path) -> NodeProcess:
+    store = CalibrationStore(tmp_path / "calibrations")
+    store.save(stored("pokes", *calibrated_by_pokes(), 1))
+    store.save(stored("whole", *calibrated(), 2))
+    process = start("dm_calibration", "calibration", {"calibration_folder": str(store.folder)})
+    message = MirrorInfo(name=MIRROR.name, serial=MIRROR.serial, actuators=MIRROR.actuators)
+    message.actuator_x, message.actuator_y = doubles(MIRROR.x), doubles(MIRROR.y)
+    message.working_aperture_diameter = 2.0 * RADIUS
+    message.signal_min, message.signal_max, message.neighbour_difference_max = -1.0, 1.0, 2.0
+    publisher = observer.node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
+    publisher.publish(message)
+    return process
+
+
+def load(observer: Observer, name: str) -> None:
+    def loaded() -> bool:
+        answer = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=name))
+        return bool(answer.error_code == ErrorCode.OK)
+
+    wait_until(loaded, 20, f"{name} loaded")
+
+
+def test_fit_and_predict(node: NodeProcess, observer: Observer) -> None:
+    def fit(**fields: Any) -> Any:
+        return observer.call(FitRegression, "fit_regression", FitRegression.Request(**fields), 30)
+
+    def predict(signals: np.ndarray) -> Any:
+        return observer.call(PredictError, "predict_error", PredictError.Request(signals=doubles(signals)), 30)
+
+    refused = predict(np.zeros(37))
+    assert refused.error_code == ErrorCode.NOT_CALIBRATED and "load one" in refused.message
+    assert fit().error_code == ErrorCode.NOT_CALIBRATED
+
+    load(observer, "whole")
+    signals = np.full(37, -1.0)
+    signals[11] = 1.0
+    first = predict(signals)  # without a regression asked for before
+    assert first.error_code == ErrorCode.OK, first.message
+    assert 0.0 <= first.lower < first.predicted_rms < first.upper < 1e-6
+    answer = fit()
+    assert answer.error_code == ErrorCode.OK, answer.message
+    assert answer.samples == 58 and answer.variables[0] == "model"
+    assert len(answer.parameters) == len(answer.variables) + 1
+    assert answer.adjusted_r2 > 0.9 and 0.0 < answer.held_out_rms < 20e-9 and answer.p_value < 1e-6
+    assert "optimistic" in answer.message
+    again = predict(signals)
+    assert (again.predicted_rms, again.upper) == pytest.approx((first.predicted_rms, first.upper))
+
+    weighted = fit(calibration="whole", method="AZWreg", p_enter=1e-6)
+    assert weighted.error_code == ErrorCode.OK and weighted.message.startswith("AZWreg")
+    changed = predict(signals)
+    assert changed.error_code == ErrorCode.OK and "AZWreg" in changed.message
+    assert changed.predicted_rms != first.predicted_rms
+
+    for fields, code, words in (
+        ({"method": "AZx"}, ErrorCode.UNKNOWN_NAME, "AZreg"),
+        ({"calibration": "nothing"}, ErrorCode.UNKNOWN_NAME, "nothing"),
+        ({"p_enter": 0.2, "p_remove": 0.1}, ErrorCode.INVALID_ARGUMENT, "p_remove = 0.1: must be at least p_enter"),
+        ({"p_enter": float("nan")}, ErrorCode.INVALID_ARGUMENT, "p_enter = nan"),
+        ({"calibration": "pokes"}, ErrorCode.TOO_FEW_MAPS, "calibrate with the plan FULL"),
+    ):
+        wrong = fit(**fields)
+        assert wrong.error_code == code and words in wrong.message, wrong.message
+    assert predict(signals).predicted_rms == changed.predicted_rms  # refusals change nothing
+
+    outside = signals.copy()
+    outside[4] = 1.01
+    for bad, code, words in (
+        (signals[:-1], ErrorCode.INVALID_LENGTH, "36 values, the calibrated mirror needs 37"),
+        (np.where(np.arange(37) == 2, np.nan, signals), ErrorCode.NOT_FINITE, "number 3"),
+        (outside, ErrorCode.OUT_OF_RANGE, "number 5 is 1.01, must be within -1 to 1"),
+    ):
+        wrong = predict(bad)
+        assert wrong.error_code == code and words in wrong.message, wrong.message
+
+    load(observer, "pokes")
+    wrong = predict(signals)
+    assert wrong.error_code == ErrorCode.TOO_FEW_MAPS and "calibration pokes" in wrong.message
+    load(observer, "whole")
+    assert predict(signals).predicted_rms == changed.predicted_rms  # its regression was kept
+    assert "Traceback" not in node.output, node.output
+
+
+def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, observer: Observer) -> None:
+    model = model_of(calibrated()[1])
+    mirror = CalibratedMirror(model, Limits(-1.0, 1.0, np.zeros((0, 2), dtype=np.intp), 2.0))
+    changes: list[None] = []
+    client = ForecastClient(observer.node, lambda: changes.append(None))
+    assert client.forecast(0.01, 5e-9) is None
+    load(observer, "whole")
+
+    def ready() -> bool:
+        client.use("whole", mirror, (-0.02, 0.02))
+        return bool(changes)
+
+    wait_until(ready, 30, node.output)
+    forecast = client.forecast(0.015, 5e-9)
+    assert forecast is not None
+    assert 5e-9 <= forecast.lower < forecast.rms < forecast.upper < 1e-6
+    wider = client.forecast(0.015, 50e-9)
+    assert wider is not None and wider.rms == pytest.approx(np.sqrt(forecast.rms**2 - 25e-18 + 2500e-18))
+    assert len(changes) == 1
+    client.use("", None, (float("nan"), float("nan")))
+    assert client.forecast(0.0, 0.0) is None
+
+
+def test_share_of_the_memory() -> None:
+    share = memory_share(
+        np.array([0.02, 0.0]), np.array([[50e-9, 40e-9, 60e-9], [5e-9, 3e-9, 8e-9]]), np.array([30e-9, 4e-9])
+    )
+    at_end = share.forecast(0.02, 0.0)
+    assert (at_end.rms, at_end.upper) == pytest.approx((40e-9, np.sqrt(2700.0) * 1e-9))
+    assert share.forecast(0.0, 4e-9).rms == pytest.approx(5e-9)
+    assert share.forecast(0.0, 4e-9).lower == pytest.approx(4e-9)  # never below the model's own
+
+
+def test_modelled_error_agrees_with_the_calibrations_own() -> None:
+    maps, fit = calibrated()
+    signals = maps.applied[maps.label.index("p44")]
+    sag = fit.sag_offset + fit.influence_sag @ signals
+    error = surface_control_error(sag[np.newaxis], signals[np.newaxis], fit.influence_zernike, fit.points)[0]
+    expected = np.sqrt(np.sum(fit.points.weight * error**2))
+    assert surface_control_error_rms(model_of(fit), signals) == pytest.approx(expected)
