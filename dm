@@ -39,6 +39,9 @@ On the bench
   up         start the nodes (--config FILE: against hardware; without: with the virtual bench)
   calibrate  measure and store a calibration
   focus      ask for a curvature (or --dioptre): prediction first, then the move
+  compare    all solvers on the same twin, open and closed loop, beside the fitting limit
+  paper      the paper's tables and figures on one bench, as a page
+
   doctor     say what is missing or wrong, and how to cure it
   exec       run any command inside the environment: ./dm exec python my_script.py
 

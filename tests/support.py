@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_controller.suite import own_domain
 from dm_runtime.executor import BackgroundExecutor
+from dm_runtime.worker import answers_arrive
 
 
 def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str = "") -> Any:
@@ -34,10 +35,6 @@ def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str 
 
 
 __all__ = ["NodeProcess", "Observer", "own_domain", "wait_until"]
-
-
-#: A server that answers before it has discovered the client's reader drops the answer.
-DISCOVERY_S = 0.2
 
 
 class NodeProcess:
@@ -115,9 +112,8 @@ class Observer:
         """Call a service and return its response."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(service_type, name)
-            time.sleep(DISCOVERY_S)
         client = self._clients[name]
-        wait_until(client.service_is_ready, timeout_s, f"service {name}")
+        wait_until(lambda: answers_arrive(client, client.service_is_ready), timeout_s, f"service {name}")
         future = client.call_async(request if request is not None else service_type.Request())
         wait_until(future.done, timeout_s, f"answer of {name}")
         return future.result()
@@ -128,9 +124,8 @@ class Observer:
         """Send a goal; return (goal handle, future of the result)."""
         if name not in self._clients:
             self._clients[name] = ActionClient(self.node, action_type, name)
-            time.sleep(DISCOVERY_S)
         client = self._clients[name]
-        wait_until(client.server_is_ready, 15, f"action {name}")
+        wait_until(lambda: answers_arrive(client, client.server_is_ready), 15, f"action {name}")
         accepted = client.send_goal_async(goal, feedback_callback=feedback)
         wait_until(accepted.done, 15, f"acceptance by {name}")
         handle = accepted.result()

@@ -158,7 +158,7 @@ def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, obs
         client.use("whole", mirror, (-0.02, 0.02))
         return bool(changes)
 
-    wait_until(ready, 30, node.output)
+    wait_until(ready, 60, node.output)
     forecast = client.forecast(0.015, 5e-9)
     assert forecast is not None
     assert 5e-9 <= forecast.lower < forecast.rms < forecast.upper < 1e-6

@@ -37,7 +37,7 @@ from sensor_msgs.msg import Image
 
 from dm_runtime import qos
 from dm_runtime.executor import BackgroundExecutor
-from dm_runtime.worker import ServiceCallError, call
+from dm_runtime.worker import ServiceCallError, answers_arrive, call
 
 SERVICES = {
     SetSignals: "set_signals",
@@ -52,8 +52,6 @@ SERVICES = {
 ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus", Converge: "converge"}
 #: Two clients of one process need two names.
 _NUMBERS = itertools.count(1)
-#: Time the nodes may take to discover a new client on a busy machine.
-DISCOVERY_S = 1.0
 
 
 class DeformableMirrorError(Exception):
@@ -86,7 +84,6 @@ class DeformableMirrorClient:
         self._timeout_s = timeout_s
         self._latest: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
-        self._created: dict[str, float] = {}
         for message_type, topic, profile in (
             (MirrorInfo, "mirror_info", qos.LATCHED),
             (Calibration, "calibration", qos.LATCHED),
@@ -165,16 +162,11 @@ class DeformableMirrorClient:
         return self.latest("actuator_state")
 
     def _client(self, interface: Any, name: str) -> Any:
-        """The service or action client of that name, once the other side can have discovered it.
-
-        A server that answers before it knows the client's reader drops the answer, and no API tells whether it does.
-        """
+        """The service or action client of that name."""
         if name not in self._clients:
             is_action = hasattr(interface, "Goal")
-            made = ActionClient(self.node, interface, name) if is_action else self.node.create_client(interface, name)
-            self._clients[name], self._created[name] = made, time.monotonic()
-        elif (missing := self._created[name] + DISCOVERY_S - time.monotonic()) > 0:
-            time.sleep(missing)
+            make = ActionClient if is_action else Node.create_client
+            self._clients[name] = make(self.node, interface, name)
         return self._clients[name]
 
     # --- services ---
@@ -259,7 +251,7 @@ class DeformableMirrorClient:
     ) -> Any:
         """Run a goal to its end. Ctrl-C cancels it first, so that the mirror is left safe."""
         client = self._client(action_type, name)
-        if not self.wait(client.server_is_ready):
+        if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
             raise DeformableMirrorError(503, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
         if not self.wait(accepted.done):

@@ -27,6 +27,7 @@ from dm_controller.converge_action import CONVERGE_PARAMETERS, ConvergeAction
 from dm_controller.conversions import doubles, limits_of, model_of, target_of
 from dm_controller.model import CalibratedMirror, Plan
 from dm_controller.move_focus_action import MoveFocusAction
+from dm_controller.prediction import ForecastClient
 from dm_controller.target import FocusTarget, TargetError
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
@@ -100,6 +101,7 @@ class FocusControllerNode(Node):
         self.create_service(SetFocus, "set_focus", self._on_set_focus)
         self.create_service(Flatten, "flatten", self._on_flatten)
         self._move = MoveFocusAction(self, self._carry_out, self._send, lambda: self._driver, self._values)
+        self._forecast = ForecastClient(self)
         self._converge = ConvergeAction(
             self, self._values, self._decide, lambda: (self._calibration, self._mirror_info)
         )
@@ -148,6 +150,15 @@ class FocusControllerNode(Node):
                 self._not_calibrated = (ErrorCode.CALIBRATION_UNREADABLE, str(error))
                 self.get_logger().error(str(error))
         self._publish_capabilities()
+        self._use_forecast()
+
+    def _use_forecast(self) -> None:
+        """Let the forecast fetch what it lacks for the calibration in use."""
+        if self._calibrated is None or self._calibration is None:
+            self._forecast.use("", None, (0.0, 0.0))
+            return
+        reachable = self._calibrated.reachable_range(FocusTarget(0.0), self._values["reachable_tolerance"])
+        self._forecast.use(self._calibration.id, self._calibrated, reachable)
 
     def _mismatch(self, calibration: Calibration, mirror: MirrorInfo) -> str | None:
         if calibration.mirror_serial != mirror.serial:
@@ -250,6 +261,10 @@ class FocusControllerNode(Node):
         state.signals = doubles(plan.signals)
         state.predicted_rms = plan.rms
         state.predicted_rms_upper = plan.rms_upper
+        self._use_forecast()
+        forecast = self._forecast.forecast(decision.target.curvature, plan.rms)
+        if forecast is not None:  # it knows of the actuators' memory, the influence function does not
+            state.predicted_rms_upper = max(state.predicted_rms_upper, forecast.upper)
         state.predicted_max_zernike = plan.max_zernike
         state.predicted_max_zernike_upper = plan.max_zernike_upper
         state.saturated = bool(plan.saturated.any())

@@ -8,6 +8,7 @@ memory, which then only has to be looked up.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,9 @@ Floats = NDArray[np.float64]
 
 #: Number of curvatures over the reachable range for which the memory's share is fetched.
 GRID = 11
+#: Answers that have not come within this time are asked for again, s: a server that has not discovered the client yet
+#: answers into the void.
+RETRY_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -93,12 +97,14 @@ class ForecastClient:
         self._node, self._on_change = node, on_change
         self._client = node.create_client(PredictError, "predict_error")
         self._calibration_id = ""
-        self._asked = False
+        self._asked_at = -float("inf")
+        self._refused = False
+        self._pending: list[Any] = []
 
     def use(self, calibration_id: str, mirror: CalibratedMirror | None, curvatures: tuple[float, float]) -> None:
         """Have the share for this calibration fetched. Call it with every calibration and every request.
 
-        It returns at once. When the calibration node does not answer yet, a later call asks again.
+        It returns at once. When the calibration node does not answer, a later call asks again.
 
         Args:
             calibration_id: "" = none.
@@ -106,18 +112,25 @@ class ForecastClient:
             curvatures: 1/m, range to fetch it for; NaN = nothing is reachable.
         """
         if calibration_id != self._calibration_id:
-            self._calibration_id, self._asked, self.share = calibration_id, False, None
-        if self._asked or not calibration_id or mirror is None or not np.isfinite(curvatures).all():
+            self._calibration_id, self._refused, self.share = calibration_id, False, None
+            self._asked_at = -float("inf")
+        if self.share is not None or self._refused or time.monotonic() < self._asked_at + RETRY_S:
+            return
+        if not calibration_id or mirror is None or not np.isfinite(curvatures).all():
             return
         if not self._client.service_is_ready():
             return
-        self._asked = True
+        self._asked_at = time.monotonic()
+        for future in self._pending:
+            self._client.remove_pending_request(future)
+        self._pending = []
         grid = np.linspace(*curvatures, GRID)
         commands = [mirror.plan(FocusTarget(float(curvature))).signals for curvature in grid]
         modelled = np.array([surface_control_error_rms(mirror.model, signals) for signals in commands])
         answers = np.full((GRID, 3), np.nan)
         for row, signals in enumerate(commands):
             future = self._client.call_async(PredictError.Request(signals=doubles(signals)))
+            self._pending.append(future)
             future.add_done_callback(
                 lambda done, row=row: self._on_answer(calibration_id, row, done, grid, answers, modelled)
             )
@@ -133,9 +146,11 @@ class ForecastClient:
             return
         answer = future.result()
         if answer.error_code != ErrorCode.OK:
-            self._node.get_logger().info(f"no prediction of the surface error: {answer.message}", once=True)
+            if not self._refused:
+                self._node.get_logger().info(f"no prediction of the surface error: {answer.message}")
+            self._refused = True
             return
         answers[row] = answer.predicted_rms, answer.lower, answer.upper
-        if np.isfinite(answers).all():
+        if self.share is None and np.isfinite(answers).all():
             self.share = memory_share(grid, answers, modelled)
             self._on_change()

@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
@@ -24,6 +25,10 @@ from rclpy.service import Service
 
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
 RESULT_TIMEOUT_S = 10
+
+#: Time that discovery may take on a busy machine from one side to the other.
+DISCOVERY_S = 0.5
+_first_seen: WeakKeyDictionary[Any, float] = WeakKeyDictionary()
 
 
 class ServiceCallError(Exception):
@@ -156,6 +161,18 @@ class WorkerActionServer(ActionServer):
             self._worker_node.executor.create_task(ActionServer.notify_execute, self, goal_handle, finish)
 
 
+def answers_arrive(client: Any, is_ready: Callable[[], bool]) -> bool:
+    """Whether a service or action server is there, and has had time to discover the client in its turn.
+
+    A server that answers before it knows the client's reader drops the answer; no API tells whether it does. So a
+    server counts as there only some time after it was first seen.
+    """
+    if not is_ready():
+        _first_seen.pop(client, None)
+        return False
+    return time.monotonic() >= _first_seen.setdefault(client, time.monotonic()) + DISCOVERY_S
+
+
 def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], bool] = lambda: False) -> Any:
     """Call a service from a worker thread and wait for the answer.
 
@@ -165,7 +182,7 @@ def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[],
         ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, or `cancelled()` became true.
     """
     deadline = time.monotonic() + timeout_s
-    while not client.service_is_ready():
+    while not answers_arrive(client, client.service_is_ready):
         if cancelled():
             raise ServiceCallError(f"{client.srv_name}: cancelled")
         if time.monotonic() > deadline:

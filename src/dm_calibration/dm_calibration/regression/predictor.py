@@ -38,7 +38,7 @@ class ErrorPredictor:
         influence: the influence function that nominal surfaces come from.
         regression: of the reading HISTORY, fitted to all surfaces p01-p58.
         law: of the sag, from all good maps.
-        histories: (COMMANDS, HISTORIES, N) normalised.
+        histories: (1 + COMMANDS, HISTORIES, N) normalised; the first is rest, for creep has died away there.
     """
 
     influence: InfluenceFit
@@ -94,13 +94,15 @@ def fit_predictor(
 
 
 def _histories(maps: MapSet, influence: InfluenceFit, rng: np.random.Generator) -> Floats:
-    """(COMMANDS, HISTORIES, N) random smooth shapes inside the range of signals of the calibration."""
+    """(1 + COMMANDS, HISTORIES, N) rest, then random smooth shapes inside the range of signals of the calibration."""
     low, high = influence.signal_min, influence.signal_max
     middle = 0.5 * (low + high)
     shapes = maps.applied[[name in MODEL_NAMES for name in maps.label]] - middle
     shapes = shapes[np.abs(shapes).max(axis=1, initial=0.0) > 0.0]
-    if not len(shapes):  # no smooth shape is known: every actuator on its own
-        return np.asarray(rng.uniform(low, high, (COMMANDS, HISTORIES, maps.actuators)))
-    largest = shapes * (0.5 * (high - low) / np.abs(shapes).max(axis=1, keepdims=True))
-    chosen = largest[rng.integers(0, len(largest), (COMMANDS, HISTORIES))]
-    return np.asarray(middle + rng.uniform(-1.0, 1.0, (COMMANDS, HISTORIES, 1)) * chosen)
+    if len(shapes):
+        largest = shapes * (0.5 * (high - low) / np.abs(shapes).max(axis=1, keepdims=True))
+        chosen = largest[rng.integers(0, len(largest), (COMMANDS, HISTORIES))]
+        commands = middle + rng.uniform(-1.0, 1.0, (COMMANDS, HISTORIES, 1)) * chosen
+    else:  # no smooth shape is known: every actuator on its own
+        commands = rng.uniform(low, high, (COMMANDS, HISTORIES, maps.actuators))
+    return np.concatenate((np.full_like(commands[:1], middle), commands))

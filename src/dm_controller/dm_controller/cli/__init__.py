@@ -13,6 +13,7 @@ from dm_controller.cli.demo import demo
 from dm_controller.cli.doctor import doctor
 from dm_controller.cli.focus import focus
 from dm_controller.cli.output import fail
+from dm_controller.cli.paper import paper
 from dm_controller.cli.up import up
 
 app = typer.Typer(
@@ -23,7 +24,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for command in (demo, up, calibrate, focus, compare, doctor):
+for command in (demo, up, calibrate, focus, compare, paper, doctor):
     app.command()(command)
 app.command(name="test", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(check)
 

@@ -56,6 +56,8 @@ def paper(
 
     started = time.monotonic()
     folder = out.resolve()
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out {out}: is a file; name a folder, which need not exist yet")
     folder.mkdir(parents=True, exist_ok=True)
     options = PaperOptions.quick(seed) if quick else PaperOptions.full(seed)
     with progress_bar() as bar:
@@ -70,11 +72,15 @@ def paper(
 
         results = measure(options, step)
         step("page, pictures and PDF")
-        page, pdf = write_page(results, folder)
+        written = write_page(results, folder)
         bar.update(task, description="paper: done", completed=options.steps + 1)
     show(results)
-    console.print(f"page: {os.path.relpath(page)}\nPDF: {os.path.relpath(pdf)}")
+    console.print(f"page: {os.path.relpath(written.html)}\nPDF: {os.path.relpath(written.pdf)}")
     figures = {"quick": quick} | figures_of(results)
-    files = {"html": str(page), "pdf": str(pdf), "pictures": sorted(path.name for path in folder.glob("*.png"))}
+    files = {
+        "html": str(written.html),
+        "pdf": str(written.pdf),
+        "pictures": [path.name for path in written.pictures],
+    }
     write_json(json, figures | {"files": files, "seconds": time.monotonic() - started})
     console.print(f"done in {time.monotonic() - started:.0f} s")

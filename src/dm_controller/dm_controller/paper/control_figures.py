@@ -72,7 +72,7 @@ def coefficients_figure(series: Mapping[str, Series], title: str) -> Figure:
         for shot in each.shots:
             error = np.maximum(np.abs(shot.zernike[FREE:]), FLOOR) * NM
             axes.semilogy(place, error, "o", markersize=3.5, color=colours(scale(shot.target.curvature)))
-        lines(axes, place[-1])
+        lines(axes)
         for edge in np.flatnonzero(np.diff([term.n for term in TERMS[FREE:]])) + 0.5:
             axes.axvline(edge, color="black", linewidth=0.5, alpha=0.4)
         axes.set_xticks(place, names[FREE:], rotation=90, fontsize=7)
@@ -85,12 +85,14 @@ def coefficients_figure(series: Mapping[str, Series], title: str) -> Figure:
     return figure
 
 
-def lines(axes: Axes, right: float) -> None:
-    """The paper's two marks, parts of the wavelength."""
+def lines(axes: Axes) -> None:
+    """The paper's two marks, parts of the wavelength, named in the right margin."""
     for parts in CLAIM_PARTS:
         level = WAVELENGTH / parts * NM
         axes.axhline(level, color=VERMILION, linewidth=0.9, linestyle="--")
-        axes.annotate(f"λ/{parts}", (right, level), fontsize=8, color=VERMILION, ha="right", va="bottom")
+        axes.text(
+            1.005, level, f"λ/{parts}", transform=axes.get_yaxis_transform(), fontsize=7, color=VERMILION, va="center"
+        )
 
 
 def sweep_figure(series: Mapping[str, Sequence[Series]]) -> Figure:
@@ -113,7 +115,7 @@ def sweep_figure(series: Mapping[str, Sequence[Series]]) -> Figure:
                 linewidth=1.1,
                 label=f"{each.method}, {each.reading}",
             )
-        lines(axes, max(shot.target.curvature for shot in rows[0].shots))
+        lines(axes)
         axes.set(xlabel="curvature, 1/m (concave positive)", title=bench)
         axes.title.set_fontsize(10)
         axes.grid(alpha=0.3)

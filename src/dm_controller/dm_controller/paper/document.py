@@ -166,7 +166,8 @@ class _Paper:
 
     def text(self, text: str, size: float = 9.5, weight: str = "normal", keep: int = 0) -> None:
         """A paragraph; `keep` lines must fit below it on the same page."""
-        rows = textwrap.wrap(text, int(CHARACTERS * 9.5 / size))
+        wider = 0.85 if weight == "bold" else 1.0
+        rows = textwrap.wrap(text, int(CHARACTERS * wider * 9.5 / size))
         line = LINE * size / 9.5
         self._room(line * (len(rows) + 1) + LINE * keep)
         for row in rows:

@@ -9,6 +9,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 
 from dm_calibration.influence.mirror import Mirror, pitch
 from dm_calibration.influence.region_weighting import RegionWeighting
@@ -17,28 +18,30 @@ from dm_calibration.optics.regions import AREA_FRACTIONS, RegionStatistics
 #: Colours that stay apart for colour-blind readers (Okabe & Ito 2008).
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
 NM = 1e9
+#: The labels of the regions stand on this line x, in pitches of the actuators, between their columns.
+LABEL_X = 0.25
 
 
 def regions_figure(mirror: Mirror, plate_diameter: float) -> Figure:
     """Fig. 4: the ten concentric apertures over the actuator layout; lengths in m."""
     figure = Figure(figsize=(6.8, 6.2), layout="constrained")
     axes = figure.add_subplot()
-    radius = mirror.working_radius * 1e3
+    radius, spacing = mirror.working_radius * 1e3, pitch(mirror.x, mirror.y) * 1e3
     shades = colormaps["cividis"]
     for number, share in reversed(list(enumerate(AREA_FRACTIONS))):
         axes.add_patch(
             Circle((0, 0), radius * np.sqrt(share), facecolor=shades(number / 9), edgecolor="white", alpha=0.85)
         )
-        axes.annotate(
-            f"{share:.0%}",
-            radius * np.sqrt(share - 0.05) * np.array([np.cos(1.31), np.sin(1.31)]),
-            fontsize=7,
-            ha="center",
-            va="center",
-            color="black" if number > 5 else "white",
+        label_x = LABEL_X * spacing
+        label_y = np.sqrt(radius**2 * (share - 0.05) - label_x**2)
+        dark = "black" if number > 5 else "white"
+        label = axes.text(
+            label_x, label_y, f"{share:.0%}", fontsize=6.5, ha="center", va="center", color=dark, zorder=5
         )
+        rim = "white" if number > 5 else "black"
+        label.set_path_effects([withStroke(linewidth=1.2, foreground=rim)])
     axes.add_patch(Circle((0, 0), plate_diameter * 500, fill=False, edgecolor="black", linewidth=1.2))
-    spot = pitch(mirror.x, mirror.y) * 1e3 * 0.2
+    spot = 0.2 * spacing
     for number, (x, y) in enumerate(zip(mirror.x * 1e3, mirror.y * 1e3, strict=True), start=1):
         axes.add_patch(Circle((x, y), spot, facecolor="white", edgecolor="black", linewidth=0.8))
         axes.text(x, y, str(number), fontsize=6.5, ha="center", va="center")
@@ -67,16 +70,13 @@ def _regional_errors(axes: Axes, panel: RegionStatistics) -> None:
     area = 100 * panel.area_fractions
     shades = colormaps["viridis"]
     for number, (label, errors) in enumerate(zip(panel.labels, panel.rms * NM, strict=True)):
-        axes.plot(
-            area + 3.0 * (number / max(len(panel.labels) - 1, 1) - 0.5),
-            errors,
-            ".",
-            color=shades(number / max(len(panel.labels) - 1, 1)),
-            markersize=4,
-            alpha=0.7,
-        )
-        if not panel.averaged[number]:
-            axes.annotate(f"{label} (not in the mean)", (area[-1], errors[-1]), fontsize=7, ha="right", va="bottom")
+        place = number / max(len(panel.labels) - 1, 1)
+        sideways = area + 3.0 * (place - 0.5)
+        if panel.averaged[number]:
+            axes.plot(sideways, errors, ".", color=shades(place), markersize=4, alpha=0.7)
+        else:
+            marker = "x" if panel.averaged[:number].all() else "+"
+            axes.plot(sideways, errors, marker, color=VERMILION, markersize=6, label=f"{label}, not in the mean")
     spread = np.sqrt(panel.variance) * NM
     axes.fill_between(
         area, panel.mean * NM - spread, panel.mean * NM + spread, color=BLUE, alpha=0.12, label="± one standard dev."

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 from dm_controller.paper import content, content_control, content_regressions
 from dm_controller.paper.document import Section, write_html, write_pdf
 from dm_controller.paper.results import Results
 
 TITLE = "Flexible spherical/aspherical surface control: the paper's tables and figures on the virtual bench"
+
+
+class Written(NamedTuple):
+    """The files of a page."""
+
+    html: Path
+    pdf: Path
+    pictures: list[Path]
 
 
 def sections(results: Results) -> list[Section]:
@@ -29,7 +38,12 @@ def sections(results: Results) -> list[Section]:
     ]
 
 
-def write_page(results: Results, folder: Path) -> tuple[Path, Path]:
-    """Write `index.html` with its PNGs and `paper.pdf` into `folder`; returns both."""
+def write_page(results: Results, folder: Path) -> Written:
+    """Write the page into `folder`.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
     made = sections(results)
-    return write_html(folder, TITLE, made), write_pdf(folder / "paper.pdf", TITLE, made)
+    pictures = [folder / f"{picture.name}.png" for section in made for picture in section.pictures]
+    return Written(write_html(folder, TITLE, made), write_pdf(folder / "paper.pdf", TITLE, made), pictures)

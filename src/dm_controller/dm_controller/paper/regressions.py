@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
-from dm_calibration.regression.stepwise import stepwise
+from dm_calibration.regression.stepwise import leave_one_out, stepwise
 from dm_calibration.regression.surface_error import (
     ErrorRegression,
     Reading,
@@ -34,14 +34,20 @@ class Regressions:
 
     Attributes:
         by_reading: the regression of each model in each reading.
-        shuffles: how often the responses of the training surfaces were shuffled among them.
-        shuffled_significant: share of these in which the selection found a model with p(F) below LEVEL; an honest p
-            would be below it in that share of LEVEL.
+        shuffled_p: (B,) p(F) of the plain linear reading on responses shuffled among the training surfaces; of honest
+            p values a share of LEVEL would be below LEVEL.
+        linear_left_out: (n,) m, absolute error of each training surface, predicted by the plain linear reading of AZreg
+            from a model selected without it; with their names in `training`.
     """
 
     by_reading: dict[Reading, dict[str, ErrorRegression]]
-    shuffles: int
-    shuffled_significant: float
+    shuffled_p: Floats
+    training: tuple[str, ...]
+    linear_left_out: Floats
+
+    def shuffled_below(self, p: float) -> float:
+        """Share of the shuffled responses with a p(F) below `p`."""
+        return float((self.shuffled_p < p).mean())
 
     @property
     def taken(self) -> dict[str, ErrorRegression]:
@@ -68,18 +74,17 @@ def regress_samples(samples: Samples, shuffles: int = 0, seed: int = 0) -> Regre
     by_reading = {
         reading: {model: regress_surface_errors(maps, fits[model], reading) for model in MODELS} for reading in Reading
     }
-    return Regressions(by_reading, shuffles, _chance(samples, shuffles, seed) if shuffles else float("nan"))
-
-
-def _chance(samples: Samples, shuffles: int, seed: int) -> float:
-    """Share of shuffled responses that the plain linear reading declares significant."""
     errors = surface_errors(samples.calibration.maps, samples.fit)
     train = np.array([label not in TEST_SURFACES for label in errors.labels])
-    candidates = np.hstack((errors.signals, errors.coefficients))[train]
-    names = [f"x{k}" for k in range(candidates.shape[1])]
+    candidates, response = np.hstack((errors.signals, errors.coefficients))[train], errors.response[train]
+    names = [f"x{k + 1}" for k in range(candidates.shape[1])]
     random = np.random.default_rng(seed)
-    found = [stepwise(candidates, random.permutation(errors.response[train]), names) for _ in range(shuffles)]
-    return float(np.mean([fit.k > 0 and fit.p_value < LEVEL for fit in found]))
+    return Regressions(
+        by_reading,
+        np.array([stepwise(candidates, random.permutation(response), names).p_value for _ in range(shuffles)]),
+        tuple(label for label, trained in zip(errors.labels, train, strict=True) if trained),
+        np.abs(leave_one_out(candidates, response, names) - response),
+    )
 
 
 def relative_errors(regression: ErrorRegression) -> Floats:

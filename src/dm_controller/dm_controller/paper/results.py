@@ -67,8 +67,8 @@ class PaperOptions:
 
     @classmethod
     def quick(cls, seed: int) -> PaperOptions:
-        """Everything once, on a small camera."""
-        return cls(TwinConfig(seed=seed, pixels=118), spheres=5, seeds=1, shuffles=20, foreign_laws=False)
+        """Everything once, on a small camera with few sampling points."""
+        return cls(TwinConfig(seed=seed, pixels=118, samples=200), spheres=5, seeds=1, shuffles=20, foreign_laws=False)
 
     @property
     def steps(self) -> int:
