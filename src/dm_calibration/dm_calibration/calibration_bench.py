@@ -161,6 +161,6 @@ class RosBench:
                 return
             if time.monotonic() > deadline or self.cancelled():
                 raise BenchError(
-                    ErrorCode.PREEMPTED, "somebody else commanded the mirror during the calibration: stop them first"
+                    ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first"
                 )
             time.sleep(0.01)
