@@ -160,7 +160,5 @@ class RosBench:
             ):
                 return
             if time.monotonic() > deadline or self.cancelled():
-                raise BenchError(
-                    ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first"
-                )
+                raise BenchError(ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first")
             time.sleep(0.01)
