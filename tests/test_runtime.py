@@ -21,7 +21,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from std_msgs.msg import Int32
 
-from dm_runtime import qos
 from dm_runtime.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
 from dm_runtime.worker import ServiceCallError, WorkerActionServer, WorkerService, call, sleep
 from support import Observer, wait_until
@@ -289,15 +288,3 @@ def test_a_node_is_made_safe_on_signals_even_when_hit_twice(domain: int, tmp_pat
     assert output == "safe\n"
     assert "Traceback" not in errors
     assert process.returncode == 0
-
-
-def test_nothing_of_a_client_stays_in_the_graph(domain: int) -> None:
-    """Also after it called a service of its own: the executor lets go of every entity."""
-    for _round in range(3):
-        with Observer(domain) as observer:
-            WorkerService(observer.node, Flatten, "flatten", lambda _request, response: response)
-            observer.record(Int32, "numbers", qos.LATCHED)
-            observer.node.create_publisher(Int32, "numbers", qos.LATCHED).publish(Int32(data=1))
-            observer.call(Flatten, "flatten")
-            assert observer.node.count_publishers("numbers") == 1
-            assert observer.node.get_node_names() == ["observer"]
