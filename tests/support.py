@@ -119,7 +119,7 @@ class Observer:
         try:
             wait_until(future.done, timeout_s, f"answer of {name}")
         except AssertionError:
-            # On a busy machine discovery can take longer than `answers_arrive` allows, and that answer is lost for good.
+            # On a busy machine discovery can take longer than `answers_arrive` allows; that answer is lost.
             future = client.call_async(message)
             wait_until(future.done, timeout_s, f"second answer of {name}")
         return future.result()
