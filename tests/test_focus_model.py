@@ -32,10 +32,8 @@ def model_of(mirror: LinearMirror, held_out: float = 0.0) -> InfluenceModel:
         sample_weight=points.weight,
         influence_sag=mirror.influence,
         sag_offset=mirror.modes @ mirror.figure_coefficients,
-        in_sample_rms=0.0,
         held_out_rms=held_out,
         held_out_max_zernike=held_out,
-        maps_used=100,
     )
 
 

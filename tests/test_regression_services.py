@@ -55,10 +55,8 @@ def model_of(fit: InfluenceFit) -> InfluenceModel:
         fit.points.weight,
         fit.influence_sag,
         fit.sag_offset,
-        fit.in_sample_rms,
         fit.held_out_rms,
         fit.held_out_max_zernike,
-        len(fit.used),
     )
 
 

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import array
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from dm_calibration.calibration_messages import doubles
 from dm_controller.model import InfluenceModel
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget
 
-
-def doubles(values: ArrayLike) -> array.array[float]:
-    """A float64[] field: message fields take an `array.array` as it is, where a list is checked element by element."""
-    result = array.array("d")
-    result.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
-    return result
+__all__ = ["doubles", "limits_of", "model_of", "target_of"]
 
 
 def target_of(request: Any) -> FocusTarget:
@@ -44,10 +39,8 @@ def model_of(calibration: Any) -> InfluenceModel:
         sample_weight=np.asarray(calibration.sample_weight, dtype=float),
         influence_sag=matrix("influence_sag", points),
         sag_offset=np.asarray(calibration.sag_offset, dtype=float),
-        in_sample_rms=calibration.in_sample_rms,
         held_out_rms=calibration.held_out_rms,
         held_out_max_zernike=calibration.held_out_max_zernike,
-        maps_used=calibration.maps_used,
     )
 
 

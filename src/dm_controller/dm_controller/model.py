@@ -40,10 +40,8 @@ class InfluenceModel:
     sample_weight: NDArray[np.float64]  # (P,) sums to 1
     influence_sag: NDArray[np.float64]  # (P, N) m per unit signal
     sag_offset: NDArray[np.float64]  # (P,) m
-    in_sample_rms: float  # m
     held_out_rms: float  # m
     held_out_max_zernike: float  # m
-    maps_used: int
 
     def __post_init__(self) -> None:
         terms, actuators = self.influence_zernike.shape

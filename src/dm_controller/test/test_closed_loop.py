@@ -31,10 +31,8 @@ def model() -> InfluenceModel:
         sample_weight=points.weight,
         influence_sag=MIRROR.influence,
         sag_offset=MIRROR.modes @ MIRROR.figure_coefficients,
-        in_sample_rms=1e-10,
         held_out_rms=1e-10,
         held_out_max_zernike=1e-10,
-        maps_used=100,
     )
 
 

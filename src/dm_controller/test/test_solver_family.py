@@ -46,10 +46,8 @@ def model(mirror: LinearMirror) -> InfluenceModel:
         sample_weight=points.weight,
         influence_sag=mirror.influence,
         sag_offset=mirror.modes @ mirror.figure_coefficients,
-        in_sample_rms=1e-10,
         held_out_rms=1e-10,
         held_out_max_zernike=1e-10,
-        maps_used=100,
     )
 
 

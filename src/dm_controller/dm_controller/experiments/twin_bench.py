@@ -291,8 +291,6 @@ def influence_model(fit: InfluenceFit, aperture_radius: float) -> InfluenceModel
         sample_weight=fit.points.weight,
         influence_sag=fit.influence_sag,
         sag_offset=fit.sag_offset,
-        in_sample_rms=fit.in_sample_rms,
         held_out_rms=fit.held_out_rms,
         held_out_max_zernike=fit.held_out_max_zernike,
-        maps_used=int(fit.used.sum()),
     )
