@@ -18,7 +18,7 @@ from dm_controller.experiments.twin_bench import TwinConfig
 from dm_controller.paper import control, reported
 from dm_controller.paper.document import Section, Table, write_html, write_pdf
 from dm_controller.paper.results import PaperOptions
-from dm_controller.paper.samples import Samples, measure_samples
+from dm_controller.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
 
 SEED = 31
 
@@ -88,6 +88,39 @@ def test_hysteresis_costs_what_ideal_actuators_do_not_show(made: tuple[Path, dic
         assert readings["closed loop"]["p50_nm"] < 0.5 * readings["measured"]["p50_nm"]
         assert 1.0 <= readings["closed loop"]["maps"] <= control.LOOP_MAPS
     assert ideal["control"]["AZreg"]["stored"]["within"]["lambda/50"] == 1.0
+
+
+def test_maps_and_memory_reach_a_thousandth_of_the_wavelength(made: tuple[Path, dict[str, Any]]) -> None:
+    figures = made[1]
+    readings = figures["control"]["AZreg"]
+    remembering = readings[control.LOOP_MEMORY]
+    assert remembering["maps"] == control.LOOP_MAPS
+    assert remembering["within"]["lambda/1000"] == 1.0
+    assert readings["closed loop"]["within"]["lambda/50"] == 1.0
+    assert readings[control.OPEN_MEMORY]["maps"] == 0.0
+    assert readings[control.OPEN_MEMORY]["true_p50_nm"] < 0.2 * readings["stored"]["true_p50_nm"]
+    # A noisy map cannot show what the noise-free surface does.
+    assert remembering["p50_nm"] > remembering["true_p50_nm"]
+    for order in remembering["orders"].values():
+        shares = list(order["within"].values())
+        assert shares == sorted(shares, reverse=True)
+        assert order["max_nm"] <= max(remembering["true_max_zernike_nm"])
+
+
+def test_sampling_study_is_reported(made: tuple[Path, dict[str, Any]]) -> None:
+    ways = made[1]["sampling"]["ways"]
+    assert ways["full map"]["bias_rms_nm"] < 1e-6
+    assert ways["edge-clustered, area-weighted"]["bias_rms_nm"] < ways["edge-clustered"]["bias_rms_nm"]
+    assert ways["full map"]["noise_rms_nm"] < ways["uniform"]["noise_rms_nm"]
+
+
+def test_regions_on_points_and_on_every_pixel_agree(made: tuple[Path, dict[str, Any]]) -> None:
+    readings = made[1]["regions_readings"]
+    assert set(readings) == {POINTS, PIXELS, LEVELLED}
+    assert readings[POINTS]["mean_nm"] == made[1]["regions"]["mean_nm"]
+    # The smallest disc holds few of the 200 points of a quick run.
+    assert readings[POINTS]["mean_nm"][1:] == pytest.approx(readings[PIXELS]["mean_nm"][1:], rel=0.05)
+    assert np.all(np.array(readings[LEVELLED]["mean_nm"]) < np.array(readings[POINTS]["mean_nm"]) + 1e-9)
 
 
 def test_page_pictures_and_pdf_belong_together(made: tuple[Path, dict[str, Any]]) -> None:

@@ -33,9 +33,46 @@ def show(results: Any) -> None:
             f"{max(pair[model].rel_err_pct for pair in reported.TABLE_3.values()):.2f}",
         )
     console.print(table)
+    _show_control(results)
+    _show_sampling(results)
     console.print(
         f"row weights cancel: G changes by {results.standard.samples.weights_cancel:.1e} m per unit signal at most"
     )
+
+
+def _show_control(results: Any) -> None:
+    import numpy as np
+    from rich.table import Table
+
+    from dm_controller.paper.content_coefficients import BY_ORDER, MARKS
+
+    table = Table(title=f"largest coefficient error of the true surface over the spheres, {BY_ORDER}")
+    table.add_column("bench and reading")
+    for heading in ("median nm", *(f"λ/{mark}" for mark in MARKS), "maps"):
+        table.add_column(heading, justify="right")
+    for name, bench in results.benches.items():
+        for (method, reading), series in bench.spheres.items():
+            if method == BY_ORDER:
+                table.add_row(
+                    f"{name}, {reading}",
+                    f"{nanometres(float(np.median(series.true_max_zernike))):.2f}",
+                    *(f"{series.share_within(mark):.0%}" for mark in MARKS),
+                    f"{np.mean([shot.maps for shot in series.shots]):.1f}",
+                )
+    console.print(table)
+
+
+def _show_sampling(results: Any) -> None:
+    from rich.table import Table
+
+    table = Table(title="ways to sample a map: errors of the 21 terms, rms sag")
+    table.add_column("way")
+    for heading in ("samples", "bias nm", "noise nm", "ringing at the rim nm"):
+        table.add_column(heading, justify="right")
+    for name, way in results.sampling.results.items():
+        lengths = (way.bias_rms, way.noise_rms, way.rim_ringing_rms)
+        table.add_row(name, f"{way.samples}", *(f"{nanometres(length):.3f}" for length in lengths))
+    console.print(table)
 
 
 def paper(

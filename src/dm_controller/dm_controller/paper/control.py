@@ -5,7 +5,14 @@ target. It leaves open when c_ini was measured. Both readings are run, and a clo
 
 - "stored": c_ini comes from the sample surfaces; no map is taken during control. This is open loop.
 - "measured": the mirror goes to p55 or p56, c_ini is measured there and then, and the mirror moves on from it: one map.
-- "closed loop": the stored start, then corrected on further maps, three in all; creep is foreseen.
+- "closed loop": the stored start, then corrected on maps, three in all; creep is foreseen, and the last correction is
+  made but not measured.
+
+An influence function does not know what the actuators remember. In two more readings the commands are those of a law of
+hysteresis and creep beside it, see `remembering`:
+
+- "stored with memory": open loop as "stored"; no map is taken.
+- "closed loop with memory": as "closed loop".
 
 Each method gets the same mirror in the same state, with the same noise to come.
 """
@@ -15,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +31,45 @@ from dm_calibration.optics.piston_tilt import remove_piston_tilt
 from dm_calibration.procedure import Measurement
 from dm_controller.closed_loop import Creep, LoopOptions, converge
 from dm_controller.experiments.twin_bench import TwinBench, influence_model
+from dm_controller.paper.regressions import fit_of
+from dm_controller.paper.remembering import RememberingControl
 from dm_controller.paper.reported import CLAIM_PARTS, CURVATURE_RANGE, WAVELENGTH
 from dm_controller.paper.samples import Samples
 from dm_controller.solvers.base import FREE, Floats, Shape, Solver, measured_shape, rms_sag, target_shape
 from dm_controller.solvers.registry import MirrorFacts, make_solver
 from dm_controller.target import FocusTarget
 
-READINGS = ("stored", "measured", "closed loop")
+#: Readings by a linear model alone, and those that follow the memory of the actuators.
+LINEAR_READINGS = ("stored", "measured", "closed loop")
+OPEN_MEMORY, LOOP_MEMORY = "stored with memory", "closed loop with memory"
+READINGS = (*LINEAR_READINGS, OPEN_MEMORY, LOOP_MEMORY)
 #: Maps of a closed loop.
 LOOP_MAPS = 3
 #: Pixels across a map that is kept for drawing.
 DRAWN_PIXELS = 160
-#: Methods by the name on the page: solver, and which region weights it takes.
+
+
+class Method(NamedTuple):
+    """A row of the page.
+
+    Attributes:
+        solver: name in `solvers.registry`.
+        weights: of regions: "" (none), "median" or "chosen", see `Samples`.
+        model: that fitted the influence function.
+    """
+
+    solver: str
+    weights: str = ""
+    model: str = "AZreg"
+
+
+#: Methods by the name on the page.
 METHODS = {
-    "AZreg": ("AZreg", ""),
-    "AZWreg": ("AZWreg", "median"),
-    "AZWreg, ε by cross-validation": ("AZWreg", "chosen"),
-    "bounded programme": ("bounded", ""),
+    "AZreg": Method("AZreg"),
+    "AZWreg": Method("AZWreg", "median"),
+    "AZWreg, ε by cross-validation": Method("AZWreg", "chosen"),
+    "AZreg, G by weighted sag fit": Method("AZreg", model="AZWreg"),
+    "bounded programme": Method("bounded"),
 }
 
 
@@ -52,7 +82,8 @@ class Shot:
         start: name of the initial state.
         sag: (h, w) m, the last map, piston and tilt removed, thinned out to DRAWN_PIXELS for drawing.
         residual: (h, w) m, the map less the target, likewise.
-        zernike: (21,) m, coefficient errors.
+        zernike: (21,) m, coefficient errors on that map.
+        true_zernike: (21,) m, those of the noise-free surface, which only a twin knows.
         rms: m, of the residual over all pixels.
         overflow: how far the signals asked for lay outside the limits, normalised.
         maps: taken during control, the judging one not counted.
@@ -63,14 +94,20 @@ class Shot:
     sag: NDArray[np.float32]
     residual: NDArray[np.float32]
     zernike: Floats
+    true_zernike: Floats
     rms: float
     overflow: float
     maps: int
 
     @property
     def max_zernike(self) -> float:
-        """Largest coefficient error beyond tilt, m."""
+        """Largest coefficient error beyond tilt on the map, m."""
         return float(np.abs(self.zernike[FREE:]).max())
+
+    @property
+    def true_max_zernike(self) -> float:
+        """Largest coefficient error beyond tilt of the noise-free surface, m."""
+        return float(np.abs(self.true_zernike[FREE:]).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +120,27 @@ class Series:
 
     @property
     def max_zernike(self) -> Floats:
-        """(T,) m, largest coefficient error of each target."""
+        """(T,) m, largest coefficient error of each target on its map."""
         return np.array([shot.max_zernike for shot in self.shots])
 
+    @property
+    def true_max_zernike(self) -> Floats:
+        """(T,) m, largest coefficient error of each target's noise-free surface."""
+        return np.array([shot.true_max_zernike for shot in self.shots])
+
+    @property
+    def order_errors(self) -> Floats:
+        """(T, 4) m, largest coefficient error of the radial orders 2 to 5 of each target's noise-free surface."""
+        return order_errors(np.stack([shot.true_zernike for shot in self.shots]))
+
     def share_within(self, parts: float) -> float:
-        """Share of the targets with all coefficients beyond tilt within wavelength / parts."""
-        return float((self.max_zernike <= WAVELENGTH / parts).mean())
+        """Share of the targets with all true coefficients beyond tilt within wavelength / parts."""
+        return share_within(self.true_max_zernike, parts)
+
+
+def share_within(errors: Floats, parts: float) -> float:
+    """Share of the errors (T,), m, within wavelength / parts."""
+    return float((errors <= WAVELENGTH / parts).mean())
 
 
 def spheres(count: int) -> tuple[FocusTarget, ...]:
@@ -113,10 +165,11 @@ def initial_state(target: FocusTarget) -> str:
 
 def make_method(name: str, samples: Samples) -> Solver:
     """The solver of a row of METHODS on the influence function of `samples`."""
-    solver, weights = METHODS[name]
-    chosen = {"": None, "median": samples.median_weights, "chosen": samples.weighting.weights}[weights]
-    model = influence_model(samples.fit, samples.bench.mirror.working_radius)
-    return make_solver(solver, model, samples.bench.limits, MirrorFacts(region_weights=chosen))
+    method = METHODS[name]
+    chosen = {"": None, "median": samples.median_weights, "chosen": samples.weighting.weights}[method.weights]
+    fit = fit_of(samples.calibration, samples.bench, method.model)
+    model = influence_model(fit, samples.bench.mirror.working_radius)
+    return make_solver(method.solver, model, samples.bench.limits, MirrorFacts(region_weights=chosen))
 
 
 def run_series(
@@ -134,31 +187,43 @@ def run_series(
     if reading not in READINGS:
         raise ValueError(f"reading = {reading!r}: must be one of {', '.join(READINGS)}")
     solver, bench = make_method(method, samples), samples.bench.fork()
+    remembering = RememberingControl(samples, bench, solver) if reading not in LINEAR_READINGS else None
     shots = []
     for target in targets:
-        shots.append(_shoot(samples, bench, solver, reading, target))
+        start = initial_state(target)
+        if remembering is None:
+            overflow, taken = _control(samples, bench, solver, reading, target)
+        else:
+            row, wanted = samples.row(start), target_shape(target, solver.model)
+            remembering.move(samples.calibration.maps.applied[row])
+            signals, overflow = remembering.start(row, wanted)
+            taken = LOOP_MAPS if reading == LOOP_MEMORY else 0
+            remembering.converge(signals, wanted, taken)
+        shots.append(_judge(bench, target, start, overflow, taken))
         on_shot()
     return Series(method, reading, tuple(shots))
 
 
-def _shoot(samples: Samples, bench: TwinBench, solver: Solver, reading: str, target: FocusTarget) -> Shot:
-    start = initial_state(target)
-    row, maps = samples.row(start), samples.calibration.maps
+def _control(
+    samples: Samples, bench: TwinBench, solver: Solver, reading: str, target: FocusTarget
+) -> tuple[float, int]:
+    """Bring the mirror to `target` by the influence function alone; returns overflow and the number of maps taken."""
+    row, maps = samples.row(initial_state(target)), samples.calibration.maps
     signals = maps.applied[row]
     wanted = target_shape(target, solver.model)
     _go(bench, signals)
     if reading == "measured":
-        initial, taken = _shape(bench.measure(start), solver), 1
+        initial, taken = _shape(bench.measure("start"), solver), 1
     else:
         initial, taken = measured_shape(maps.coefficients[row], maps.sag[row], solver.model), 0
     command = solver.correct(signals, initial - wanted)
     if reading == "closed loop":
-        options = LoopOptions(tolerance=WAVELENGTH / CLAIM_PARTS[1], max_maps=LOOP_MAPS)
+        options = LoopOptions(tolerance=WAVELENGTH / CLAIM_PARTS[1], max_maps=LOOP_MAPS, correct_last=True)
         creep = Creep(bench.config.creep, signals, lambda: bench.time)
         taken = converge(solver, target, bench, options, start=command.signals, creep=creep).maps
     else:
         _go(bench, command.signals)
-    return _judge(bench, target, start, command.overflow, taken)
+    return command.overflow, taken
 
 
 def _go(bench: TwinBench, signals: Floats) -> None:
@@ -178,27 +243,18 @@ def _judge(bench: TwinBench, target: FocusTarget, start: str, overflow: float, t
     x: Floats = (np.arange(sag.shape[1], dtype=np.float64)[None, :] - aperture.centre_x_px) / aperture.radius_px
     y: Floats = (aperture.centre_y_px - np.arange(sag.shape[0], dtype=np.float64)[:, None]) / aperture.radius_px
     residual = remove_piston_tilt(sag - target.sag(x, y, radius))
-    zernike = bench.measurement_of(sag).coefficients - target.coefficients(radius)
+    wanted = target.coefficients(radius)
+    zernike = bench.measurement_of(sag).coefficients - wanted
+    true = bench.measurement_of(bench.true_map()).coefficients - wanted
     rms = float(np.sqrt(np.nanmean(np.square(residual))))
-    return Shot(target, start, _thinned(remove_piston_tilt(sag)), _thinned(residual), zernike, rms, overflow, taken)
+    drawn = _thinned(remove_piston_tilt(sag))
+    return Shot(target, start, drawn, _thinned(residual), zernike, true, rms, overflow, taken)
 
 
 def _thinned(sag: Floats) -> NDArray[np.float32]:
     """Every n-th pixel, such that no more than some DRAWN_PIXELS are left across."""
     step = max(1, round(len(sag) / DRAWN_PIXELS))
     return sag[::step, ::step].astype(np.float32)
-
-
-def noise_of_a_map(samples: Samples, maps: int = 20) -> float:
-    """Median over repeated maps of a mirror at rest of the largest coefficient's deviation from their mean, m.
-
-    No controlled surface can be shown to be better than this.
-    """
-    bench = samples.bench.fork()
-    _go(bench, bench.mirror.rest)
-    bench.time += 1e4  # until creep has come to rest
-    taken = np.stack([bench.measure(f"repeat {k}").coefficients for k in range(maps)])
-    return float(np.median(np.abs(taken - taken.mean(axis=0))[:, FREE:].max(axis=1)))
 
 
 def branch_spread(samples: Samples) -> float:

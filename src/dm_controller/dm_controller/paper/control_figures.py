@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from dm_calibration.optics.zernike import TERMS
-from dm_controller.paper.control import Series
+from dm_controller.paper.control import LOOP_MEMORY, OPEN_MEMORY, Series
 from dm_controller.paper.figures import BLUE, GREEN, NM, ORANGE, PURPLE, VERMILION
 from dm_controller.paper.reported import CLAIM_PARTS, WAVELENGTH
 from dm_controller.solvers.base import FREE
@@ -60,8 +60,8 @@ def _map(axes: Axes, values: np.ndarray, radius: float, limit: float, colours: s
 
 
 def coefficients_figure(series: Mapping[str, Series], title: str) -> Figure:
-    """Figs. 8 and 9: |coefficient error| of every term beyond tilt, one panel for each series by name."""
-    figure = Figure(figsize=(12, 4.4), layout="constrained")
+    """Figs. 8 and 9: |true coefficient error| of every term beyond tilt, one panel for each series by name."""
+    figure = Figure(figsize=(14, 4.4), layout="constrained")
     figure.suptitle(title, fontsize=11)
     panels = figure.subplots(1, len(series), sharey=True, squeeze=False)[0]
     curvatures = [shot.target.curvature for shot in next(iter(series.values())).shots]
@@ -70,13 +70,13 @@ def coefficients_figure(series: Mapping[str, Series], title: str) -> Figure:
     place = np.arange(len(TERMS) - FREE)
     for axes, (name, each) in zip(panels, series.items(), strict=True):
         for shot in each.shots:
-            error = np.maximum(np.abs(shot.zernike[FREE:]), FLOOR) * NM
+            error = np.maximum(np.abs(shot.true_zernike[FREE:]), FLOOR) * NM
             axes.semilogy(place, error, "o", markersize=3.5, color=colours(scale(shot.target.curvature)))
         lines(axes)
         for edge in np.flatnonzero(np.diff([term.n for term in TERMS[FREE:]])) + 0.5:
             axes.axvline(edge, color="black", linewidth=0.5, alpha=0.4)
         axes.set_xticks(place, names[FREE:], rotation=90, fontsize=7)
-        axes.set(title=name, xlabel="term n,m (c cosine, s sine); lines part the orders 2, 3, 4, 5")
+        axes.set(title=name, xlabel="term n,m; lines part the orders 2 to 5")
         axes.title.set_fontsize(9)
         axes.xaxis.label.set_fontsize(8)
         axes.grid(axis="y", alpha=0.3)
@@ -96,10 +96,10 @@ def lines(axes: Axes) -> None:
 
 
 def sweep_figure(series: Mapping[str, Sequence[Series]]) -> Figure:
-    """Largest coefficient error against curvature: one panel for each bench by name, one line for each series."""
+    """Largest true coefficient error against curvature: one panel for each bench by name, one line for each series."""
     figure = Figure(figsize=(12, 4.6), layout="constrained")
     panels = figure.subplots(1, len(series), sharey=True, squeeze=False)[0]
-    styles = {"stored": ":", "measured": "-", "closed loop": "--"}
+    styles = {"stored": ":", "measured": "-", "closed loop": "--", OPEN_MEMORY: (0, (1, 3)), LOOP_MEMORY: "-."}
     colours: dict[str, str] = {}
     for axes, (bench, rows) in zip(panels, series.items(), strict=True):
         for each in rows:
@@ -107,8 +107,8 @@ def sweep_figure(series: Mapping[str, Sequence[Series]]) -> Figure:
             curvature = [shot.target.curvature for shot in each.shots]
             axes.semilogy(
                 curvature,
-                each.max_zernike * NM,
-                styles[each.reading],
+                each.true_max_zernike * NM,
+                linestyle=styles[each.reading],
                 color=colour,
                 marker="o",
                 markersize=3,
@@ -121,5 +121,5 @@ def sweep_figure(series: Mapping[str, Sequence[Series]]) -> Figure:
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("largest coefficient error, nm")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=7.5, ncols=4, loc="outside lower center")
+    figure.legend(handles, labels, fontsize=7.5, ncols=5, handlelength=3.5, loc="outside lower center")
     return figure

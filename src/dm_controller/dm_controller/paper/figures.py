@@ -7,39 +7,39 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.patheffects import withStroke
 
 from dm_calibration.influence.mirror import Mirror, pitch
 from dm_calibration.influence.region_weighting import RegionWeighting
 from dm_calibration.optics.regions import AREA_FRACTIONS, RegionStatistics
+from dm_calibration.optics.sampling_study import SamplingStudy
+from dm_calibration.optics.zernike import PISTON_TILT, TERMS
 
 #: Colours that stay apart for colour-blind readers (Okabe & Ito 2008).
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
 NM = 1e9
-#: The labels of the regions stand on this line x, in pitches of the actuators, between their columns.
-LABEL_X = 0.25
 
 
 def regions_figure(mirror: Mirror, plate_diameter: float) -> Figure:
     """Fig. 4: the ten concentric apertures over the actuator layout; lengths in m."""
-    figure = Figure(figsize=(6.8, 6.2), layout="constrained")
+    figure = Figure(figsize=(7.6, 6.2), layout="constrained")
     axes = figure.add_subplot()
     radius, spacing = mirror.working_radius * 1e3, pitch(mirror.x, mirror.y) * 1e3
-    shades = colormaps["cividis"]
+    shades = ListedColormap(colormaps["cividis"](np.linspace(0.0, 1.0, len(AREA_FRACTIONS))))
     for number, share in reversed(list(enumerate(AREA_FRACTIONS))):
-        axes.add_patch(
-            Circle((0, 0), radius * np.sqrt(share), facecolor=shades(number / 9), edgecolor="white", alpha=0.85)
-        )
-        label_x = LABEL_X * spacing
-        label_y = np.sqrt(radius**2 * (share - 0.05) - label_x**2)
-        dark = "black" if number > 5 else "white"
-        label = axes.text(
-            label_x, label_y, f"{share:.0%}", fontsize=6.5, ha="center", va="center", color=dark, zorder=5
-        )
-        rim = "white" if number > 5 else "black"
-        label.set_path_effects([withStroke(linewidth=1.2, foreground=rim)])
+        axes.add_patch(Circle((0, 0), radius * np.sqrt(share), facecolor=shades(number), edgecolor="white"))
+    edges = np.concatenate(([0.0], 100 * np.asarray(AREA_FRACTIONS)))
+    # Beside the aperture, where no label can touch an actuator.
+    figure.colorbar(
+        ScalarMappable(BoundaryNorm(edges, shades.N), shades),
+        ax=axes,
+        ticks=edges[1:],
+        label="region: disc up to this share of the area, %",
+        shrink=0.8,
+    )
     axes.add_patch(Circle((0, 0), plate_diameter * 500, fill=False, edgecolor="black", linewidth=1.2))
     spot = 0.2 * spacing
     for number, (x, y) in enumerate(zip(mirror.x * 1e3, mirror.y * 1e3, strict=True), start=1):
@@ -104,6 +104,29 @@ def weights_figure(weightings: Mapping[str, RegionWeighting], median_weights: Ma
     for axes in (left, right):
         axes.legend(fontsize=8)
         axes.grid(alpha=0.3)
+    return figure
+
+
+def sampling_figure(study: SamplingStudy) -> Figure:
+    """Bias of each coefficient beyond tilt, and ringing at the rim, for each way of sampling."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(3, 1))
+    first = len(PISTON_TILT)
+    names = [f"{'c' if term.kind == 'cos' else 's' if term.kind == 'sin' else ''}{term.n},{term.m}" for term in TERMS]
+    place = np.arange(len(TERMS) - first)
+    for number, (way, colour) in enumerate(zip(study.results.values(), (GREY, VERMILION, BLUE, ORANGE), strict=True)):
+        if way.bias[first:].max() > 1e-3 / NM:
+            left.semilogy(place, way.bias[first:] * NM, "o-", color=colour, markersize=4, linewidth=0.8, label=way.name)
+        right.bar(number, way.rim_ringing_rms * NM, color=colour)
+        right.bar(number, way.rim_error_rms * NM, fill=False, edgecolor=colour)
+    left.set_xticks(place, names[first:], rotation=90, fontsize=7)
+    left.set(xlabel="term n,m (c cosine, s sine)", ylabel="bias, nm")
+    left.legend(fontsize=8)
+    left.grid(axis="y", alpha=0.3)
+    short = [name.replace("edge-clustered, ", "").replace("-", "-\n", 1) for name in study.results]
+    right.set_xticks(range(len(short)), short, fontsize=7)
+    right.set_ylabel("on the rim, rms, nm")
+    right.set_title("filled: ringing; outline: surface less terms", fontsize=8)
     return figure
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from dm_controller.paper import content, content_control, content_regressions
+from dm_controller.paper import content, content_coefficients, content_control, content_regressions, content_sampling
 from dm_controller.paper.document import Section, write_html, write_pdf
 from dm_controller.paper.results import Results
 
@@ -25,13 +25,14 @@ def sections(results: Results) -> list[Section]:
     return [
         content.introduction(results),
         content.table_1(results),
+        content_sampling.sampling(results),
         content.figure_4(results),
         content.figure_5(results),
         content.weights(results),
         content_regressions.table_2(results),
         content_regressions.table_3(results),
         content_control.controlled_surfaces(results),
-        content_control.coefficient_errors(results),
+        content_coefficients.coefficient_errors(results),
         content_control.conics(results),
         content_control.readings(results),
         content_control.claims(results),

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.optics.sampling_study import SamplingStudy
 from dm_controller.experiments.twin_bench import TwinConfig
 from dm_controller.paper.control import (
+    LINEAR_READINGS,
     METHODS,
     READINGS,
     Series,
     aspheres,
     branch_spread,
     fitting_limit,
-    noise_of_a_map,
     run_series,
     spheres,
 )
 from dm_controller.paper.regressions import Regressions, regress_samples, relative_errors_on
 from dm_controller.paper.reported import CURVATURE_RANGE
 from dm_controller.paper.samples import Samples, measure_samples
+from dm_controller.paper.sampling import study_samples
 from dm_controller.target import FocusTarget
 
 Floats = NDArray[np.float64]
@@ -32,6 +35,10 @@ STANDARD, IDEAL = "standard bench", "ideal actuators"
 FOREIGN_LAWS = ("preisach", "bouc_wen")
 #: Methods that the aspheres are controlled by.
 ASPHERE_METHODS = ("AZreg", "AZWreg")
+#: Method that the spheres are controlled by on twins of foreign laws.
+LAW_METHOD = "AZreg"
+#: Readings on each bench: ideal actuators remember nothing.
+READINGS_ON = MappingProxyType({STANDARD: READINGS, IDEAL: LINEAR_READINGS})
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class PaperOptions:
         spheres: number of spheres over the range of curvature.
         seeds: number of further twins for Table 3, with the seeds that follow the bench's; with small cameras.
         shuffles: of the responses of the regression.
-        foreign_laws: whether Table 3 is tried on other hysteresis laws too.
+        foreign_laws: whether Table 3 and the spheres are tried on other hysteresis laws too.
     """
 
     bench: TwinConfig
@@ -73,8 +80,8 @@ class PaperOptions:
     @property
     def steps(self) -> int:
         """Steps that `measure` reports."""
-        series = len(METHODS) * len(READINGS) + len(ASPHERE_METHODS)
-        return 2 * (2 + series) + self.seeds + (len(FOREIGN_LAWS) if self.foreign_laws else 0)
+        series = sum(len(METHODS) * len(readings) + len(ASPHERE_METHODS) for readings in READINGS_ON.values())
+        return 2 * len(READINGS_ON) + series + 1 + self.seeds + (2 * len(FOREIGN_LAWS) if self.foreign_laws else 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +91,6 @@ class BenchResults:
     Attributes:
         spheres: by method and reading.
         aspheres: by method, in the reading "measured".
-        noise: m, see `noise_of_a_map`.
         branch_spread: m, see there.
         limit_rms: m, least rms sag error of the strongest sphere that the model permits inside the limits.
     """
@@ -93,7 +99,6 @@ class BenchResults:
     regressions: Regressions
     spheres: dict[tuple[str, str], Series]
     aspheres: dict[str, Series]
-    noise: float
     branch_spread: float
     limit_rms: float
 
@@ -107,6 +112,8 @@ class Results:
         seeds: of the further twins.
         over_seeds: (B, S) RelErr of the test surfaces on them, by model.
         over_laws: (S,) the same on one twin of each foreign law, by law and model.
+        law_spheres: the spheres by LAW_METHOD on such twins, by law and reading.
+        sampling: errors of ways to sample a map, on the standard bench.
     """
 
     options: PaperOptions
@@ -114,6 +121,8 @@ class Results:
     seeds: tuple[int, ...]
     over_seeds: dict[str, Floats]
     over_laws: dict[str, dict[str, Floats]]
+    law_spheres: dict[str, dict[str, Series]]
+    sampling: SamplingStudy
 
     @property
     def standard(self) -> BenchResults:
@@ -145,21 +154,28 @@ def measure(options: PaperOptions, step: Callable[[str], None] = lambda what: No
         step(f"Table 3 on another twin, seed {seed}")
         rows.append(relative_errors_on(replace(small, seed=seed)))
     over_seeds = {model: np.stack([row[model] for row in rows]) for model in rows[0]}
-    over_laws = {}
+    over_laws, law_spheres = {}, {}
     for law in FOREIGN_LAWS if options.foreign_laws else ():
         step(f"Table 3 on a {law} twin")
         over_laws[law] = relative_errors_on(replace(small, law=law))
-    return Results(options, benches, seeds, over_seeds, over_laws)
+        step(f"spheres on a {law} twin")
+        samples = measure_samples(replace(small, law=law))
+        law_spheres[law] = {
+            reading: run_series(samples, LAW_METHOD, reading, spheres(options.spheres)) for reading in READINGS
+        }
+    step("ways to sample a map")
+    sampling = study_samples(benches[STANDARD].samples)
+    return Results(options, benches, seeds, over_seeds, over_laws, law_spheres, sampling)
 
 
 def _bench(name: str, config: TwinConfig, options: PaperOptions, step: Callable[[str], None]) -> BenchResults:
     step(f"{name}: sample surfaces")
-    samples = measure_samples(config)
+    samples = measure_samples(config, every_pixel=True)
     step(f"{name}: regressions")
     regressions = regress_samples(samples, options.shuffles, config.seed)
     controlled = {}
     for method in METHODS:
-        for reading in READINGS:
+        for reading in READINGS_ON[name]:
             step(f"{name}: {method}, {reading}")
             controlled[method, reading] = run_series(samples, method, reading, spheres(options.spheres))
     shaped = {}
@@ -167,6 +183,4 @@ def _bench(name: str, config: TwinConfig, options: PaperOptions, step: Callable[
         step(f"{name}: conics by {method}")
         shaped[method] = run_series(samples, method, "measured", aspheres())
     strongest = max(fitting_limit(samples, FocusTarget(curvature))[0] for curvature in CURVATURE_RANGE)
-    return BenchResults(
-        samples, regressions, controlled, shaped, noise_of_a_map(samples), branch_spread(samples), strongest
-    )
+    return BenchResults(samples, regressions, controlled, shaped, branch_spread(samples), strongest)

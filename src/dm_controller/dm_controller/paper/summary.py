@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 
 from dm_calibration.optics.regions import AREA_FRACTIONS, RegionStatistics
+from dm_calibration.optics.sampling_study import SamplingStudy
 from dm_calibration.regression.surface_error import ErrorRegression
 from dm_controller.paper import reported
-from dm_controller.paper.control import Series
+from dm_controller.paper.content_coefficients import MARKS
+from dm_controller.paper.control import Series, share_within
 from dm_controller.paper.regressions import LEVEL, TAKEN
 from dm_controller.paper.results import BenchResults, Results
 
@@ -33,6 +35,11 @@ def figures_of(results: Results) -> dict[str, Any]:
             law: {model: _by_surface(errors) for model, errors in models.items()}
             for law, models in results.over_laws.items()
         },
+        "sampling": _sampling(results.sampling),
+        "control_other_laws": {
+            law: {reading: _series(series) for reading, series in by_reading.items()}
+            for law, by_reading in results.law_spheres.items()
+        },
         "paper": {
             "table2": {model: row._asdict() for model, row in reported.TABLE_2.items()},
             "table3": {
@@ -53,6 +60,7 @@ def _bench(bench: BenchResults) -> dict[str, Any]:
         "table3_readings": {reading.value: _table_3(models) for reading, models in regressions.by_reading.items()},
         "shuffled_significant": regressions.shuffled_below(LEVEL),
         "regions": _regions(samples.actuator_surfaces) | {"zernike": _regions(samples.zernike_surfaces)},
+        "regions_readings": {name: _regions(panel) for name, panel in samples.readings.items()},
         "weights_cancel_max_abs": samples.weights_cancel,
         "weights": {
             "epsilon_nm2": weighting.epsilon * NM**2,
@@ -76,7 +84,7 @@ def _bench(bench: BenchResults) -> dict[str, Any]:
             for method, series in bench.aspheres.items()
         },
         "branch_spread_nm": bench.branch_spread * NM,
-        "map_noise_nm": bench.noise * NM,
+        "map_noise_nm": bench.samples.noise * NM,
         "fitting_limit_nm": bench.limit_rms * NM,
     }
 
@@ -135,8 +143,45 @@ def _series(series: Series) -> dict[str, Any]:
         "rms_nm": [shot.rms * NM for shot in series.shots],
         "p50_nm": float(np.median(series.max_zernike)) * NM,
         "p90_nm": float(np.quantile(series.max_zernike, 0.9)) * NM,
-        "within": {f"lambda/{parts}": series.share_within(parts) for parts in reported.CLAIM_PARTS},
+        "true_max_zernike_nm": (series.true_max_zernike * NM).tolist(),
+        "true_p50_nm": float(np.median(series.true_max_zernike)) * NM,
+        "true_p90_nm": float(np.quantile(series.true_max_zernike, 0.9)) * NM,
+        "within": _within(series.true_max_zernike),
+        "within_on_map": _within(series.max_zernike),
+        "orders": {
+            str(order): {
+                "p50_nm": float(np.median(errors)) * NM,
+                "max_nm": float(errors.max()) * NM,
+                "within": _within(errors),
+            }
+            for order, errors in enumerate(series.order_errors.T, start=2)
+        },
         "maps": float(np.mean([shot.maps for shot in series.shots])),
+    }
+
+
+def _within(errors: np.ndarray) -> dict[str, float]:
+    return {f"lambda/{parts}": share_within(errors, parts) for parts in MARKS}
+
+
+def _sampling(study: SamplingStudy) -> dict[str, Any]:
+    return {
+        "surfaces": study.surfaces,
+        "beyond_terms_rms_nm": study.beyond_rms * NM,
+        "pixel_noise_nm": study.pixel_noise * NM,
+        "ways": {
+            name: {
+                "samples": way.samples,
+                "bias_rms_nm": way.bias_rms * NM,
+                "noise_rms_nm": way.noise_rms * NM,
+                "rim_ringing_rms_nm": way.rim_ringing_rms * NM,
+                "rim_ringing_peak_nm": way.rim_ringing_peak * NM,
+                "rim_error_rms_nm": way.rim_error_rms * NM,
+                "bias_nm": (way.bias * NM).tolist(),
+                "noise_nm": (way.noise * NM).tolist(),
+            }
+            for name, way in study.results.items()
+        },
     }
 
 
