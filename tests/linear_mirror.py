@@ -7,6 +7,7 @@ Each actuator raises the deflection of an infinite plate on an elastic foundatio
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from scipy.special import kei
 from dm_calibration.influence.mirror import NEIGHBOUR_REACH, Mirror
 from dm_calibration.optics.sampling import SamplePoints, edge_clustered_points
 from dm_calibration.optics.zernike import basis
+
+if TYPE_CHECKING:
+    from dm_controller.model import InfluenceModel
 
 Floats = NDArray[np.float64]
 
@@ -90,3 +94,21 @@ class LinearMirror:
         z = self.modes @ ((1.0 + drift) * self.figure_coefficients) + self.influence @ signals
         z = z + self.noise * self.random.standard_normal(z.size)
         return np.asarray(z + self.modes[:, :3] @ (self.piston_tilt * self.random.standard_normal(3)))
+
+    def model(self, held_out: float = 1e-10) -> InfluenceModel:
+        """What a perfect calibration would say of this mirror, with a held-out error (m) of choice."""
+        # Here, because the tests of dm_calibration use this module too, and that package must do without dm_controller.
+        from dm_controller.model import InfluenceModel
+
+        return InfluenceModel(
+            aperture_radius=RADIUS,
+            influence_zernike=self.fit_terms(self.influence.T).T,
+            zernike_offset=self.figure_coefficients,
+            sample_x=self.points.x,
+            sample_y=self.points.y,
+            sample_weight=self.points.weight,
+            influence_sag=self.influence,
+            sag_offset=self.modes @ self.figure_coefficients,
+            held_out_rms=held_out,
+            held_out_max_zernike=held_out,
+        )

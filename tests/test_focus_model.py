@@ -21,24 +21,8 @@ def mirror() -> LinearMirror:
     return LinearMirror(*hexagon())
 
 
-def model_of(mirror: LinearMirror, held_out: float = 0.0) -> InfluenceModel:
-    points = mirror.points
-    return InfluenceModel(
-        aperture_radius=RADIUS,
-        influence_zernike=mirror.fit_terms(mirror.influence.T).T,
-        zernike_offset=mirror.figure_coefficients,
-        sample_x=points.x,
-        sample_y=points.y,
-        sample_weight=points.weight,
-        influence_sag=mirror.influence,
-        sag_offset=mirror.modes @ mirror.figure_coefficients,
-        held_out_rms=held_out,
-        held_out_max_zernike=held_out,
-    )
-
-
 def calibrated(mirror: LinearMirror, neighbour_difference: float = 2.0, held_out: float = 0.0) -> CalibratedMirror:
-    return CalibratedMirror(model_of(mirror, held_out), Limits(-1.0, 1.0, PAIRS, neighbour_difference))
+    return CalibratedMirror(mirror.model(held_out), Limits(-1.0, 1.0, PAIRS, neighbour_difference))
 
 
 @pytest.mark.parametrize("curvature", [-0.03, 0.0, 0.01, 0.03])
@@ -137,7 +121,7 @@ def test_sag_and_coefficients_agree() -> None:
 
 
 def test_inconsistent_calibrations_are_refused(mirror: LinearMirror) -> None:
-    good = model_of(mirror)
+    good = mirror.model(0.0)
     fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
     with pytest.raises(ValueError, match="sag_offset has shape"):
         InfluenceModel(**{**fields, "sag_offset": np.zeros(3)})

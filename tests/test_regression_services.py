@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.msg import ErrorCode, MirrorInfo
-from dm_msgs.srv import FitRegression, LoadCalibration, PredictError
+from dm_msgs.srv import FitInfluenceFunction, FitRegression, LoadCalibration, PredictError
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter as RosParameter
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.fit import InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.weights import surface_control_error
+from dm_calibration.optics.zernike import basis
+from dm_calibration.regression.surface_error import SURFACES
 from dm_calibration.store import CalibrationStore
-from dm_controller.model import CalibratedMirror, InfluenceModel
+from dm_controller.experiments.twin_bench import influence_model
+from dm_controller.model import CalibratedMirror
 from dm_controller.prediction import ForecastClient, memory_share, surface_control_error_rms
 from dm_controller.solvers.bounded import Limits
 from dm_runtime import qos
@@ -45,19 +52,29 @@ def stored(identifier: str, maps: MapSet, fit: InfluenceFit, created_ns: int) ->
     )
 
 
-def model_of(fit: InfluenceFit) -> InfluenceModel:
-    return InfluenceModel(
-        RADIUS,
-        fit.influence_zernike,
-        fit.zernike_offset,
-        fit.points.x,
-        fit.points.y,
-        fit.points.weight,
-        fit.influence_sag,
-        fit.sag_offset,
-        fit.held_out_rms,
-        fit.held_out_max_zernike,
-    )
+def unfit() -> Iterator[Calibration]:
+    """Calibrations whose maps do not do for a regression, by name."""
+    maps, fit = calibrated()
+    number = np.array([int(label[1:]) if label in SURFACES else 0 for label in maps.label])
+    for name, kept in (("few", number < 10), ("levels", (number < 6) | (number > 45) & (number < 55))):
+        chosen = maps.select(kept)
+        yield stored(name, chosen, fit_influence(chosen, rings=MIRROR.rings), 1)
+    sag = maps.sag.copy()
+    sag[maps.label.index("p44"), np.hypot(maps.points.x, maps.points.y) < 0.35] = np.nan
+    yield stored("holed", replace(maps, sag=sag), fit, 1)
+    coefficients = maps.applied @ fit.influence_zernike.T
+    same = coefficients @ basis(maps.points.x, maps.points.y).T + 40e-9 * np.cos(9.0 * maps.points.x)
+    yield stored("same", replace(maps, sag=same, coefficients=coefficients), fit, 1)
+
+
+#: What is wrong with each of them, as the node says it.
+UNFIT = {
+    "pokes": (ErrorCode.TOO_FEW_MAPS, "calibrate with the plan FULL"),
+    "few": (ErrorCode.TOO_FEW_MAPS, "9 samples: a constant, one variable and 10 degrees of freedom"),
+    "levels": (ErrorCode.TOO_FEW_MAPS, "candidates s02 and s03 are proportional over all samples"),
+    "holed": (ErrorCode.MAP_INSUFFICIENT, "p44: the concentric region of 10% of the area holds no valid data"),
+    "same": (ErrorCode.INVALID_ARGUMENT, "the response is the same for all samples"),
+}
 
 
 @pytest.fixture
@@ -65,6 +82,8 @@ def node(start: Callable[..., NodeProcess], observer: Observer, tmp_path: Path) 
     store = CalibrationStore(tmp_path / "calibrations")
     store.save(stored("pokes", *calibrated_by_pokes(), 1))
     store.save(stored("whole", *calibrated(), 2))
+    for calibration in unfit():
+        store.save(calibration)
     process = start("dm_calibration", "calibration", {"calibration_folder": str(store.folder)})
     message = MirrorInfo(name=MIRROR.name, serial=MIRROR.serial, actuators=MIRROR.actuators)
     message.actuator_x, message.actuator_y = doubles(MIRROR.x), doubles(MIRROR.y)
@@ -120,7 +139,7 @@ def test_fit_and_predict(node: NodeProcess, observer: Observer) -> None:
         ({"calibration": "nothing"}, ErrorCode.UNKNOWN_NAME, "nothing"),
         ({"p_enter": 0.2, "p_remove": 0.1}, ErrorCode.INVALID_ARGUMENT, "p_remove = 0.1: must be at least p_enter"),
         ({"p_enter": float("nan")}, ErrorCode.INVALID_ARGUMENT, "p_enter = nan"),
-        ({"calibration": "pokes"}, ErrorCode.TOO_FEW_MAPS, "calibrate with the plan FULL"),
+        ({"p_remove": -0.1}, ErrorCode.INVALID_ARGUMENT, "p_remove = -0.1: must be at least p_enter"),
     ):
         wrong = fit(**fields)
         assert wrong.error_code == code and words in wrong.message, wrong.message
@@ -136,16 +155,61 @@ def test_fit_and_predict(node: NodeProcess, observer: Observer) -> None:
         wrong = predict(bad)
         assert wrong.error_code == code and words in wrong.message, wrong.message
 
-    load(observer, "pokes")
-    wrong = predict(signals)
-    assert wrong.error_code == ErrorCode.TOO_FEW_MAPS and "calibration pokes" in wrong.message
-    load(observer, "whole")
-    assert predict(signals).predicted_rms == changed.predicted_rms  # its regression was kept
     assert "Traceback" not in node.output, node.output
 
 
+def test_maps_that_do_not_do_are_refused_and_what_was_in_use_stays(node: NodeProcess, observer: Observer) -> None:
+    published = observer.record(CalibrationMsg, "calibration", qos.LATCHED)
+    signals = doubles(np.linspace(-0.5, 0.5, 37))
+
+    def predict() -> Any:
+        return observer.call(PredictError, "predict_error", PredictError.Request(signals=signals), 30)
+
+    load(observer, "whole")
+    before = predict()
+    assert before.error_code == ErrorCode.OK, before.message
+    for name, (code, words) in UNFIT.items():
+        request = FitRegression.Request(calibration=name)
+        refused = observer.call(FitRegression, "fit_regression", request, 30)
+        assert (refused.error_code, words in refused.message) == (code, True), refused.message
+        assert refused.message.startswith(f"calibration {name}: ")
+    assert predict().predicted_rms == before.predicted_rms
+    for name, code, words in (
+        ("holed", ErrorCode.MAP_INSUFFICIENT, "p44: the concentric region of 10%"),
+        ("same", ErrorCode.INVALID_ARGUMENT, "the regional errors are the same for all 69 sample surfaces"),
+    ):
+        fit = FitInfluenceFunction.Request(calibration=name, method="AZWreg", activate=True)
+        refused = observer.call(FitInfluenceFunction, "fit_influence_function", fit, 30)
+        assert (refused.error_code, words in refused.message) == (code, True), refused.message
+    assert published[-1].id == "whole"
+
+    for name, (code, words) in UNFIT.items():  # in use, there is an influence function but no prediction
+        load(observer, name)
+        refused = predict()
+        assert (refused.error_code, words in refused.message) == (code, True), refused.message
+    load(observer, "whole")
+    assert predict().predicted_rms == before.predicted_rms
+    assert "Traceback" not in node.output, node.output
+
+
+def test_epsilon_is_a_parameter(node: NodeProcess, observer: Observer, tmp_path: Path) -> None:
+    def set_epsilon(value: float) -> Any:
+        request = SetParameters.Request(parameters=[RosParameter("epsilon", value=value).to_parameter_msg()])
+        return observer.call(SetParameters, "calibration/set_parameters", request).results[0]
+
+    load(observer, "whole")
+    refused = set_epsilon(-1e-18)
+    assert not refused.successful and "epsilon" in refused.reason
+    assert set_epsilon(4e-16).successful
+    request = FitInfluenceFunction.Request(method="AZWreg")
+    fitted = observer.call(FitInfluenceFunction, "fit_influence_function", request, 30)
+    assert fitted.error_code == ErrorCode.OK, fitted.message
+    limitations = CalibrationStore(tmp_path / "calibrations").load(fitted.id).limitations
+    assert any("epsilon 400 nm^2 given" in sentence for sentence in limitations), limitations
+
+
 def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, observer: Observer) -> None:
-    model = model_of(calibrated()[1])
+    model = influence_model(calibrated()[1], RADIUS)
     mirror = CalibratedMirror(model, Limits(-1.0, 1.0, np.zeros((0, 2), dtype=np.intp), 2.0))
     changes: list[None] = []
     client = ForecastClient(observer.node, lambda: changes.append(None))
@@ -183,4 +247,4 @@ def test_modelled_error_agrees_with_the_calibrations_own() -> None:
     sag = fit.sag_offset + fit.influence_sag @ signals
     error = surface_control_error(sag[np.newaxis], signals[np.newaxis], fit.influence_zernike, fit.points)[0]
     expected = np.sqrt(np.sum(fit.points.weight * error**2))
-    assert surface_control_error_rms(model_of(fit), signals) == pytest.approx(expected)
+    assert surface_control_error_rms(influence_model(fit, RADIUS), signals) == pytest.approx(expected)

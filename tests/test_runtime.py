@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import MoveFocus
 from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import Flatten, SetSignals
+from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
 from dm_runtime.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
@@ -288,3 +293,39 @@ def test_a_node_is_made_safe_on_signals_even_when_hit_twice(domain: int, tmp_pat
     assert output == "safe\n"
     assert "Traceback" not in errors
     assert process.returncode == 0
+
+
+@pytest.fixture
+def watcher(domain: int) -> Iterator[Node]:
+    """A participant of its own, which sees of others what DDS tells it."""
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("watcher", context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize("kind", ["service", "action server", "action client", "all, used"])
+def test_nothing_of_a_client_stays_in_the_graph(kind: str, domain: int, watcher: Node) -> None:
+    def served(_goal: Any) -> tuple[str, Any]:
+        return "succeed", MoveFocus.Result()
+
+    # Circles of references must not decide how long a node is seen.
+    gc.collect()
+    gc.disable()
+    try:
+        with Observer(domain) as observer:
+            if kind in ("service", "all, used"):
+                WorkerService(observer.node, Flatten, "flatten", lambda _request, response: response)
+            if kind in ("action server", "all, used"):
+                WorkerActionServer(observer.node, MoveFocus, "move", served)
+            if kind == "action client":
+                ActionClient(observer.node, MoveFocus, "move")
+            if kind == "all, used":
+                observer.call(Flatten, "flatten")
+                observer.run_goal(MoveFocus, "move", MoveFocus.Goal())
+            wait_until(lambda: "observer" in watcher.get_node_names())
+        wait_until(lambda: "observer" not in watcher.get_node_names(), 5, "the node is still in the graph")
+    finally:
+        gc.enable()

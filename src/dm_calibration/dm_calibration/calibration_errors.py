@@ -7,7 +7,9 @@ from dm_msgs.msg import ErrorCode
 from dm_calibration.calibration import CalibrationFileError
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.names import UnknownNameError
+from dm_calibration.optics.regions import EmptyRegionError
 from dm_calibration.procedure import BenchError, Cancelled
+from dm_calibration.regression.stepwise import CollinearError, TooFewSamplesError
 from dm_calibration.store import StoreError, UnknownCalibrationError
 
 
@@ -27,6 +29,9 @@ def error_code(error: Exception) -> int:
         (Cancelled, ErrorCode.CANCELED),
         (StoreError, ErrorCode.STORAGE_FAILED),
         (TooFewMapsError, ErrorCode.TOO_FEW_MAPS),
+        (TooFewSamplesError, ErrorCode.TOO_FEW_MAPS),
+        (CollinearError, ErrorCode.TOO_FEW_MAPS),
+        (EmptyRegionError, ErrorCode.MAP_INSUFFICIENT),
         (CalibrationFileError, ErrorCode.CALIBRATION_UNREADABLE),
         (UnknownNameError, ErrorCode.UNKNOWN_NAME),
         (UnknownCalibrationError, ErrorCode.UNKNOWN_NAME),

@@ -11,12 +11,12 @@ from dm_msgs.msg import ErrorCode
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_desk import CalibrationDesk
-from dm_calibration.calibration_errors import Refused
+from dm_calibration.calibration_errors import Refused, error_code
 from dm_calibration.calibration_messages import doubles
 from dm_calibration.calibration_parameters import fit_options
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.regression.predictor import ErrorPredictor, fit_predictor
-from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions, TooFewSamplesError
+from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions
 
 
 class ErrorPrediction:
@@ -80,13 +80,13 @@ class ErrorPrediction:
 
     def _fitted(self, stored: Calibration, method: str, options: SelectionOptions | None) -> ErrorPredictor:
         influence = stored.fit
-        if method != influence.method:
-            left_out = [label for label, used in zip(stored.maps.label, influence.used, strict=True) if not used]
-            influence = fit_influence(stored.maps, fit_options(self._values, method), exclude=left_out)
         try:
+            if method != influence.method:
+                left_out = [label for label, used in zip(stored.maps.label, influence.used, strict=True) if not used]
+                influence = fit_influence(stored.maps, fit_options(self._values, method), exclude=left_out)
             return fit_predictor(stored.maps, influence, options)
-        except TooFewSamplesError as error:
-            raise Refused(ErrorCode.TOO_FEW_MAPS, f"calibration {stored.id}: {error}") from error
+        except ValueError as error:
+            raise Refused(error_code(error), f"calibration {stored.id}: {error}") from error
 
     def _checked(self, signals: np.ndarray, calibration: Calibration) -> np.ndarray:
         actuators = calibration.fit.actuators
@@ -113,5 +113,6 @@ def _selection(p_enter: float, p_remove: float) -> SelectionOptions | None:
     """Thresholds of a request, 0 = default; None when both are."""
     if p_enter == 0.0 and p_remove == 0.0:
         return None
-    enter = p_enter or min(P_ENTER, p_remove)
+    # A p_remove that is refused must be named itself, not as the default that follows from it.
+    enter = p_enter or (min(P_ENTER, p_remove) if p_remove > 0.0 else P_ENTER)
     return SelectionOptions(enter, p_remove or max(P_REMOVE, enter))

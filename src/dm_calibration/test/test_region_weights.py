@@ -28,8 +28,8 @@ from dm_calibration.influence.weights import (
     surface_control_error,
     weights_cancel_max_abs,
 )
-from dm_calibration.joined_maps import joined_maps
 from dm_calibration.names import UnknownNameError
+from dm_calibration.optics.regions import EmptyRegionError
 from dm_calibration.optics.sample_regions import regional_rms
 from dm_calibration.optics.sampling import SamplePoints, edge_clustered_points
 from dm_calibration.optics.zernike import basis
@@ -103,7 +103,9 @@ def test_epsilon_must_be_above_0(epsilon: float) -> None:
     with pytest.raises(ValueError, match=r"epsilon = .*: must be above 0 and finite"):
         region_weights(np.ones(10), epsilon)
     with pytest.raises(ValueError, match=r"epsilon = .*: must be above 0 and finite"):
-        fit_influence(rim_maps(), FitOptions("AZWreg", epsilon=epsilon))
+        FitOptions(epsilon=epsilon)
+    with pytest.raises(ValueError, match=r"epsilon = .*: must be above 0 and finite"):
+        weighting(rim_maps(), epsilon=epsilon)
 
 
 def test_variances_must_be_variances() -> None:
@@ -308,6 +310,21 @@ def test_azwreg_with_points_without_data() -> None:
     assert np.abs(gappy.influence_zernike - whole.influence_zernike)[3:].max() < 5 * NM
 
 
+def test_a_region_that_a_surface_does_not_show_is_refused() -> None:
+    """Its weight would come from sag that the fit made up."""
+    _plant, maps = linear_maps()
+    sag = maps.sag.copy()
+    row = maps.kind.index("surface")
+    sag[row, np.hypot(POINTS.x, POINTS.y) < 0.35] = np.nan
+    holed = replace(maps, sag=sag)
+    fit_influence(holed)
+    with pytest.raises(
+        EmptyRegionError, match=f"{maps.label[row]}: the concentric region of 10% .* measure the map again"
+    ):
+        fit_influence(holed, FitOptions("AZWreg"))
+    assert fit_influence(holed, FitOptions("AZWreg"), exclude=[maps.label[row]]).method == "AZWreg"
+
+
 def test_unknown_methods_list_the_known_ones() -> None:
     with pytest.raises(UnknownNameError, match="method 'AZWerg' is unknown; did you mean AZWreg"):
         fit_influence(rim_maps(), FitOptions("AZWerg"))
@@ -347,22 +364,3 @@ def test_a_stored_calibration_is_fitted_again_with_either_method() -> None:
     back = refit(again, FitOptions("AZreg"), [], Provenance("three", 3))
     assert back.fit.influence_zernike == pytest.approx(stored.fit.influence_zernike)
     assert not any("region weights" in sentence for sentence in back.limitations)
-
-
-def test_maps_of_two_calibrations_join_unless_apertures_or_wavelengths_are_mixed() -> None:
-    one, two = make_calibration("one"), make_calibration("two")
-    maps = joined_maps([one, two])
-    assert len(maps) == 2 * len(one.maps) and len(set(maps.step)) == 2 * len(set(one.maps.step))
-    assert maps.label[0] == f"one/{one.maps.label[0]}"
-    assert fit_influence(maps).influence_zernike == pytest.approx(one.fit.influence_zernike, abs=3 * NM)
-    for changed, message in (
-        (replace(two, aperture_radius=0.010), "aperture radius 11.000 mm and 10.000 mm, must agree within 0.1%"),
-        (replace(two, wavelength=635e-9), "wavelength 632.800 nm and 635.000 nm"),
-        (replace(two, wavelength=0.0), "0 = not told"),
-        (replace(two, mirror_serial="other"), "of different mirrors"),
-        (replace(two, maps=replace(two.maps, points=SamplePoints(POINTS.y, POINTS.x, POINTS.weight))), "points"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            joined_maps([one, changed])
-    with pytest.raises(ValueError, match="no calibration given"):
-        joined_maps([])

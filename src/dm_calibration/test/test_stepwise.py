@@ -114,6 +114,19 @@ def test_leaving_out_means_that_the_sample_has_no_say() -> None:
     assert np.abs(np.delete(after - before, 7)).max() > 1.0
 
 
+def test_candidates_that_vary_in_one_sample_only_have_no_say_when_that_is_left_out() -> None:
+    """Without that sample they are constant, but for rounding, which must not be taken for a variable."""
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        x = np.tile(random.uniform(-1.0, 1.0, 58), (40, 1))
+        x[:, :4] = random.standard_normal((40, 4))
+        x[7] += 1.0
+        y = 50.0 + 3.0 * x[:, 0] + random.standard_normal(40)
+        weights = random.uniform(0.5, 2.0, 40)
+        without = leave_one_out(x[:, :4], y, NAMES[:4], weights)
+        assert leave_one_out(x, y, NAMES, weights)[7] == pytest.approx(without[7])
+
+
 def test_an_unexplained_response_gives_the_mean_alone() -> None:
     x = candidates(7, count=2)
     y = np.random.default_rng(8).standard_normal(50)
@@ -199,6 +212,6 @@ def test_other_bad_input_is_refused_in_words() -> None:
         SelectionOptions(p_remove=0.01)
     with pytest.raises(ValueError, match="freedom_min = 0"):
         SelectionOptions(freedom_min=0)
-    for arguments in ((3.0, 50, 0), (3.0, 7, 6), (-1.0, 50, 6)):
+    for arguments in ((3.0, 50, 0), (3.0, 7, 6), (-1.0, 50, 6), (np.inf, 50, 6)):
         with pytest.raises(ValueError, match="must be"):
             adjusted_r2_of_f(*arguments)

@@ -85,25 +85,20 @@ class CalibratedMirror:
     possible, with piston and tilt free, inside the limits; where the limits forbid equality it is the closest in the
     weighted least-squares sense. A small ridge keeps actuators that the aperture hardly sees from running to their
     limits for nothing.
+
+    Attributes:
+        matrix: (K - 3 + P, N), `rows` of the influence function.
     """
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         self.model = model
         self.limits = limits
-        weights = np.sqrt(model.sample_weight)
-        weighted_basis = weights[:, None] * basis(model.sample_x, model.sample_y)
-        orthogonal = np.linalg.qr(weighted_basis)[0]
-        self._weights = weights
-        self._tilt_free = orthogonal[:, :FREE_TERMS]
-        self._beyond_terms = orthogonal
+        self._weights = np.sqrt(model.sample_weight)
+        self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
+        self._tilt_free = self._terms[:, :FREE_TERMS]
+        self.matrix = self.rows(model.influence_zernike, model.influence_sag)
         response = np.linalg.norm(self._reduce(model.influence_sag, self._tilt_free), axis=0)
-        matrix = np.vstack(
-            [
-                COEFFICIENT_WEIGHT * model.influence_zernike[FREE_TERMS:],
-                self._reduce(model.influence_sag, self._beyond_terms),
-            ]
-        )
-        self._programme = BoundedProgramme(matrix, limits, ridge=(RIDGE_SHARE * float(np.median(response))) ** 2)
+        self._programme = BoundedProgramme(self.matrix, limits, ridge=(RIDGE_SHARE * float(np.median(response))) ** 2)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
     def _reduce(self, sag: NDArray[np.float64], removed: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,17 +107,53 @@ class CalibratedMirror:
         result: NDArray[np.float64] = weighted - removed @ (removed.T @ weighted)
         return result
 
+    def rows(self, coefficients: NDArray[np.float64], sag: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
+
+        Args:
+            coefficients: (K,) m, or (K, N), a surface in each column.
+            sag: (P,) or (P, N) m.
+
+        Returns:
+            (K - 3 + P,) or (K - 3 + P, N).
+        """
+        return np.concatenate([COEFFICIENT_WEIGHT * coefficients[FREE_TERMS:], self._reduce(sag, self._terms)])
+
+    def solve(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The signals (N,) inside the limits whose `matrix @ signals` comes nearest to `rows`.
+
+        Raises:
+            ValueError: another number of rows than `matrix` has, or not finite.
+        """
+        return self._programme.solve(rows)
+
     def plan(self, target: FocusTarget) -> Plan:
         """Find the command for `target` and predict its error.
 
         Raises:
             TargetError: no such surface exists over the aperture.
         """
+        coefficients, sag = self._wanted(target)
+        return self._judged(self.solve(self.rows(coefficients, sag)), coefficients, sag)
+
+    def predict(self, target: FocusTarget, signals: NDArray[np.float64]) -> Plan:
+        """What `signals` (N,) are expected to do when `target` is wanted.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        return self._judged(signals, *self._wanted(target))
+
+    def _wanted(self, target: FocusTarget) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficients (K,) and sag (P,) of `target` less those at zero signals, m."""
         model = self.model
         coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
-        sag = target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
-        wanted = np.concatenate([COEFFICIENT_WEIGHT * coefficients[FREE_TERMS:], self._reduce(sag, self._beyond_terms)])
-        signals = self._programme.solve(wanted)
+        return coefficients, target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
+
+    def _judged(
+        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64], sag: NDArray[np.float64]
+    ) -> Plan:
+        model = self.model
         zernike_error = model.influence_zernike[FREE_TERMS:] @ signals - coefficients[FREE_TERMS:]
         sag_error = self._reduce(model.influence_sag @ signals - sag, self._tilt_free)
         rms = float(np.linalg.norm(sag_error))

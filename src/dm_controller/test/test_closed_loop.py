@@ -9,7 +9,6 @@ import pytest
 
 from dm_calibration.procedure import BenchError, Measurement
 from dm_controller.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
-from dm_controller.model import InfluenceModel
 from dm_controller.solvers.base import Shape, Solver
 from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.registry import make_solver
@@ -18,22 +17,7 @@ from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().neighbours, dtype=np.intp), 2.0)
 MIRROR = LinearMirror(*hexagon())
-
-
-def model() -> InfluenceModel:
-    points = MIRROR.points
-    return InfluenceModel(
-        aperture_radius=RADIUS,
-        influence_zernike=MIRROR.fit_terms(MIRROR.influence.T).T,
-        zernike_offset=MIRROR.figure_coefficients,
-        sample_x=points.x,
-        sample_y=points.y,
-        sample_weight=points.weight,
-        influence_sag=MIRROR.influence,
-        sag_offset=MIRROR.modes @ MIRROR.figure_coefficients,
-        held_out_rms=1e-10,
-        held_out_max_zernike=1e-10,
-    )
+MODEL = MIRROR.model()
 
 
 class Plant:
@@ -78,7 +62,7 @@ class Plant:
 
 @pytest.fixture(scope="module")
 def solver() -> Solver:
-    return make_solver("bounded", model(), LIMITS)
+    return make_solver("bounded", MODEL, LIMITS)
 
 
 def test_an_exact_mirror_takes_one_map(solver: Solver) -> None:

@@ -139,3 +139,15 @@ def test_true_sag_is_the_measurement_without_its_errors(plate: Plate) -> None:
 def test_a_field_larger_than_the_plate_is_refused(plate: Plate) -> None:
     with pytest.raises(ValueError, match=r"field_diameter = 0.04 m: must not exceed the plate, 0.03 m"):
         make(replace(QUIET, field_diameter=0.040), plate)
+
+
+def test_with_noise_of_its_own_it_stays_the_same_instrument(plate: Plate) -> None:
+    config = replace(QUIET, figure_rms=40e-9, pixel_noise=1e-9)
+    camera, alike = make(config, plate), make(config, plate)
+    other = camera.with_noise(np.random.default_rng(77))
+    np.testing.assert_array_equal(other.true_sag(poke(3)), camera.true_sag(poke(3)))
+    first = other.measure(poke(3))
+    np.testing.assert_array_equal(camera.with_noise(np.random.default_rng(77)).measure(poke(3)), first)
+    expected = alike.measure(poke(3))
+    np.testing.assert_array_equal(camera.measure(poke(3)), expected)  # its own noise has not been used up
+    assert np.nanstd(expected - first) > 0.5e-9

@@ -9,7 +9,8 @@ with care (measured with rclpy 7.1.6):
 * `async def` service callbacks are not run, and a pending `await` in an action callback is polled at 100 % CPU. Work
   that waits therefore runs in worker threads (see :mod:`dm_runtime.worker`), and callbacks stay short.
 * It keeps a hold on every entity it serves: a node destroyed before its executor is shut down stays in the ROS graph,
-  latched messages and all.
+  latched messages and all. (So does one with action clients or servers, for `Node.destroy_node` passes these over and
+  each holds its node: see `destroy`.)
 * A signal may raise KeyboardInterrupt inside any callback, and is not noticed while the loop sleeps. `StopOnSignals`
   turns SIGINT and SIGTERM into an orderly end instead.
 """
@@ -24,6 +25,7 @@ import traceback
 from collections.abc import Callable, Sequence
 
 import rclpy
+from rclpy.action import ActionClient, ActionServer
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental import EventsExecutor
@@ -128,7 +130,19 @@ class BackgroundExecutor:
         self._executor.create_task(lambda: None)  # wake() alone does not end a spin_once
         self._thread.join(2 * WAKE_PERIOD_S)
         self._executor.shutdown(2 * WAKE_PERIOD_S)
-        self._node.destroy_node()
+        destroy(self._node)
+
+
+def destroy(node: Node) -> None:
+    """Destroy a node that no executor serves any more, with its action clients and servers.
+
+    `Node.destroy_node` leaves those alone; they refer to each other in circles, so the node would stay in the ROS graph
+    until the garbage collector comes by.
+    """
+    for waitable in list(node.waitables):
+        if isinstance(waitable, ActionClient | ActionServer):
+            waitable.destroy()
+    node.destroy_node()
 
 
 def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int:

@@ -23,6 +23,7 @@ from dm_calibration.influence.region_weighting import choose_weighting, weighted
 from dm_calibration.influence.regression import METHODS, Design, Method, Regression, TooFewMapsError, make_design
 from dm_calibration.influence.sag import rms
 from dm_calibration.influence.screening import ScreeningOptions
+from dm_calibration.influence.weights import check_epsilon
 from dm_calibration.names import unknown_name
 from dm_calibration.optics.sampling import SamplePoints
 
@@ -37,6 +38,9 @@ class FitOptions:
     """How to fit: method (a name of METHODS), folds of the cross-validation, thresholds.
 
     `epsilon` (m^2, above 0) is the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
+
+    Raises:
+        ValueError: fewer than 2 folds, or an epsilon that is not above 0.
     """
 
     method: str = "AZreg"
@@ -44,6 +48,12 @@ class FitOptions:
     screening: ScreeningOptions = field(default_factory=ScreeningOptions)
     grades: GradeOptions = field(default_factory=GradeOptions)
     epsilon: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.folds < 2:
+            raise ValueError(f"folds = {self.folds}: must be at least 2")
+        if self.epsilon is not None:
+            check_epsilon(self.epsilon)
 
 
 @dataclass(frozen=True)
@@ -117,6 +127,7 @@ def fit_influence(
     Raises:
         UnknownNameError: an unknown method or label, listing the near ones.
         TooFewMapsError: the good maps do not determine the unknowns.
+        EmptyRegionError: region weights are asked for and some map has no data in a region.
         ValueError: region weights are asked for and the maps give none.
     """
     options = options or FitOptions()

@@ -16,7 +16,9 @@ Floats = NDArray[np.float64]
 REFERENCE = "reference"
 POKE = "poke"
 SURFACE = "surface"
-KINDS = (REFERENCE, POKE, SURFACE)
+EXCITATION = "excitation"
+CHECK = "check"
+KINDS = (REFERENCE, POKE, SURFACE, EXCITATION, CHECK)
 
 
 def same_points(a: SamplePoints, b: SamplePoints) -> bool:
@@ -32,7 +34,7 @@ class MapRecord:
 
     Attributes:
         label: unique in a calibration, e.g. ``poke+07``, ``p55``, ``reference 3``.
-        kind: REFERENCE, POKE or SURFACE.
+        kind: REFERENCE, POKE, SURFACE, EXCITATION (shows the memory) or CHECK (a move as in use, tests the law of it).
         step: index of the commanded state; maps repeated in one state share it.
         signals, applied: (N,) normalised signals as requested and as written to the electronics.
         stamp_ns: time of the measurement, ns.

@@ -22,7 +22,12 @@ from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import SURFACE, MapSet
 from dm_calibration.influence.regression import Design, TooFewMapsError, least_squares, make_design
 from dm_calibration.influence.sag import remove_piston_tilt, weighted_fit
-from dm_calibration.influence.weights import coefficient_operator, region_weights, surface_control_error
+from dm_calibration.influence.weights import (
+    check_epsilon,
+    coefficient_operator,
+    region_weights,
+    surface_control_error,
+)
 from dm_calibration.optics.regions import AREA_FRACTIONS, region_statistics
 from dm_calibration.optics.sample_regions import regional_rms
 from dm_calibration.optics.zernike import PISTON_TILT, TERMS, basis
@@ -101,12 +106,18 @@ def choose_weighting(
 
     Raises:
         TooFewMapsError: fewer than four sample surfaces.
+        EmptyRegionError: a sample surface has no data in some region.
         ValueError: regional errors that are the same for all surfaces, so that no weights follow; folds below 2;
             epsilon not above 0; maps with other than 21 terms.
     """
     if maps.terms != len(TERMS):
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
+    if epsilon is not None:
+        check_epsilon(epsilon)
     chosen = sample_surfaces(maps)
+    # `sag` has its gaps filled from a fit: a region that nobody saw would get its weight from what was made up.
+    labels = [label for label, used in zip(maps.label, chosen, strict=True) if used]
+    regional_rms(maps.sag[chosen], maps.points, labels=labels)
     fold = _folds(maps, chosen, folds)
     fractions = np.array((0.0, *EPSILON_CANDIDATES))  # 0 stands for no weights at all
     variance = _variance(design, maps, sag, chosen)
@@ -153,7 +164,7 @@ def weighting_of(
 
     Raises:
         TooFewMapsError: the maps do not determine the influence function, or fewer than four sample surfaces.
-        ValueError: as :func:`choose_weighting`.
+        EmptyRegionError, ValueError: as :func:`choose_weighting`.
     """
     good = maps if used is None else maps.select(used)
     design = make_design(good)

@@ -76,7 +76,10 @@ def make_design(maps: MapSet) -> Design:
     excited = np.ptp(maps.applied, axis=0) >= EXCITATION_MIN
     count = int(excited.sum())
     if count == 0:
-        raise TooFewMapsError(f"no actuator was moved by {EXCITATION_MIN:g} or more in the {len(maps)} good maps")
+        raise TooFewMapsError(
+            f"no actuator was moved by {EXCITATION_MIN:g} or more in the {len(maps)} good maps: raise poke_amplitude, "
+            "or add surfaces that move the actuators"
+        )
     drift = drift_columns(maps.stamp_ns, maps.reference)
     if len(maps) < drift.shape[1] + count + DRIFT_SPARE_MAPS:
         drift = np.ones((len(maps), 1))
@@ -84,7 +87,7 @@ def make_design(maps: MapSet) -> Design:
     if len(maps) <= unknowns:
         raise TooFewMapsError(
             f"{len(maps)} good maps for {unknowns} unknowns ({count} actuators and the figure): "
-            f"at least {unknowns + 1} are needed"
+            f"at least {unknowns + 1} are needed; measure more shapes, or leave out fewer maps"
         )
     return Design(np.hstack((drift, maps.applied[:, excited])), drift.shape[1], excited)
 

@@ -51,13 +51,18 @@ def region_weights(variance: ArrayLike, epsilon: float) -> Floats:
         ValueError: epsilon not above 0, or a variance negative or not finite.
     """
     r = np.asarray(variance, dtype=float)
+    check_epsilon(epsilon)
+    if r.ndim != 1 or not r.size or not (np.isfinite(r) & (r >= 0.0)).all():
+        raise ValueError(f"variance = {r.tolist()}: must be one finite number of m^2, 0 or more, per region")
+    return np.asarray(1.0 / np.hypot(1.0, r / epsilon))
+
+
+def check_epsilon(epsilon: float) -> None:
+    """Raise ValueError unless `epsilon` (m^2) can be the prior parameter of Eq. (8)."""
     if not (np.isfinite(epsilon) and epsilon > 0.0):
         raise ValueError(
             f"epsilon = {epsilon:g} m^2: must be above 0 and finite; the median of the variances is a start"
         )
-    if r.ndim != 1 or not r.size or not (np.isfinite(r) & (r >= 0.0)).all():
-        raise ValueError(f"variance = {r.tolist()}: must be one finite number of m^2, 0 or more, per region")
-    return np.asarray(1.0 / np.hypot(1.0, r / epsilon))
 
 
 def surface_control_error(sag: Floats, signals: Floats, influence_zernike: Floats, points: SamplePoints) -> Floats:

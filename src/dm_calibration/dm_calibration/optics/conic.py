@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -64,11 +66,16 @@ def conic_coefficients(
     """
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius = {radius} m: must be positive")
+    x, y, projection = _quadrature()
+    return conic_sag(radius * x, radius * y, curvature, conic_constant, shift) @ projection
+
+
+@cache
+def _quadrature() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Points of the unit disc, x and y (Q,), and what takes sag there to coefficients, (Q, 21)."""
     nodes, weights = np.polynomial.legendre.leggauss(_RADIAL_NODES)
     r = np.sqrt((nodes + 1) / 2)
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
-    x, y = np.outer(r, np.cos(angle)), np.outer(r, np.sin(angle))
+    x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
     area = np.repeat(weights / (2 * _ANGLES), _ANGLES)
-    sag = conic_sag(radius * x, radius * y, curvature, conic_constant, shift)
-    terms = basis(x, y).reshape(-1, len(TERM_RMS))
-    return (area * sag.ravel()) @ terms / TERM_RMS**2
+    return x, y, area[:, np.newaxis] * basis(x, y) / TERM_RMS**2

@@ -6,6 +6,8 @@ its AZWreg.
 
 from __future__ import annotations
 
+import math
+
 from scipy import stats
 
 
@@ -13,7 +15,7 @@ def adjusted_r2_of_f(f_statistic: float, n: int, k: int) -> float:
     """Adjusted R^2 of a model of k variables and a constant on n samples that has this F: R^2 = kF / (kF + n - k - 1).
 
     Raises:
-        ValueError: F negative, k below 1, or n not above k + 1.
+        ValueError: F negative or not finite, k below 1, or n not above k + 1.
     """
     freedom = _freedom(f_statistic, n, k)
     r2 = k * f_statistic / (k * f_statistic + freedom)
@@ -34,6 +36,6 @@ def _freedom(f_statistic: float, n: int, k: int) -> int:
         raise ValueError(f"k = {k}: must be at least 1, the constant not counted")
     if n <= k + 1:
         raise ValueError(f"n = {n}: must be above k + 1 = {k + 1}, or no freedom is left for the residual")
-    if not f_statistic >= 0.0:
-        raise ValueError(f"F = {f_statistic:g}: must be 0 or more")
+    if not 0.0 <= f_statistic < math.inf:
+        raise ValueError(f"F = {f_statistic:g}: must be 0 or more and finite")
     return n - k - 1

@@ -111,6 +111,9 @@ class StepwiseFit:
 
         Returns:
             mean, lower, upper: (M,) each, in the unit of the response.
+
+        Raises:
+            ValueError: fewer columns than the fit has used, weights not above 0, or a level outside 0 to 1.
         """
         x = np.asarray(candidates, dtype=float)
         needed = max(self.columns, default=-1) + 1
@@ -257,8 +260,11 @@ def _select(x: Floats, y: Floats, w: Floats, options: SelectionOptions) -> list[
     columns, target = root[:, np.newaxis] * x, root * y
     # Only the variation about the constant counts, or an offset would hide what a candidate brings.
     unit = constant / np.linalg.norm(constant)
+    whole = np.square(columns).sum(axis=0)
     columns, target = columns - unit @ (unit.T @ columns), target - unit[:, 0] * (unit[:, 0] @ target)
     energy = np.square(columns).sum(axis=0)
+    # A candidate that varies in one sample only is constant where that one is left out: what remains is rounding.
+    varies = energy > CONSTANT**2 * whole
     floor = CONSTANT**2 * (target @ target)
     selected: list[int] = []
     # Every entry lowers the residual by more than a removal may raise it, so this ends; the bound guards rounding.
@@ -267,7 +273,7 @@ def _select(x: Floats, y: Floats, w: Floats, options: SelectionOptions) -> list[
         q = np.linalg.qr(columns[:, selected])[0]
         rest, left = columns - q @ (q.T @ columns), target - q @ (q.T @ target)
         size = np.square(rest).sum(axis=0)
-        free = size > TOLERANCE * energy
+        free = varies & (size > TOLERANCE * energy)
         free[selected] = False
         error = left @ left
         if freedom < options.freedom_min or not free.any() or error <= floor:

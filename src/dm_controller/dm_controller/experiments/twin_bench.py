@@ -18,6 +18,7 @@ from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.mirror import Mirror
 from dm_calibration.influence.surfaces import LinearModel
+from dm_calibration.memory.tracker import Applied
 from dm_calibration.optics.aperture import Aperture, configured_aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.sampling import edge_clustered_points, sample_map
@@ -126,6 +127,9 @@ class TwinBench:
         )
         self._fitter: MapFitter | None = None
         self._written: Floats = self._drive.signals()
+        self._turns = self._degausses = 0
+        self._turned_at: Floats | None = None
+        self._moved = 0.0
         self.time = 0.0
         self.maps = 0
         self.mirror = Mirror(
@@ -144,9 +148,7 @@ class TwinBench:
         other = copy.copy(self)
         other._drive, other._piezo = copy.deepcopy(self._drive), copy.deepcopy(self._piezo)
         other._noise = copy.deepcopy(self._noise)
-        # The plate and the camera's polynomials never change and are shared.
-        other._interferometer = copy.copy(self._interferometer)
-        other._interferometer._noise = other._noise
+        other._interferometer = self._interferometer.with_noise(other._noise)
         other._fitter = None
         return other
 
@@ -157,6 +159,8 @@ class TwinBench:
         rest = self.mirror.rest
         points = degauss_waypoints(len(rest), float(rest[0]), 1.0, self.config.degauss_steps, rest)
         self._write(list(self._limiter.path(self._written, points)))
+        self._turns, self._degausses = self._turns + 1, self._degausses + 1
+        self._turned_at, self._moved = self._written, self.time
 
     def apply(self, signals: Floats) -> Floats:
         """Ramp to `signals` (N,) by the driver's limiter, through the codes of the DAC; returns what was written.
@@ -165,8 +169,26 @@ class TwinBench:
             dm_driver.refusal.Refusal: signals that the driver would refuse.
         """
         target = self._limiter.check_shape(signals)
+        if not np.array_equal(target, self._written):
+            self._turns, self._turned_at = self._turns + 1, self._drive.signals()
         self._write(list(self._limiter.ramp(self._written, target)))
+        self._moved = self.time
         return self._drive.signals()
+
+    def power_cycle(self, off: float) -> None:
+        """Switch the electronics off for `off` s and on again: the actuators rest at 0 V, the driver starts anew."""
+        self._drive = DriveUnit(self._drive.config)
+        self._written = self._drive.signals()
+        self._piezo.apply(self._written, self.time)
+        self.time += off
+        self._turns = self._degausses = 0
+        self._turned_at, self._moved = None, self.time
+
+    def report(self) -> Applied:
+        """What the driver would report now."""
+        return Applied(
+            self._moved, self._drive.signals(), self._turns, self._turned_at, self._degausses, self._degausses > 0
+        )
 
     def _write(self, shapes: list[Floats]) -> None:
         for shape in shapes:
@@ -175,9 +197,9 @@ class TwinBench:
             self.time += self._limiter.pause_after(self._written, shape)
             self._written = shape
 
-    def settle(self) -> bool:
-        """Let the settle time pass."""
-        self.time += self.config.settle_time
+    def settle(self, dwell: float = 0.0) -> bool:
+        """Let the settle time and `dwell` s pass."""
+        self.time += self.config.settle_time + dwell
         return True
 
     def measure(self, label: str) -> Measurement:
@@ -236,6 +258,12 @@ class TwinBench:
         figure = self._interferometer.true_sag(np.zeros(count))[inside]
         columns = [self._interferometer.true_sag(unit)[inside] - figure for unit in np.eye(count)]
         return np.column_stack(columns), figure
+
+    @property
+    def true_displacement(self) -> Floats:
+        """(N,) base displacements at this moment, m: for judging only."""
+        self._piezo.advance(self.time)
+        return np.asarray(self._piezo.displacement)
 
     @property
     def true_stroke(self) -> Floats:

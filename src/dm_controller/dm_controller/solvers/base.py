@@ -158,12 +158,14 @@ class Solver(ABC):
             ("sag", shape.sag, self.model.sag_offset.size),
         ):
             if value.shape != (size,) or not np.isfinite(value).all():
-                raise ValueError(f"{name}: must be {size} finite numbers, as many as the calibration has")
+                raise ValueError(
+                    f"{name} of shape {value.shape}: must be {size} finite numbers, as many as the calibration has"
+                )
 
     def _check_signals(self, signals: Floats) -> None:
         count = self.model.influence_zernike.shape[1]
         if signals.shape != (count,) or not np.isfinite(signals).all():
-            raise ValueError(f"signals: must be {count} finite numbers, one per actuator")
+            raise ValueError(f"signals of shape {signals.shape}: must be {count} finite numbers, one per actuator")
 
     def limited(self, signals: Floats) -> Command:
         """Cut signals to the range, then draw them together about their mean until neighbours keep their limit."""
@@ -180,9 +182,15 @@ def normalised_terms(model: InfluenceModel) -> tuple[Floats, Floats]:
     """The influence function without piston and tilt in rms-normalised terms, (K - 3, N), and the factors (K - 3,).
 
     A unit of each term is then the same rms sag, so that a norm of coefficients is an rms error.
+
+    Raises:
+        ValueError: no actuator moves any of these terms.
     """
     factors = TERM_RMS[FREE : len(model.zernike_offset)]
-    return factors[:, None] * model.influence_zernike[FREE:], factors
+    matrix = factors[:, None] * model.influence_zernike[FREE:]
+    if not matrix.any():
+        raise ValueError("influence_zernike is zero: no actuator moves the surface; calibrate first")
+    return matrix, factors
 
 
 def miss_rows(matrix: Floats) -> Floats:

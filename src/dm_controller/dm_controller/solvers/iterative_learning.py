@@ -31,8 +31,6 @@ class IterativeLearning(Solver):
         super().__init__(model, limits)
         matrix, self._factors = normalised_terms(model)
         left, singular, right = np.linalg.svd(matrix, full_matrices=False)
-        if not singular[0] > 0.0:
-            raise ValueError("influence_zernike is zero: no actuator moves the surface; calibrate first")
         self._learning = (right.T * (singular / (singular**2 + beta * singular[0] ** 2))) @ left.T
 
     def _signals(self, start: Floats, change: Shape) -> Floats:

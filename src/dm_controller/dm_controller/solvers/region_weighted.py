@@ -38,6 +38,8 @@ class AZWreg(Solver):
         self._plane = np.linalg.qr(plane)[0]
         influence = remove_piston_tilt(model.influence_sag.T, points).T
         matrix = self._reduce(influence)
+        if not matrix.any():
+            raise ValueError("influence_sag is zero: no actuator moves the surface; calibrate first")
         self._inverse = np.linalg.pinv(matrix, rcond=CUTOFF)
         self._correction = np.linalg.pinv(np.vstack([matrix, miss_rows(matrix)]))[:, : len(matrix)]
 

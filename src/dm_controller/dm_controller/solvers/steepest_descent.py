@@ -29,8 +29,6 @@ class SteepestDescent(Solver):
         super().__init__(model, limits)
         self._matrix, self._factors = normalised_terms(model)
         singular = np.linalg.svd(self._matrix, compute_uv=False)
-        if not singular[0] > 0.0:
-            raise ValueError("influence_zernike is zero: no actuator moves the surface; calibrate first")
         self._gain = 2.0 / (singular[0] ** 2 + singular[-1] ** 2)
 
     def _signals(self, start: Floats, change: Shape) -> Floats:

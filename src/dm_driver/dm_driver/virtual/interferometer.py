@@ -7,6 +7,7 @@ pixel centres: about 3 ms for 944 x 944 pixels, and no influence maps to keep in
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,6 +110,15 @@ class Interferometer:
         self._figure = interpolate((shapes @ amplitudes)[..., None])[0]
         inside = self._evaluate(self._figure)[self.aperture]
         self._figure *= config.figure_rms / np.sqrt(np.mean((inside - inside.mean()) ** 2))
+
+    def with_noise(self, noise_rng: np.random.Generator) -> Interferometer:
+        """This very instrument and plate, drawing what differs from map to map from `noise_rng`.
+
+        What never changes (polynomials, figure) is shared, not copied.
+        """
+        other = copy.copy(self)
+        other._noise = noise_rng
+        return other
 
     def _evaluate(self, coefficients: Array) -> Array:
         return (self._rows @ coefficients) @ self._columns.T
