@@ -24,6 +24,8 @@ CHECK_PERIOD_S = 0.25
 #: A link that opened counts as standing when it still does after this time: a busy EDAC40 accepts a second TCP client
 #: only to close it, and a datagram's "port unreachable" takes a moment to return.
 CONFIRM_S = 0.05
+#: A degauss of at least this share of the full range wipes the memory.
+FULL_CYCLE = 0.999
 
 Listener = Callable[[WriterState, bool], None]
 
@@ -80,6 +82,9 @@ class ActuatorWriter:
         self._written: tuple[Shape, Shape, int] | None = None  # applied, volts, stamp
         self._sequence = 0
         self._history_known = False
+        self._degausses = 0
+        self._turns = 0
+        self._turned_at: Shape | None = None
         self._write_at = 0.0
         self._check_at = 0.0
         self._retry_at = 0.0
@@ -104,7 +109,8 @@ class ActuatorWriter:
         with self._change:
             self._enabled = self._accepting = self._rewrite_due = True
             self._shape = self._requested = self._safe_shape
-            self._sequence = 0
+            self._sequence = self._degausses = self._turns = 0
+            self._turned_at = None
             self._history_known = False
             self._change.notify_all()
             return self._change.wait_for(lambda: not self._rewrite_due, timeout_s)
@@ -167,7 +173,9 @@ class ActuatorWriter:
         if steps < 1:
             raise Refusal(Reason.OUT_OF_RANGE, f"steps = {steps}: must be at least 1")
         waypoints = degauss_waypoints(limits.actuators, middle, amplitude or largest, steps, end)
-        return self._submit(Move(Kind.DEGAUSS, waypoints, end))
+        # A smaller cycle leaves what wider swings have written.
+        wipes = (amplitude or largest) >= FULL_CYCLE * largest
+        return self._submit(Move(Kind.DEGAUSS, waypoints, end, wipes))
 
     def ramp_time(self, target: Shape) -> float:
         """Seconds that the slew limit needs from the present shape to `target`; 0 before the first write."""
@@ -203,6 +211,8 @@ class ActuatorWriter:
         assert self._shape is not None
         if self._current is not None:
             self._current.finish(Outcome.SUPERSEDED)
+            if self._under_way:
+                self._turn()
         self._current = move
         self._requested = move.target
         self._steps = self._limiter.path(self._shape, move.waypoints)
@@ -210,6 +220,11 @@ class ActuatorWriter:
         self._under_way = False
         if move.kind is Kind.DEGAUSS:
             self._history_known = False
+
+    def _turn(self) -> None:
+        """The way bends where the mirror now stands: hysteresis depends on these places only."""
+        self._turns += 1
+        self._turned_at = self._written[0] if self._written is not None else None
 
     def _end_moves(self, outcome: Outcome) -> None:
         for move in (self._mailbox, self._current):
@@ -232,6 +247,9 @@ class ActuatorWriter:
             stamp_ns=stamp_ns,
             sequence=self._sequence,
             history_known=self._history_known,
+            degausses=self._degausses,
+            turns=self._turns,
+            turned_at=self._turned_at,
             fault=self._fault,
         )
 
@@ -320,8 +338,10 @@ class ActuatorWriter:
             ended = self._next_shape is None
             if ended:
                 self._current = None
+                self._turn()
                 if move.kind is Kind.DEGAUSS:
-                    self._history_known = True
+                    self._history_known = move.wipes
+                    self._degausses += move.wipes
                     self._watchdog.feed(time.monotonic())
                 elif move.kind is Kind.SAFE and self._mailbox is None:
                     self._watchdog.disarm()

@@ -61,6 +61,7 @@ def state_message(
     message.sequence = state.sequence
     message.moving = state.moving is not None
     message.history_known = state.history_known
+    message.degausses, message.turns = state.degausses, state.turns
     if state.link_up or not state.enabled:
         message.error_code, message.message = int(complaint.reason), complaint.message
     else:
@@ -73,6 +74,8 @@ def state_message(
         message.requested = _floats(state.requested)
         message.applied = _floats(state.applied)
         message.volts = _floats(state.volts)
+        if state.turned_at is not None:
+            message.turned_at = _floats(state.turned_at)
         limits = configuration.limiter.limits
         # Quantisation may leave a signal up to one code short of its limit.
         code = configuration.output.scale.resolution

@@ -37,10 +37,12 @@ class Move:
         kind: what it is for.
         waypoints: shapes to pass; straight lines between them.
         target: the last of them.
+        wipes: a degauss over the full range, which leaves no memory.
     """
 
-    def __init__(self, kind: Kind, waypoints: Iterable[Shape], target: Shape) -> None:
+    def __init__(self, kind: Kind, waypoints: Iterable[Shape], target: Shape, wipes: bool = False) -> None:
         self.kind = kind
+        self.wipes = wipes
         self.waypoints = waypoints
         self.target = target
         self._ended = threading.Event()
@@ -81,7 +83,10 @@ class WriterState:
         volts: (N,) V at the actuators for `applied`.
         stamp_ns: when `applied` was written, in the caller's clock.
         sequence: writes since the writer was enabled.
-        history_known: every write since a completed degauss went through.
+        history_known: every write since a completed degauss over the full range went through.
+        degausses: such degausses since the writer was enabled.
+        turns: moves that ended or were left for another since the writer was enabled.
+        turned_at: (N,) what was applied where that happened last; None before the first.
         fault: why the link is down, in words; empty when it is up.
     """
 
@@ -94,4 +99,7 @@ class WriterState:
     stamp_ns: int
     sequence: int
     history_known: bool
+    degausses: int
+    turns: int
+    turned_at: Shape | None
     fault: str

@@ -160,11 +160,8 @@ def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
         assert not writer.state().history_known
         move = writer.degauss(0.5, 10, shape(0.2))
         assert move.wait(10) is Outcome.REACHED
-        assert writer.state().history_known
+        assert not writer.state().history_known  # wider swings than 0.5 are still remembered
         wait_until(lambda: len(unit.frames) == writer.state().sequence)
-        # History stays known while every write goes through.
-        assert writer.command(shape(0.25)).wait(5) is Outcome.REACHED
-        assert writer.state().history_known
         for bad in (lambda: writer.degauss(1.01, 10, shape(0)), lambda: writer.degauss(0.5, 0, shape(0))):
             assert refused(bad) is Reason.OUT_OF_RANGE
     one = signals_of(unit.frames)
@@ -174,6 +171,28 @@ def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
     # The first point, -0.5, is no turn: the mirror comes up from -1.
     expected = [(-1) ** (k + 1) * 0.5 * (1 - k / 10) for k in range(1, 10)]
     assert turns[:9] == pytest.approx(expected, abs=CODE)
+
+
+def test_a_full_degauss_makes_the_history_known_while_every_write_goes_through(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=1e4) as (writer, _told):
+        assert writer.degauss(0.0, 10, shape(0.2)).wait(10) is Outcome.REACHED
+        assert writer.state().history_known and writer.state().degausses == 1
+        assert writer.command(shape(0.25)).wait(5) is Outcome.REACHED
+        assert writer.state().history_known
+
+
+def test_every_turn_is_counted_and_told_with_its_place(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=20.0) as (writer, told):
+        assert writer.command(shape(0.5)).wait(5) is Outcome.REACHED
+        assert writer.state().turns == 1 and writer.state().turned_at == pytest.approx(0.5, abs=CODE)
+        left = writer.command(shape(-0.9))
+        wait_until(lambda: writer.state().applied is not None and writer.state().applied[0] < 0.2)
+        assert writer.command(shape(0.9)).wait(5) is Outcome.REACHED
+        assert left.wait(5) is Outcome.SUPERSEDED
+        assert writer.state().turns == 3
+    lowest = min(state.applied[0] for state, _ in told if state.applied is not None and state.turns >= 1)
+    places = {state.turns: state.turned_at[0] for state, _ in told if state.turned_at is not None}
+    assert places[2] == pytest.approx(lowest, abs=CODE) and places[3] == pytest.approx(0.9, abs=CODE)
 
 
 def test_a_command_cancels_a_degauss_and_leaves_the_history_unknown(unit: Edac40TcpUnit) -> None:
