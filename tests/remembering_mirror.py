@@ -38,7 +38,7 @@ class RememberingBench:
         self.lag = np.clip(self.lag, signals - BACKLASH, signals + BACKLASH)
         return signals
 
-    def settle(self) -> bool:
+    def settle(self, dwell: float = 0.0) -> bool:
         self.clock_ns += 10**9
         return True
 

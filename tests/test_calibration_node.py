@@ -20,6 +20,7 @@ from dm_msgs.srv import Degauss, FitInfluenceFunction, ListCalibrations, LoadCal
 
 from dm_calibration.influence.mirror import Mirror
 from dm_calibration.influence.sag import remove_piston_tilt
+from dm_calibration.plan import PlanKind
 from dm_calibration.store import CalibrationStore
 from dm_runtime import qos
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
@@ -42,6 +43,8 @@ class StandIn:
         self.degaussed = 0
         self.measured: list[str] = []
         self.failing: set[str] = set()
+        self.other_wavelength: set[str] = set()
+        self.other_aperture: set[str] = set()
         self.disturbed_at = ""
         self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
         self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
@@ -90,8 +93,8 @@ class StandIn:
         sag = self.plant.sag(self.signals)
         zernike, samples = response.zernike, response.samples
         zernike.header.stamp = samples.header.stamp = self.node.get_clock().now().to_msg()
-        zernike.radius = samples.radius = RADIUS
-        zernike.wavelength = 632.8e-9
+        zernike.radius = samples.radius = 10e-3 if request.label in self.other_aperture else RADIUS
+        zernike.wavelength = 635e-9 if request.label in self.other_wavelength else 632.8e-9
         zernike.coefficients = doubles(self.plant.fit_terms(sag))
         zernike.residual_rms, zernike.valid_fraction = 3e-9, 0.97
         samples.x, samples.y = doubles(self.plant.points.x), doubles(self.plant.points.y)
@@ -196,6 +199,12 @@ def test_calibrate_store_publish_and_serve(node: NodeProcess, bench: StandIn, ob
     assert unknown.error_code == ErrorCode.UNKNOWN_NAME and "poke-99" in unknown.message
     wrong = observer.call(FitInfluenceFunction, "fit_influence_function", FitInfluenceFunction.Request(method="AZx"))
     assert wrong.error_code == ErrorCode.UNKNOWN_NAME and "AZreg" in wrong.message
+    few = [f"poke-{k:02d}" for k in range(1, ACTUATORS + 1)] + [f"reference {k}" for k in range(2, 6)]
+    wrong = observer.call(
+        FitInfluenceFunction, "fit_influence_function", FitInfluenceFunction.Request(exclude=few, activate=True)
+    )
+    assert wrong.error_code == ErrorCode.TOO_FEW_MAPS and "leave out fewer maps" in wrong.message, wrong.message
+    assert received[-1].id == fitted.id
 
     (folder / "broken.h5").write_bytes(Path(result.file).read_bytes()[:5000])
     listed = observer.call(ListCalibrations, "list_calibrations")
@@ -286,13 +295,18 @@ def test_failures_are_told_and_leave_things_as_they_were(
 
     run(pokes(poke_amplitude=float("nan")), ErrorCode.OUT_OF_RANGE, "poke_amplitude = nan: must be 0 to 1")
     run(pokes(settle_time=-1.0), ErrorCode.OUT_OF_RANGE, "settle_time = -1.0")
-    run(Calibrate.Goal(plan=9), ErrorCode.OUT_OF_RANGE, "plan = 9: must be 0 to 3")
+    run(Calibrate.Goal(plan=9), ErrorCode.OUT_OF_RANGE, f"plan = 9: must be 0 to {max(PlanKind)}")
     unknown = Calibrate.Goal(plan=Calibrate.Goal.PLAN_SURFACES, surfaces=["p60"])
     run(unknown, ErrorCode.UNKNOWN_NAME, "surface 'p60' is unknown; did you mean")
-    bench.failing = {f"poke{mark}{k:02d}" for mark in "+-" for k in range(1, 20)}
+    all_pokes = {f"poke{mark}{k:02d}" for mark in "+-" for k in range(1, 20)}
+    bench.failing = all_pokes
     result = run(pokes(), ErrorCode.MAP_TIMEOUT, "3 states in a row gave no map")
     assert len(result.dropped) == 3 and result.maps == 1
-    bench.failing = set()
+    bench.failing, bench.other_wavelength = set(), all_pokes
+    run(pokes(), ErrorCode.MAP_REJECTED, "wavelength 635.000 nm, before it was 632.800 nm (0 = not told): never mix")
+    bench.other_wavelength, bench.other_aperture = set(), all_pokes
+    run(pokes(), ErrorCode.MAP_REJECTED, "aperture radius 10.000 mm, the mirror's is 11.000 mm")
+    bench.other_aperture = set()
     few = Calibrate.Goal(plan=Calibrate.Goal.PLAN_SURFACES, surfaces=["p01", "p05"])
     run(few, ErrorCode.TOO_FEW_MAPS, "good maps")
     bench.publish_state(ActuatorState.STATE_INACTIVE)

@@ -199,7 +199,7 @@ def test_set_signals_answers_when_the_shape_stands(driver: Driver) -> None:
 
 
 def test_degauss_makes_the_history_known(driver: Driver) -> None:
-    request = Degauss.Request(amplitude=0.4, steps=6, end_signals=[0.1] * 37)
+    request = Degauss.Request(steps=6, end_signals=[0.1] * 37)
     answer = driver.observer.call(Degauss, "degauss", request)
     assert answer.error_code == ErrorCode.OK and answer.duration > 0
     state = driver.wait_for_state(lambda state: state.history_known and not state.moving, "history known")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, TypeVar
 
@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 from dm_calibration.hdf5_image import Attribute, Column
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.memory.memory_fit import MemoryFit
+from dm_calibration.memory.recipes import NO_RECIPES, RecipeBook
+from dm_calibration.memory.storage import memory_columns, memory_from, recipe_columns, recipes_from
+from dm_calibration.optics.regions import AREA_FRACTIONS
 from dm_calibration.optics.sampling import SamplePoints
 
 T = TypeVar("T")
@@ -46,6 +50,9 @@ class Calibration:
         targets: the shapes that were solved from an influence function, in words; their coefficients are maps.nominal.
         limitations: sentences; those of the fit, of the run, and of the poke check.
         note: the user's.
+        memory: hysteresis and creep; with it, `fit` acts on effective signals. None = not identified.
+        recipes: built on this calibration.
+        region_weights: (10,) Eq. (8), for commands weighted by region; empty where no sample surfaces were measured.
     """
 
     id: str
@@ -63,6 +70,9 @@ class Calibration:
     limitations: tuple[str, ...] = ()
     note: str = ""
     software_version: str = ""
+    memory: MemoryFit | None = None
+    recipes: RecipeBook = NO_RECIPES
+    region_weights: Floats = field(default_factory=lambda: np.zeros(0))
 
     @property
     def stamp_ns(self) -> int:
@@ -92,9 +102,9 @@ def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, A
     }
     for name in _POINTS:
         columns[f"points/{name}"] = getattr(maps.points, name)
-    for field in fields(MapSet):
-        if field.name != "points":
-            columns[f"maps/{field.name}"] = getattr(maps, field.name)
+    for column in fields(MapSet):
+        if column.name != "points":
+            columns[f"maps/{column.name}"] = getattr(maps, column.name)
     columns["maps/reference"] = maps.reference
     attributes: dict[str, Attribute] = {
         "schema": SCHEMA,
@@ -112,16 +122,19 @@ def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, A
         "note": calibration.note,
         "maps_used": int(fit.used.sum()),
     }
-    for field in fields(InfluenceFit):
-        value = getattr(fit, field.name)
-        if field.name == "points":
+    for figure in fields(InfluenceFit):
+        value = getattr(fit, figure.name)
+        if figure.name == "points":
             continue
         if isinstance(value, np.ndarray):
-            columns[f"result/{field.name}"] = value
-        elif field.name == "reasons":
+            columns[f"result/{figure.name}"] = value
+        elif figure.name == "reasons":
             columns["result/reasons"] = value
         else:
-            attributes[f"fit_{field.name}"] = value
+            attributes[f"fit_{figure.name}"] = value
+    if calibration.region_weights.size:
+        columns["regions/weights"] = calibration.region_weights
+    columns |= memory_columns(calibration.memory) | recipe_columns(calibration.recipes)
     return columns, attributes
 
 
@@ -142,11 +155,11 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         raw: dict[str, Any] = {f.name: columns[f"maps/{f.name}"] for f in fields(MapSet) if f.name != "points"}
         maps = MapSet(points=points, **raw)
         result: dict[str, Any] = {"points": points}
-        for field in fields(InfluenceFit):
-            if field.name == "points":
+        for figure in fields(InfluenceFit):
+            if figure.name == "points":
                 continue
-            path = f"result/{field.name}"
-            result[field.name] = columns[path] if path in columns else attributes[f"fit_{field.name}"]
+            path = f"result/{figure.name}"
+            result[figure.name] = columns[path] if path in columns else attributes[f"fit_{figure.name}"]
         fit = InfluenceFit(**result)
         calibration = Calibration(
             id=_typed(attributes, "id", str),
@@ -164,6 +177,9 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
             limitations=_typed(attributes, "known_limitations", tuple),
             note=_typed(attributes, "note", str),
             software_version=_typed(attributes, "software_version", str),
+            memory=memory_from(columns),
+            recipes=recipes_from(columns),
+            region_weights=np.asarray(columns.get("regions/weights", np.zeros(0)), dtype=np.float64),
         )
     except KeyError as error:
         raise CalibrationFileError(f"{error.args[0]} is missing") from error
@@ -206,6 +222,15 @@ def _check_result(calibration: Calibration) -> None:
         raise CalibrationFileError(f"result/reasons has {len(fit.reasons)} entries: must be {m}")
     if calibration.actuator_x.shape != (n,) or calibration.actuator_y.shape != (n,):
         raise CalibrationFileError(f"mirror/actuator_x and actuator_y: must have {n} values each")
+    if calibration.memory is not None and calibration.memory.zernike_sigma.shape != (k,):
+        raise CalibrationFileError(f"memory/zernike_sigma: must have {k} values")
+    weights = calibration.region_weights
+    if weights.size and not (
+        weights.shape == (len(AREA_FRACTIONS),) and np.all(weights > 0.0) and np.all(weights <= 1.0)
+    ):
+        raise CalibrationFileError(f"regions/weights: must be {len(AREA_FRACTIONS)} numbers above 0, at most 1")
+    if any(recipe.effective.shape != (n,) for recipe in calibration.recipes.recipes):
+        raise CalibrationFileError(f"recipes/effective: must have {n} signals each")
     for name in ("x", "y", "weight"):
         if not np.isfinite(getattr(maps.points, name)).all():
             raise CalibrationFileError(f"points/{name} holds values that are not finite")

@@ -29,6 +29,8 @@ _PHASES = {
     StepKind.DEGAUSS: Calibrate.Feedback.PHASE_DEGAUSS,
     StepKind.POKE: Calibrate.Feedback.PHASE_POKES,
     StepKind.SURFACE: Calibrate.Feedback.PHASE_SURFACES,
+    StepKind.EXCITATION: Calibrate.Feedback.PHASE_MEMORY,
+    StepKind.CHECK: Calibrate.Feedback.PHASE_MEMORY,
 }
 
 
@@ -94,6 +96,7 @@ class CalibrateAction:
             reference_every=goal.reference_every or self._values["reference_every"],
             surfaces=tuple(goal.surfaces),
             degauss=not goal.skip_degauss,
+            memory_maps=goal.memory_maps or self._values["memory_maps"],
         )
         return make_plan(PlanKind(goal.plan), mirror, options)
 
@@ -146,6 +149,8 @@ class CalibrateAction:
             provenance = self._desk.provenance(mirror.name, mirror.serial, goal.note)
             calibration, check = evaluate(outcome, mirror, fit_options(self._values), provenance, remarks)
             fit = calibration.fit
+            if (memory := calibration.memory) is not None:
+                result.memory_law, result.memory_held_out_max_zernike = memory.name, memory.held_out_max_zernike
             result.dropped = dropped_maps(calibration.maps, fit, outcome.dropped)
         result.maps = int(fit.used.sum())
         result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms

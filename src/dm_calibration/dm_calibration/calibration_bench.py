@@ -79,9 +79,9 @@ class RosBench:
         applied = np.array(response.applied, dtype=np.float64)
         return applied if applied.shape == signals.shape else signals
 
-    def settle(self) -> bool:
+    def settle(self, dwell: float = 0.0) -> bool:
         try:
-            return sleep(self._node.get_clock(), self.settle_time, self.cancelled)
+            return sleep(self._node.get_clock(), self.settle_time + dwell, self.cancelled)
         except TimeoutError as error:
             raise BenchError(ErrorCode.TIMEOUT, str(error)) from error
 

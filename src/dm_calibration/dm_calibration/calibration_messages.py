@@ -8,12 +8,17 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from dm_msgs.msg import ActuatorMemory, MirrorInfo, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
-from dm_msgs.msg import MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import Recipe as RecipeMsg
+from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.mirror import Mirror
+from dm_calibration.memory.law import MemoryLaw
+from dm_calibration.memory.memory_fit import MemoryFit
+from dm_calibration.memory.recipes import Recipe, RecipeBook
 from dm_calibration.optics.sampling import SamplePoints
 from dm_calibration.procedure import Measurement
 
@@ -136,4 +141,92 @@ def calibration_message(
     message.quality = CalibrationMsg.CALIBRATED if good else CalibrationMsg.APPROXIMATE
     message.actuator_grade = array("B", fit.grades.astype(np.uint8).tobytes())
     message.known_limitations = list(calibration.limitations)
+    message.region_weights = doubles(calibration.region_weights)
+    if calibration.memory is not None:
+        message.memory = memory_message(calibration.memory)
+    message.recipes = recipe_book_message(calibration.recipes)
     return message
+
+
+def memory_message(memory: MemoryFit) -> ActuatorMemory:
+    """The memory of a calibration."""
+    law = memory.law
+    return ActuatorMemory(
+        law=memory.name,
+        play_radius=doubles(law.play_radius),
+        powers=law.play_weight.shape[1],
+        play_weight=doubles(law.play_weight),
+        duhem_slope=doubles(law.duhem_slope),
+        duhem_weight=law.duhem_weight,
+        creep_rate=law.creep_rate,
+        creep_time=doubles(law.creep_time),
+        zernike_sigma=doubles(memory.zernike_sigma),
+        held_out_max_zernike=memory.held_out_max_zernike,
+        unknown_sigma=memory.unknown_sigma,
+        maps=memory.maps,
+    )
+
+
+def memory_law_from(message: ActuatorMemory) -> MemoryLaw | None:
+    """The law in a message; None when no memory was identified.
+
+    Raises:
+        ValueError: naming the field that makes no sense.
+    """
+    radius = np.array(message.play_radius, dtype=np.float64)
+    if not radius.size:
+        return None
+    weight = np.array(message.play_weight, dtype=np.float64)
+    if weight.size != radius.size * message.powers or not message.powers:
+        raise ValueError(f"memory: play_weight has {weight.size} values, must be {radius.size} x {message.powers}")
+    return MemoryLaw(
+        radius,
+        weight.reshape(radius.size, message.powers),
+        np.array(message.duhem_slope, dtype=np.float64),
+        message.duhem_weight,
+        message.creep_rate,
+        np.array(message.creep_time, dtype=np.float64),
+    )
+
+
+def recipe_book_message(book: RecipeBook) -> RecipeBookMsg:
+    """Recipes as a message."""
+    recipes = [
+        RecipeMsg(
+            curvature=recipe.curvature,
+            conic_constant=recipe.conic_constant,
+            effective=doubles(recipe.effective),
+            signals=doubles(recipe.signals),
+            max_zernike=recipe.max_zernike,
+            rms=recipe.rms,
+            maps=recipe.maps,
+        )
+        for recipe in book.recipes
+    ]
+    return RecipeBookMsg(
+        stamp=time_message(book.stamp_ns),
+        degauss_steps=book.degauss_steps,
+        interpolation_error=book.interpolation_error,
+        recipes=recipes,
+    )
+
+
+def recipe_book_from(message: RecipeBookMsg) -> RecipeBook:
+    """Recipes of a message.
+
+    Raises:
+        RecipeError: they do not fit together.
+    """
+    recipes = [
+        Recipe(
+            recipe.curvature,
+            recipe.conic_constant,
+            np.array(recipe.effective, dtype=np.float64),
+            np.array(recipe.signals, dtype=np.float64),
+            recipe.max_zernike,
+            recipe.rms,
+            recipe.maps,
+        )
+        for recipe in message.recipes
+    ]
+    return RecipeBook(tuple(recipes), message.degauss_steps, message.interpolation_error, stamp_ns(message.stamp))

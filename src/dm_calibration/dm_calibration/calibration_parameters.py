@@ -21,6 +21,7 @@ PARAMETERS = (
     ),
     Parameter("poke_amplitude", float, 0.5, "Half-swing of a push-pull poke, normalised.", "", 0.01, 1.0, live=True),
     Parameter("reference_every", int, 10, "Steps between two reference frames.", "", 1, 1000, live=True),
+    Parameter("memory_maps", int, 300, "Commands of a memory plan; more give less noise.", "", 60, 2000, live=True),
     Parameter("settle_time", float, 0.5, "Wait between command and map, in ROS time.", "s", 0.0, 600.0, live=True),
     Parameter("measure_retries", int, 1, "Further tries after a map that failed.", "", 0, 20, live=True),
     Parameter(
@@ -40,6 +41,16 @@ PARAMETERS = (
         live=True,
     ),
     Parameter("folds", int, 10, "Folds of the cross-validation.", "", 2, 1000, live=True),
+    Parameter(
+        "epsilon",
+        float,
+        0.0,
+        "Prior parameter of the region weights of AZWreg, Eq. (8); 0 = by cross-validation.",
+        "m^2",
+        0.0,
+        1e-6,
+        live=True,
+    ),
     Parameter("valid_fraction_min", float, 0.5, "Least share of valid pixels of a map.", "", 0.0, 1.0, live=True),
     Parameter(
         "outlier_sigmas",
@@ -96,7 +107,7 @@ def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
     grades = GradeOptions(
         dead_sigmas=values["dead_sigmas"], weak_sigmas=values["weak_sigmas"], weak_share=values["weak_share"]
     )
-    return FitOptions(method or FitOptions().method, values["folds"], screening, grades)
+    return FitOptions(method or FitOptions().method, values["folds"], screening, grades, values["epsilon"] or None)
 
 
 def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> ProcedureOptions:

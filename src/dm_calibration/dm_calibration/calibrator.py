@@ -6,14 +6,20 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration, software_version
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import EXCITATION, SURFACE, MapSet
 from dm_calibration.influence.mirror import Mirror
 from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
+from dm_calibration.influence.region_weighting import weighting_of
+from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.memory.memory_fit import MemoryFit, effective_maps, fit_memory
 from dm_calibration.poke_check import PokeCheck, check_pokes
 from dm_calibration.procedure import Outcome
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -40,15 +46,17 @@ def check_fit(fit: InfluenceFit, mirror: Mirror) -> PokeCheck:
 def evaluate(
     outcome: Outcome, mirror: Mirror, options: FitOptions, provenance: Provenance, run_limitations: Collection[str] = ()
 ) -> tuple[Calibration, PokeCheck]:
-    """Fit the maps of a run and compare the responses with the layout.
+    """Fit the maps of a run and compare the responses with the layout; where it holds excitation, the memory first.
 
     Raises:
-        TooFewMapsError: the good maps do not determine the unknowns.
+        TooFewMapsError: the good maps do not determine the unknowns, or do not show the memory.
+        ValueError: time stamps that run backwards where the memory is to be identified.
     """
     maps = outcome.maps()
-    fit = fit_influence(maps, options, rings=mirror.rings)
+    memory = fit_memory(maps) if EXCITATION in maps.kind else None
+    fit = fit_remembering(maps, memory, options, mirror)
     check = check_fit(fit, mirror)
-    limitations = [*fit.limitations, *run_limitations]
+    limitations = [*fit.limitations, *(memory.remarks if memory else ()), *run_limitations]
     if not outcome.radius_known:
         limitations.append(
             "The maps do not tell their aperture radius; the mirror's working aperture "
@@ -74,8 +82,34 @@ def evaluate(
         limitations=tuple(limitations),
         note=provenance.note,
         software_version=software_version(),
+        memory=memory,
+        region_weights=_region_weights(maps, fit, options),
     )
     return calibration, check
+
+
+def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Floats:
+    """(10,) weights for commands weighted by region; empty where the maps give none."""
+    if SURFACE not in maps.kind:
+        return np.zeros(0)
+    try:
+        return weighting_of(maps, fit.used, options.folds, options.epsilon).weights
+    except (TooFewMapsError, ValueError):  # a calibration is whole without them
+        return np.zeros(0)
+
+
+def fit_remembering(
+    maps: MapSet, memory: MemoryFit | None, options: FitOptions, mirror: Mirror, exclude: Collection[str] = ()
+) -> InfluenceFit:
+    """The influence function of `maps`, of effective signals when a memory is known.
+
+    Raises:
+        As :func:`~dm_calibration.influence.fit.fit_influence`.
+    """
+    if memory is None:
+        return fit_influence(maps, options, rings=mirror.rings, exclude=exclude)
+    fit = fit_influence(effective_maps(maps, memory.law), options, rings=mirror.rings, exclude=exclude)
+    return replace(fit, signal_min=float(maps.applied.min()), signal_max=float(maps.applied.max()))
 
 
 def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], provenance: Provenance) -> Calibration:
@@ -88,7 +122,7 @@ def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], pr
     mirror = Mirror(
         stored.mirror_name, stored.mirror_serial, stored.actuator_x, stored.actuator_y, stored.aperture_radius
     )
-    fit = fit_influence(stored.maps, options, rings=mirror.rings, exclude=exclude)
+    fit = fit_remembering(stored.maps, stored.memory, options, mirror, exclude)
     of_the_run = [sentence for sentence in stored.limitations if sentence not in stored.fit.limitations]
     without = f" without {', '.join(exclude)}" if exclude else ""
     return replace(
@@ -96,6 +130,7 @@ def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], pr
         id=provenance.id,
         created_ns=provenance.created_ns,
         fit=fit,
+        region_weights=_region_weights(stored.maps, fit, options),
         limitations=(*fit.limitations, *of_the_run, f"Fitted again from the raw data of {stored.id}{without}."),
         note=provenance.note or stored.note,
         software_version=software_version(),

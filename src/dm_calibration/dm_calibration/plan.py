@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence import surfaces
 from dm_calibration.influence.mirror import Mirror, scale_to_limits
+from dm_calibration.memory.excitation import REPEATS, excitation
 
 Floats = NDArray[np.float64]
+
+#: Commands between two reference frames of a MEMORY plan; creep takes up most of what drifts.
+MEMORY_REFERENCE_EVERY = 100
 
 
 class PlanKind(IntEnum):
@@ -22,6 +26,7 @@ class PlanKind(IntEnum):
     POKES = 1
     SURFACES = 2
     POKE_CHECK = 3
+    MEMORY = 4
 
 
 class StepKind(Enum):
@@ -31,6 +36,8 @@ class StepKind(Enum):
     REFERENCE = "reference"
     POKE = "poke"
     SURFACE = "surface"
+    EXCITATION = "excitation"
+    CHECK = "check"
 
 
 @dataclass(frozen=True)
@@ -42,12 +49,14 @@ class Step:
         kind: see StepKind.
         signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes.
         nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
+        dwell: to hold the shape beyond the settle time, s.
     """
 
     label: str
     kind: StepKind
     signals: Floats | None = None
     nominal: Floats | None = None
+    dwell: float = 0.0
 
     @property
     def needs_model(self) -> bool:
@@ -64,12 +73,14 @@ class PlanOptions:
         reference_every: steps between two reference frames.
         surfaces: names of Table 1; empty = all.
         degauss: whether to start with a degauss.
+        memory_maps: commands of a MEMORY plan.
     """
 
     poke_amplitude: float = 0.5
     reference_every: int = 10
     surfaces: Sequence[str] = ()
     degauss: bool = True
+    memory_maps: int = 300
 
     def __post_init__(self) -> None:
         if not 0.0 < self.poke_amplitude <= 1.0:
@@ -99,6 +110,8 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
         ValueError: a surface asked for by name that this mirror cannot have, or an option out of its range.
     """
     options = options or PlanOptions()
+    if kind is PlanKind.MEMORY:
+        return _memory_plan(mirror, options)
     remarks: list[str] = []
     states: list[Step] = []
     names = surfaces.check_names(options.surfaces)
@@ -110,6 +123,27 @@ def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None
     if options.degauss:
         steps.insert(0, Step("degauss", StepKind.DEGAUSS))
     return Plan(kind, tuple(steps), tuple(remarks))
+
+
+def _memory_plan(mirror: Mirror, options: PlanOptions) -> Plan:
+    """A degauss, repeated maps at rest, and the excitation.
+
+    Raises:
+        ValueError: a run that would not begin with a degauss, or of too few or too many maps.
+    """
+    if not options.degauss:
+        raise ValueError("skip_degauss = true: the memory can only be identified from a degauss on")
+    commands = excitation(mirror, options.memory_maps)
+    steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
+    steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]
+    for k, (signals, dwell, check) in enumerate(
+        zip(commands.signals, commands.dwell, commands.check, strict=True)
+    ):  # fmt: skip
+        kind = StepKind.CHECK if check else StepKind.EXCITATION
+        steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell)))
+        if (k + 1) % MEMORY_REFERENCE_EVERY == 0:
+            steps.append(Step(f"reference {2 + k // MEMORY_REFERENCE_EVERY}", StepKind.REFERENCE, mirror.rest))
+    return Plan(PlanKind.MEMORY, tuple(steps))
 
 
 def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple[Step, surfaces.Surface]:

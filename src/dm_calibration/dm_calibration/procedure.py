@@ -75,8 +75,8 @@ class Bench(Protocol):
     def apply(self, signals: Floats) -> Floats:
         """Command `signals` (N,), wait until they stand, return what was written (N,). Raises BenchError."""
 
-    def settle(self) -> bool:
-        """Wait the settle time; False when cancelled meanwhile."""
+    def settle(self, dwell: float = 0.0) -> bool:
+        """Wait the settle time and `dwell` s more; False when cancelled meanwhile."""
 
     def measure(self, label: str) -> Measurement:
         """Take one map. Raises MeasurementError, or BenchError when no other try can succeed."""
@@ -223,7 +223,7 @@ class Procedure:
     def _measure_state(self, step: Step, number: int) -> None:
         assert step.signals is not None
         applied = self._bench.apply(step.signals)
-        if not self._bench.settle():
+        if not self._bench.settle(step.dwell):
             raise Cancelled("cancelled while settling")
         taken = 0
         failure = MeasurementError(MAP_REJECTED, "")
@@ -276,20 +276,25 @@ class Procedure:
                 raise MeasurementError(
                     MAP_REJECTED,
                     f"aperture radius {measured.radius * 1e3:.3f} mm, the mirror's is {expected * 1e3:.3f} mm "
-                    f"+-{self._options.aperture_tolerance:.1%}",
+                    f"+-{self._options.aperture_tolerance:.1%}: never mix apertures in one fit, set the "
+                    "interferometer's aperture.radius to the mirror's",
                 )
         if self.outcome.points is None:
             self.outcome.points = measured.points
             self.outcome.wavelength = measured.wavelength
             self.outcome.system_error_subtracted = measured.system_error_subtracted
         elif not same_points(measured.points, self.outcome.points):
-            raise MeasurementError(MAP_REJECTED, "sampled at other points than the maps before")
+            raise MeasurementError(
+                MAP_REJECTED,
+                "sampled at other points than the maps before: leave the interferometer's sample_count alone in a run",
+            )
         elif abs(measured.wavelength - self.outcome.wavelength) > (
             self._options.wavelength_tolerance * self.outcome.wavelength
         ):
             raise MeasurementError(
                 MAP_REJECTED,
-                f"wavelength {measured.wavelength * 1e9:.3f} nm, before it was {self.outcome.wavelength * 1e9:.3f} nm",
+                f"wavelength {measured.wavelength * 1e9:.3f} nm, before it was {self.outcome.wavelength * 1e9:.3f} nm "
+                "(0 = not told): never mix wavelengths in one fit, measure the whole run with one instrument",
             )
         elif measured.system_error_subtracted != self.outcome.system_error_subtracted:
             raise MeasurementError(MAP_REJECTED, "system error subtracted differs from the maps before: never mix them")

@@ -45,7 +45,7 @@ class Bench:
         self.applied.append(self.signals)
         return self.signals
 
-    def settle(self) -> bool:
+    def settle(self, dwell: float = 0.0) -> bool:
         self.clock_ns += 10**9
         return not self.stopped
 
@@ -141,8 +141,9 @@ def test_failures_that_are_not_in_a_row_do_not_end_it(bench: Bench, mirror: Mirr
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"radius": 10e-3}, "aperture radius 10.000 mm, the mirror's is 11.000 mm"),
-        ({"wavelength": 1064e-9}, "wavelength 1064.000 nm"),
+        ({"radius": 10e-3}, "aperture radius 10.000 mm, the mirror's is 11.000 mm +-2.0%: never mix"),
+        ({"wavelength": 1064e-9}, "wavelength 1064.000 nm, before it was 632.800 nm (0 = not told): never mix"),
+        ({"wavelength": 0.0}, "wavelength 0.000 nm"),
         ({"system_error_subtracted": 1}, "never mix"),
         ({"coefficients": np.zeros(15)}, "15 Zernike terms"),
         ({"points": LinearMirror(np.zeros(1), np.zeros(1)).points.__class__(*np.zeros((3, 300)))}, "other points"),

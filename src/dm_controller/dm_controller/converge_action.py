@@ -175,7 +175,11 @@ class ConvergeAction:
         calibration, mirror = self._known()
         if calibration is None or mirror is None:
             raise BenchError(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
-        facts = MirrorFacts(np.asarray(mirror.actuator_x, dtype=float), np.asarray(mirror.actuator_y, dtype=float))
+        facts = MirrorFacts(
+            np.asarray(mirror.actuator_x, dtype=float),
+            np.asarray(mirror.actuator_y, dtype=float),
+            np.asarray(calibration.region_weights, dtype=float) if len(calibration.region_weights) else None,
+        )
         return make_solver(method, model_of(calibration), limits_of(mirror), facts)
 
     def _judge(self, outcome: LoopResult) -> tuple[str, int, str]:

@@ -1,0 +1,125 @@
+"""From the maps of a run to the law of a mirror, with what it may be trusted to predict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.fit import PISTON_TILT
+from dm_calibration.influence.maps import CHECK, MapSet
+from dm_calibration.memory.identify import Identification, Run, identify
+from dm_calibration.memory.law import MemoryLaw, follow
+from dm_calibration.memory.responses import responses_of
+from dm_calibration.optics.zernike import TERM_RMS
+
+Floats = NDArray[np.float64]
+
+#: Draws for quantiles of the largest of many correlated errors.
+DRAWS = 4000
+#: Moves of the random histories that tell what not knowing the history means.
+HISTORY_MOVES = 12
+#: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
+BEFORE_FIRST_MAP_S = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class MemoryFit:
+    """The memory of one mirror.
+
+    Attributes:
+        name: class of the law, in words.
+        law: see :class:`~dm_calibration.memory.law.MemoryLaw`.
+        zernike_sigma: (K,) m, standard deviation of the coefficients of a predicted move, on maps that had no part in
+            the fit, the maps' own noise taken off; 0 for piston and tilt.
+        held_out_max_zernike: m, 95th percentile of the largest of them.
+        unknown_sigma: standard deviation of an effective signal when the history is not known.
+        maps: number that the law was identified from.
+        remarks: sentences on how the law was chosen.
+    """
+
+    name: str
+    law: MemoryLaw
+    zernike_sigma: Floats
+    held_out_max_zernike: float
+    unknown_sigma: float
+    maps: int
+    remarks: tuple[str, ...]
+
+
+def fit_memory(maps: MapSet, progress: Callable[[str], None] = lambda step: None) -> MemoryFit:
+    """Identify the law from the maps of one run, in the order measured, which begins with a degauss.
+
+    Maps of kind CHECK test the law before they join the final fit.
+
+    Raises:
+        ExcitationError: the maps do not show the memory.
+        TooFewMapsError: no map can be used.
+        ValueError: time stamps that run backwards.
+    """
+    time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
+    run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S)
+    test = np.array([kind == CHECK for kind in maps.kind])
+    found = identify(run, test, progress=progress)
+    covariance = _error_covariance(found, run, maps.terms)
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
+    sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
+    return MemoryFit(
+        name=found.fit.candidate.name,
+        law=found.fit.law,
+        zernike_sigma=sigma,
+        held_out_max_zernike=float(np.quantile(np.abs(draws).max(axis=1), 0.95)),
+        unknown_sigma=unknown_history_sigma(found.fit.law),
+        maps=int(run.responses.usable.sum()),
+        remarks=_remarks(found),
+    )
+
+
+def effective_maps(maps: MapSet, law: MemoryLaw) -> MapSet:
+    """`maps` of one run with effective signals in the place of those applied.
+
+    Raises:
+        ValueError: time stamps that run backwards.
+    """
+    time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
+    state = law.demagnetised(maps.actuators, -BEFORE_FIRST_MAP_S)
+    return replace(maps, applied=follow(law, state, maps.applied, time)[0])
+
+
+def unknown_history_sigma(law: MemoryLaw, seed: int = 0, actuators: int = 500) -> float:
+    """Standard deviation of the static effective signal at one signal over random histories."""
+    rng = np.random.default_rng(seed)
+    signals = rng.uniform(-1.0, 1.0, actuators)
+    ends = []
+    for _ in range(2):
+        state = law.demagnetised(actuators, 0.0)
+        for _ in range(HISTORY_MOVES):
+            state = law.move(state, rng.uniform(-1.0, 1.0, actuators), 0.0)
+        ends.append(law.move(state, signals, 0.0).position)
+    return float(np.std(ends[1] - ends[0]) / np.sqrt(2.0))
+
+
+def _error_covariance(found: Identification, run: Run, terms: int) -> Floats:
+    """(K - 3, K - 3) m^2 of the coefficients of moves predicted, without the noise of their maps."""
+    count = run.responses.coefficients
+    scale = TERM_RMS[PISTON_TILT:terms]
+    rows = found.held_out[:, :count] / scale
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    covariance = rows.T @ rows / len(rows)
+    repeated = np.flatnonzero((np.diff(run.signals, axis=0) == 0.0).all(axis=1)) + 1
+    if repeated.size >= 3:
+        values = run.responses.values[:, :count] / scale
+        noise = 0.5 * np.mean(np.square(values[repeated] - values[repeated - 1]), axis=0)
+        covariance = covariance - np.diag(noise)
+    size, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
+
+
+def _remarks(found: Identification) -> tuple[str, ...]:
+    best = found.fit.candidate.name
+    others = ", ".join(f"{name} {score:.2f}" for name, score in found.scores.items() if name != best)
+    sentences = [f"Memory: {best} predicts the maps left out best; error of other laws relative to it: {others}."]
+    sentences += [f"Memory: {name} was not taken: {reason}." for name, reason in found.refused.items()]
+    return tuple(sentences)

@@ -1,0 +1,90 @@
+"""Recipes: what makes a shape from a defined condition (the paper's control-parameter database).
+
+The condition is a mirror degaussed over the full range about mid range. What a recipe keeps is the *effective* signals
+under which the surface was the wanted one: the command that brings them about follows from the memory law, at any later
+time and creep. On a mirror without an identified memory they are the signals themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class RecipeError(ValueError):
+    """A recipe outside its range, or made under another condition or for another mirror."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """One shape.
+
+    Attributes:
+        curvature: 1/m.
+        conic_constant: as requested.
+        effective: (N,) effective signals.
+        signals: (N,) the command when it was built.
+        max_zernike, rms: m, re-measured: largest coefficient error beyond tilt, sag error.
+        maps: taken to find it.
+    """
+
+    curvature: float
+    conic_constant: float
+    effective: Floats
+    signals: Floats
+    max_zernike: float
+    rms: float
+    maps: int
+
+
+@dataclass(frozen=True, eq=False)
+class RecipeBook:
+    """Recipes of one calibration.
+
+    Attributes:
+        recipes: by rising conic constant, then curvature.
+        degauss_steps: half-swings of the degauss that they begin with.
+        interpolation_error: m, largest coefficient error of a recipe interpolated from the others.
+        stamp_ns: when the last was built.
+    """
+
+    recipes: tuple[Recipe, ...]
+    degauss_steps: int
+    interpolation_error: float
+    stamp_ns: int
+
+    def __post_init__(self) -> None:
+        keys = [(recipe.conic_constant, recipe.curvature) for recipe in self.recipes]
+        if keys != sorted(set(keys)):
+            raise RecipeError("recipes: must rise in conic constant and curvature, each shape once")
+        if len({len(recipe.effective) for recipe in self.recipes}) > 1:
+            raise RecipeError("recipes: are of mirrors with different numbers of actuators")
+        for recipe in self.recipes:
+            if recipe.signals.shape != recipe.effective.shape or not np.isfinite(recipe.effective).all():
+                raise RecipeError(f"recipe of {recipe.curvature:+.4f} 1/m: effective signals must be finite, one each")
+
+    def merged(self, newer: RecipeBook) -> RecipeBook:
+        """With the recipes of `newer` in the place of those of the same shape.
+
+        Raises:
+            RecipeError: made under another condition.
+        """
+        if self.recipes and newer.degauss_steps != self.degauss_steps:
+            raise RecipeError(
+                f"degauss_steps = {newer.degauss_steps}: the recipes there are begin with {self.degauss_steps}; "
+                "build all of them again"
+            )
+        both = {(r.conic_constant, r.curvature): r for r in (*self.recipes, *newer.recipes)}
+        return RecipeBook(
+            tuple(both[key] for key in sorted(both)),
+            newer.degauss_steps,
+            max(self.interpolation_error, newer.interpolation_error),
+            newer.stamp_ns,
+        )
+
+
+NO_RECIPES = RecipeBook((), 0, 0.0, 0)

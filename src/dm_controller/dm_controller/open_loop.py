@@ -1,0 +1,147 @@
+"""Open loop that remembers: from a target and the state of the actuators to a command, with what it is expected to do.
+
+The influence function acts on effective signals; the bounded programme finds those of the target, the inverse of the
+memory law the command that brings them about from where the mirror stands. Holding the shape is the same inversion
+again, a little later: creep has changed what the same signals do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.memory.law import MemoryLaw, MemoryState
+from dm_controller.inverse import invert
+from dm_controller.model import FREE_TERMS, CalibratedMirror, Plan
+from dm_controller.solvers.bounded import Limits
+from dm_controller.target import FocusTarget
+
+Floats = NDArray[np.float64]
+
+#: Draws for the 95 % quantile of the largest of many errors.
+DRAWS = 4000
+#: Part of the expected error beyond which effective signals that a limit denies count, normalised.
+MISSED_MAX = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class MemoryFigures:
+    """What a calibration says of its memory law; fields as in dm_msgs/ActuatorMemory."""
+
+    law: MemoryLaw
+    zernike_sigma: Floats
+    held_out_max_zernike: float
+    unknown_sigma: float
+
+
+@dataclass(frozen=True)
+class Move:
+    """A planned move.
+
+    Attributes:
+        plan: command and prediction; its signals are what the electronics get.
+        effective: (N,) effective signals aimed at: what holding the shape means.
+    """
+
+    plan: Plan
+    effective: Floats
+
+
+class OpenLoop:
+    """Plans moves of one calibrated mirror.
+
+    Args:
+        mirror: its influence function acts on effective signals.
+        memory: None = the mirror's memory is not identified: effective signals are signals.
+    """
+
+    def __init__(self, mirror: CalibratedMirror, memory: MemoryFigures | None = None) -> None:
+        self.mirror, self.memory = mirror, memory
+        self.law = memory.law if memory is not None else MemoryLaw.linear()
+        self._unknown_max_zernike, self._unknown_rms = self._unknown_history()
+
+    def plan(
+        self,
+        target: FocusTarget,
+        state: MemoryState | None,
+        time: float,
+        known: bool = True,
+        effective: Floats | None = None,
+        ahead: float = 0.0,
+    ) -> Move:
+        """The move to `target` that begins at `time` (s) from `state`.
+
+        Args:
+            state: None = unknown altogether; then the mirror is taken to be degaussed.
+            known: whether the state can be trusted; if not, the bounds are widened.
+            effective: (N,) effective signals to aim at instead of the model's own (a recipe).
+            ahead: s after `time` at which the shape is to be right; creep is quickest just after a move.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        limits = self.mirror.limits
+        planned = self.mirror.plan(target)
+        aim = planned.signals if effective is None else effective
+        if self.memory is None:
+            return Move(planned if effective is None else self.mirror.predict(target, aim), aim)
+        if state is None:
+            state, known = self.law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
+        inverted = invert(self.law, self.law.advance(state, time), aim, limits.low, limits.high, ahead)
+        signals, missed = inverted.signals, inverted.missed
+        if not limits.allow_neighbours(signals):
+            signals, missed = self._within_neighbours(signals, state, time, aim)
+        if np.abs(missed).max() > MISSED_MAX and effective is None:
+            planned = self.mirror.predict(target, aim - missed)
+        return Move(self._bounded(planned, signals, known), aim)
+
+    def hold(self, state: MemoryState, time: float, effective: Floats, ahead: float = 0.0) -> Floats:
+        """(N,) signals, applied at `time` (s), that keep `effective` (N,) and are right `ahead` s later."""
+        limits = self.mirror.limits
+        at = self.law.advance(state, time)
+        signals = invert(self.law, at, effective, limits.low, limits.high, ahead).signals
+        return signals if limits.allow_neighbours(signals) else state.signals
+
+    def _bounded(self, plan: Plan, signals: Floats, known: bool) -> Plan:
+        memory = self.memory
+        assert memory is not None
+        rms_spread, largest_spread = self.mirror.model.held_out_rms, memory.held_out_max_zernike
+        if not known:
+            rms_spread = float(np.hypot(rms_spread, self._unknown_rms))
+            largest_spread = float(np.hypot(largest_spread, self._unknown_max_zernike))
+        return replace(
+            plan,
+            signals=signals,
+            rms_upper=float(np.hypot(plan.rms, 1.96 * rms_spread)),
+            max_zernike_upper=plan.max_zernike + largest_spread,
+            saturated=self.mirror.limits.at_limit(signals),
+        )
+
+    def _within_neighbours(
+        self, signals: Floats, state: MemoryState, time: float, aim: Floats
+    ) -> tuple[Floats, Floats]:
+        """The part of the way from the present signals that keeps neighbours within their limit, and what it misses."""
+        limits = self.mirror.limits
+        at = self.law.advance(state, time)
+        a, b = limits.pairs.T
+        now, then = at.signals[a] - at.signals[b], signals[a] - signals[b]
+        room = limits.neighbour_difference - np.sign(then) * now
+        share = np.where(np.abs(then) > limits.neighbour_difference, room / np.maximum(np.sign(then) * (then - now), 1e-12), 1.0)
+        moved = at.signals + float(np.clip(share.min(), 0.0, 1.0)) * (signals - at.signals)
+        reached = self.law.position_at(at, moved) + self.law.creep(at)
+        return moved, aim - reached
+
+    def _unknown_history(self) -> tuple[float, float]:
+        """95 % quantile of the largest coefficient error, and rms sag error, when the history is not known; m."""
+        if self.memory is None:
+            return 0.0, 0.0
+        model, sigma = self.mirror.model, self.memory.unknown_sigma
+        miss = sigma * np.random.default_rng(0).standard_normal((DRAWS, model.influence_zernike.shape[1]))
+        largest = np.abs(miss @ model.influence_zernike[FREE_TERMS:].T).max(axis=1)
+        area = model.sample_weight[:, None] * np.square(model.influence_sag)
+        return float(np.quantile(largest, 0.95)), float(sigma * np.sqrt(area.sum()))
+
+
+__all__ = ["Limits", "MemoryFigures", "Move", "OpenLoop"]
