@@ -1,16 +1,17 @@
 """Least-squares fit of the 21 Zernike terms to every valid pixel of a map, through moments.
 
 On a Cartesian grid the moments of a map Z against products of Legendre polynomials are two thin matrix products,
-L^T Z L. The 21 products P_a(x) P_b(y) with a + b <= 5 span the same polynomials as the 21 Zernike terms, and their
-masked Gram matrix follows from moments of the mask to degree 10, because a product of two Legendre polynomials is a
-short sum of others. Solving the 21 x 21 system gives the exact least-squares answer.
+L^T Z L (see :mod:`~dm_calibration.optics.map_moments`). The 21 products P_a(x) P_b(y) with a + b <= 5 span the same
+polynomials as the 21 Zernike terms, and their masked Gram matrix follows from moments of the mask to degree 10, because
+a product of two Legendre polynomials is a short sum of others. Solving the 21 x 21 system gives the exact least-squares
+answer.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from .aperture import Aperture, InsufficientDataError
+from .map_moments import MaskedMoments, mask_moments
 from .zernike import MAX_ORDER, TERM_RMS, TERMS, basis
 
 Array = NDArray[np.float64]
@@ -77,10 +79,18 @@ def _zernike_from_products() -> Array:
     return np.linalg.lstsq(products, basis(x, y), rcond=None)[0].T
 
 
+@lru_cache(maxsize=4)
+def _disc(aperture: Aperture, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """The aperture's pixels: often the same from map to map where the valid ones are not."""
+    disc = aperture.disc(shape)
+    disc.flags.writeable = False
+    return disc
+
+
 class MapFitter:
     """Fits maps that share one mask of valid pixels and one aperture.
 
-    Making it costs a few times as much as a fit: keep it as long as the mask repeats.
+    Making it costs a few times as much as a fit: keep it as long as the mask repeats. Not for two threads at a time.
     """
 
     def __init__(self, mask: NDArray[np.bool_], centre_x_px: float, centre_y_px: float, radius_px: float) -> None:
@@ -98,9 +108,8 @@ class MapFitter:
         self._shape = mask.shape
         self._rows = _span(centre_y_px, radius_px, mask.shape[0])
         self._columns = _span(centre_x_px, radius_px, mask.shape[1])
-        self._disc = self.aperture.disc(mask.shape)[self._rows, self._columns]
+        self._disc = _disc(self.aperture, self._shape)[self._rows, self._columns]
         self._used = mask[self._rows, self._columns] & self._disc
-        self._unused = np.flatnonzero(~self._used)
         self.valid_pixels = int(np.count_nonzero(self._used))
         self.valid_fraction = self.valid_pixels / max(self.aperture.pixels(), 1)
         if self.valid_pixels < len(TERMS):
@@ -111,12 +120,15 @@ class MapFitter:
         y = (centre_y_px - np.arange(mask.shape[0])[self._rows]) / radius_px
         self._legendre_x = np.ascontiguousarray(legendre.legvander(x, 2 * MAX_ORDER))
         self._legendre_y = np.ascontiguousarray(legendre.legvander(y, 2 * MAX_ORDER))
-        self._workspace = np.empty(self._used.shape)
         self._solve_with(self._gram())
+        # The thin bases of the fit itself: moments[b, a] against P_b(y) P_a(x).
+        self._thin_x = np.ascontiguousarray(self._legendre_x[:, : MAX_ORDER + 1])
+        self._thin_y = np.ascontiguousarray(self._legendre_y[:, : MAX_ORDER + 1])
+        self._moments = MaskedMoments(self._used, self._thin_y, self._thin_x)
 
     def _gram(self) -> Array:
         """Masked Gram matrix of the Zernike terms."""
-        moments = self._legendre_y.T @ (self._used.astype(float) @ self._legendre_x)  # [degree of y, degree of x]
+        moments = mask_moments(self._used, self._legendre_y, self._legendre_x)  # [degree of y, degree of x]
         c = _linearisation()
         in_x = c[:, _A[:, None], _A]  # (11, 21, 21)
         in_y = c[:, _B[:, None], _B]
@@ -136,9 +148,6 @@ class MapFitter:
         self._factor = linalg.cho_factor(gram / np.outer(scale, scale))
         inverse = linalg.cho_solve(self._factor, np.eye(len(TERMS)))
         self._sigma_per_pixel_noise = np.sqrt(np.diag(inverse)) / scale
-        # The thin bases of the fit itself: moments[b, a] against P_b(y) P_a(x).
-        self._thin_x = np.ascontiguousarray(self._legendre_x[:, : MAX_ORDER + 1])
-        self._thin_y = np.ascontiguousarray(self._legendre_y[:, : MAX_ORDER + 1])
 
     def fits(self, mask: NDArray[np.bool_], aperture: Aperture) -> bool:
         """Whether this fitter was made for that aperture and mask (as far as it lies inside the aperture)."""
@@ -157,21 +166,17 @@ class MapFitter:
         """
         if sag.shape != self._shape:
             raise ValueError(f"map of shape {sag.shape}: the mask has {self._shape}")
-        work = self._workspace
-        work[...] = sag[self._rows, self._columns]
-        work.ravel()[self._unused] = 0
-        energy = float(np.vdot(work, work))
+        inner = sag[self._rows, self._columns]
+        moments, energy = self._moments.of(inner)
         if not math.isfinite(energy):
-            missing = np.count_nonzero(~np.isfinite(work))
+            missing = np.count_nonzero(self._used & ~np.isfinite(inner))
             raise ValueError(f"the map has {missing} pixels without data where the mask says there are")
-        moments = (self._thin_y.T @ (work @ self._thin_x))[_B, _A]
-        right = _zernike_from_products() @ moments
+        right = _zernike_from_products() @ moments[_B, _A]
         coefficients = linalg.cho_solve(self._factor, right / self._scale) / self._scale
         squares = energy - float(coefficients @ right)
         if squares < _CANCELLATION * energy:
-            work -= self._evaluate(coefficients)
-            work.ravel()[self._unused] = 0
-            squares = float(np.vdot(work, work))
+            left = (inner - self._evaluate(coefficients))[self._used]
+            squares = float(np.vdot(left, left))
         squares = max(squares, 0.0)
         freedom = max(self.valid_pixels - len(TERMS), 1)
         return MapFit(

@@ -16,6 +16,10 @@ AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))
 OUTSIDE_MEAN = ("pz02", "pz03")
 
 
+#: Pixels of the blocks in which a map is worked through: 0.5 MB.
+_BLOCK_PIXELS = 2**16
+
+
 class EmptyRegionError(ValueError):
     """A region holds no data; the message names the map and the region."""
 
@@ -36,11 +40,24 @@ class ConcentricRegions:
         fractions = checked_fractions(area_fractions)
         self.area_fractions = fractions
         self._shape = shape
-        # The ring between two discs, numbered from inside; one more number for everything outside.
-        self._ring = np.searchsorted(fractions, aperture.squared_distance(shape)).astype(np.uint8).ravel()
+        # Every row meets a disc in one run of pixels. Together the ends of these runs cut the row into pieces, each of
+        # which belongs to one ring between two discs; a sum over a piece is one step of `reduceat`.
+        spans = [aperture.row_spans(shape, fraction) for fraction in fractions]
+        rings = len(spans)
+        columns = np.stack([start for start, _end in spans[::-1]] + [end for _start, end in spans], axis=1)
+        for k in range(1, rings):  # rows that miss an inner disc: its empty run must lie inside the next larger one
+            columns[:, rings + k - 1] = np.minimum(columns[:, rings + k - 1], columns[:, rings + k])
+        columns = np.maximum.accumulate(columns, axis=1)
+        ring = np.concatenate([np.arange(rings)[::-1], np.arange(1, rings + 1)])
+        # Blocks of rows, so that what is made of a block stays in the processor's cache.
+        size = max(_BLOCK_PIXELS // shape[1], 1)
+        self._blocks = [
+            (slice(start, start + size), *_pieces(columns[start : start + size], ring, shape[1]))
+            for start in range(0, shape[0], size)
+        ]
 
     def rms(self, residual: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Root mean square (about zero) of a residual map inside each disc.
+        """Root mean square (about zero) of a residual map inside each disc, in one pass over the map.
 
         Args:
             residual: (height, width), NaN = no data.
@@ -48,13 +65,18 @@ class ConcentricRegions:
         Returns:
             (R,), in the unit of the residual; NaN for a disc without valid pixels.
         """
-        squares = residual.ravel() ** 2
-        valid = np.isfinite(squares)
         size = len(self.area_fractions) + 1
-        energy = np.bincount(self._ring, np.where(valid, squares, 0.0), size)[:-1].cumsum()
-        count = np.bincount(self._ring, valid, size)[:-1].cumsum()
+        energy, count = np.zeros(size), np.zeros(size)
+        for rows, pieces, ring in self._blocks:
+            if pieces.size:
+                valid = np.isfinite(residual[rows])
+                squares = np.square(residual[rows])
+                squares[~valid] = 0.0
+                energy += np.bincount(ring, np.add.reduceat(squares.ravel(), pieces), size)
+                valid_pixels = np.add.reduceat(valid.view(np.uint8).ravel(), pieces, dtype=np.int64)
+                count += np.bincount(ring, valid_pixels, size)
         with np.errstate(invalid="ignore"):
-            return np.sqrt(energy / count)
+            return np.sqrt(energy[:-1].cumsum() / count[:-1].cumsum())
 
     def rms_of_each(self, residuals: Iterable[NDArray[np.float64]], labels: Sequence[str] = ()) -> NDArray[np.float64]:
         """:meth:`rms` of a set of residual maps, one pass over each, one map in memory at a time.
@@ -152,6 +174,18 @@ def figure_5(rms: NDArray[np.float64], labels: Sequence[str]) -> tuple[RegionSta
         rows = [k for k, name in enumerate(labels) if name.removeprefix(prefix).isdigit() and name.startswith(prefix)]
         panels.append(region_statistics(rms[rows], [labels[k] for k in rows], leave_out))
     return panels[0], panels[1]
+
+
+def _pieces(columns: NDArray[np.intp], ring: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Flat index where each piece of some rows begins, and its ring; pieces without a pixel left out.
+
+    Args:
+        columns: (rows, 2 R), rising along each row: where the pieces begin.
+        ring: (2 R,) of the pieces of a row.
+    """
+    begin = (np.arange(len(columns))[:, None] * width + columns).ravel()
+    filled = np.diff(begin, append=len(columns) * width) > 0
+    return begin[filled], np.tile(ring, len(columns))[filled]
 
 
 def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:

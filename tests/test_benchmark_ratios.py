@@ -1,0 +1,109 @@
+"""A short run of `./dm bench`: results that must be right, and ratios that have left the committed ones far behind.
+
+A ratio of two times from the same run hardly depends on the machine, but on a busy one it scatters; only a factor that
+no scatter explains fails.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dm_controller.benchmarks import rivals
+from dm_controller.benchmarks.influence_maps import peak_memory
+from dm_controller.benchmarks.page import growth_table, target_table
+from dm_controller.benchmarks.suite import JOBS, run
+from dm_controller.benchmarks.targets import TARGETS, rows
+from dm_controller.benchmarks.timing import Effort, medians
+
+ROOT = Path(__file__).resolve().parents[1]
+BASELINE: dict[str, Any] = json.loads((ROOT / "benchmarks" / "baseline.json").read_text())
+
+#: How much worse than in the committed run a ratio may be.
+FAR = 5.0
+#: The same for reading, which is mostly fresh memory: on a busy machine its price alone has varied by a factor of 6.
+FAR_READING = 15.0
+
+#: The suite's time over that of something else in the same run: part, figure, part and figure of the other.
+RATIOS = [
+    ("zernike_fit", "ms", "zernike_fit", "memory_read_ms"),
+    ("zernike_fit", "ms", "zernike_fit", "lstsq_ms"),
+    ("new_mask_fit", "ms", "zernike_fit", "lstsq_ms"),
+    ("regions", "ms", "regions", "ten_passes_ms"),
+    ("read_dat", "ms", "read_dat", "fromfile_ms"),
+    ("solve", "ms", "solve", "bvls_ms"),
+]
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict[str, Any]:
+    return run(["fit", "read", "solve"], Effort(rounds=12, quick=True), {})
+
+
+@pytest.mark.parametrize(("part", "figure", "other_part", "other"), RATIOS)
+def test_ratio_is_not_far_off(measured: dict[str, Any], part: str, figure: str, other_part: str, other: str) -> None:
+    def ratio(figures: dict[str, Any]) -> float:
+        return float(figures[part][figure] / figures[other_part][other])
+
+    assert ratio(measured) < (FAR_READING if part == "read_dat" else FAR) * ratio(BASELINE)
+
+
+def test_fast_results_are_right(measured: dict[str, Any]) -> None:
+    assert measured["zernike_fit"]["max_rel_diff"] < 1e-6
+    assert measured["solve"]["residual_over_bvls"] < 1 + 1e-6
+    assert measured["solve"]["clipped_residual_over_ours"] > 1
+
+
+def test_memory_does_not_grow_with_the_number_of_maps() -> None:
+    assert peak_memory(75, pixels=500) < 1.1 * peak_memory(25, pixels=500)
+
+
+def test_baseline_is_a_whole_run_with_all_targets() -> None:
+    assert not BASELINE["quick"]
+    assert [row["job"] for row in BASELINE["targets"]] == [target.job for target in TARGETS]
+    assert rows(BASELINE) == BASELINE["targets"]
+
+
+def test_page_shows_the_committed_run() -> None:
+    page = (ROOT / "docs" / "benchmarks.md").read_text()
+    assert target_table(BASELINE) in page
+    assert growth_table(BASELINE) in page
+
+
+def test_a_job_that_was_not_run_has_no_line(measured: dict[str, Any]) -> None:
+    assert not [row for row in rows(measured) if "influence" in row["job"]]
+    assert [row for row in rows(measured) if "solve" in row["job"]]
+
+
+def test_unknown_job_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=f"--only nonsense: must be one of {', '.join(JOBS)}"):
+        run(["nonsense"], Effort(), {})
+
+
+def test_jobs_take_turns_and_slow_ones_get_fewer() -> None:
+    calls: list[str] = []
+
+    def job(name: str) -> Callable[[], None]:
+        return lambda: calls.append(name)
+
+    medians({"quick": job("quick"), "slow": job("slow")}, 6, {"slow": 2})
+    assert calls[2:] == ["quick", "quick", "quick", "slow"] * 2  # after one unmeasured call of each
+    with pytest.raises(ValueError, match="rounds = 0"):
+        medians({"quick": job("quick")}, 0)
+
+
+def test_median_is_that_of_the_job() -> None:
+    seconds = medians({"waits": lambda: time.sleep(0.02), "does not": lambda: None}, 3)
+    assert seconds["waits"] >= 0.02 > seconds["does not"]
+
+
+def test_rivals_that_are_not_there_are_skipped_with_a_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rivals, "MODULES", {"nothing": "no_such_module_anywhere"})
+    said: list[str] = []
+    assert rivals.load(tmp_path, True, said.append) == {}
+    assert said == ["skipped, because they are not installed: nothing (requirements/bench.txt names the versions)"]
