@@ -13,12 +13,12 @@ from typing import Any
 
 import rclpy
 import yaml
-from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
 from dm_controller.suite import own_domain
+from dm_runtime.action_client import ThreadedActionClient
 from dm_runtime.executor import BackgroundExecutor
 from dm_runtime.worker import answers_arrive
 
@@ -129,7 +129,7 @@ class Observer:
     ) -> tuple[Any, Any]:
         """Send a goal; return (goal handle, future of the result)."""
         if name not in self._clients:
-            self._clients[name] = ActionClient(self.node, action_type, name)
+            self._clients[name] = ThreadedActionClient(self.node, action_type, name)
         client = self._clients[name]
         wait_until(lambda: answers_arrive(client, client.server_is_ready), 15, f"action {name}")
         accepted = client.send_goal_async(goal, feedback_callback=feedback)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import signal
-from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,91 +15,18 @@ from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo
 from dm_msgs.msg import Calibration as CalibrationMsg
-from dm_msgs.srv import Degauss, FitInfluenceFunction, ListCalibrations, LoadCalibration, Measure, SetSignals
+from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
 
-from dm_calibration.influence.mirror import Mirror
+from calibration_stand_in import StandIn, doubles
 from dm_calibration.influence.sag import remove_piston_tilt
 from dm_calibration.plan import PlanKind
 from dm_calibration.store import CalibrationStore
 from dm_runtime import qos
-from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
+from linear_mirror import LinearMirror, hexagon, make_mirror
 from support import NodeProcess, Observer, wait_until
 
 RINGS = 2
 ACTUATORS = 19
-
-
-def doubles(values: np.ndarray) -> array[float]:
-    return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
-
-
-class StandIn:
-    """Driver and interferometer as the calibration node meets them, on the observer's node."""
-
-    def __init__(self, node: Any, mirror: Mirror, plant: LinearMirror) -> None:
-        self.node, self.mirror, self.plant = node, mirror, plant
-        self.signals = mirror.rest
-        self.degaussed = 0
-        self.measured: list[str] = []
-        self.failing: set[str] = set()
-        self.other_wavelength: set[str] = set()
-        self.other_aperture: set[str] = set()
-        self.disturbed_at = ""
-        self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
-        self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
-        node.create_service(SetSignals, "set_signals", self.on_set_signals)
-        node.create_service(Degauss, "degauss", self.on_degauss)
-        node.create_service(Measure, "measure", self.on_measure)
-        self.publish_info(mirror)
-        self.publish_state()
-
-    def publish_info(self, mirror: Mirror) -> None:
-        message = MirrorInfo(name=mirror.name, serial=mirror.serial, actuators=mirror.actuators)
-        message.header.frame_id = "mirror"
-        message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
-        message.neighbour_a = array("I", mirror.neighbours[:, 0].astype(np.uint32).tobytes())
-        message.neighbour_b = array("I", mirror.neighbours[:, 1].astype(np.uint32).tobytes())
-        message.working_aperture_diameter = 2.0 * mirror.working_radius
-        message.signal_min, message.signal_max = mirror.signal_min, mirror.signal_max
-        message.neighbour_difference_max = mirror.neighbour_difference_max
-        self.info.publish(message)
-
-    def publish_state(self, driver_state: int = ActuatorState.STATE_ACTIVE) -> None:
-        message = ActuatorState(driver_state=driver_state, history_known=True)
-        message.requested = message.applied = doubles(self.signals)
-        self.state.publish(message)
-
-    def on_set_signals(self, request: Any, response: Any) -> Any:
-        self.signals = np.array(request.signals)
-        self.publish_state()
-        response.applied = doubles(self.signals)
-        return response
-
-    def on_degauss(self, _request: Any, response: Any) -> Any:
-        self.degaussed += 1
-        self.signals = self.mirror.rest
-        self.publish_state()
-        return response
-
-    def on_measure(self, request: Any, response: Any) -> Any:
-        self.measured.append(request.label)
-        if request.label == self.disturbed_at:
-            self.signals = np.full(ACTUATORS, 0.3)
-            self.publish_state()
-        if request.label in self.failing:
-            response.error_code, response.message = ErrorCode.MAP_TIMEOUT, "no new file within 5 s"
-            return response
-        sag = self.plant.sag(self.signals)
-        zernike, samples = response.zernike, response.samples
-        zernike.header.stamp = samples.header.stamp = self.node.get_clock().now().to_msg()
-        zernike.radius = samples.radius = 10e-3 if request.label in self.other_aperture else RADIUS
-        zernike.wavelength = 635e-9 if request.label in self.other_wavelength else 632.8e-9
-        zernike.coefficients = doubles(self.plant.fit_terms(sag))
-        zernike.residual_rms, zernike.valid_fraction = 3e-9, 0.97
-        samples.x, samples.y = doubles(self.plant.points.x), doubles(self.plant.points.y)
-        samples.weight, samples.sag = doubles(self.plant.points.weight), doubles(sag)
-        response.info.file, response.info.sha256 = f"/maps/{request.label}.dat", "00"
-        return response
 
 
 @pytest.fixture
@@ -311,7 +237,7 @@ def test_failures_are_told_and_leave_things_as_they_were(
     run(few, ErrorCode.TOO_FEW_MAPS, "good maps")
     bench.publish_state(ActuatorState.STATE_INACTIVE)
     run(pokes(), ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active")
-    bench.publish_state()
+    bench.publish_state(ActuatorState.STATE_ACTIVE)
 
     # Files of the node may not grow any more, as on a full disk.
     files = sorted(path.name for path in folder.iterdir())

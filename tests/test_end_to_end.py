@@ -21,7 +21,6 @@ from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, ErrorCode, ZernikeCoefficients
-from rclpy.action import ActionClient
 from std_srvs.srv import SetBool
 
 from dm_calibration.map_files import read_map
@@ -31,6 +30,7 @@ from dm_controller.suite import Suite, own_domain, save_config
 from dm_controller.target import FocusTarget
 from dm_controller.verify import map_of, surface_error
 from dm_driver.virtual.parameters import TABLE
+from dm_runtime.action_client import ThreadedActionClient
 from support import wait_until
 
 SEED = 20_11
@@ -132,7 +132,7 @@ def test_cancelled_calibration_leaves_the_mirror_at_mid_range(
     mirror: DeformableMirrorClient, calibrated: Calibrate.Result
 ) -> None:
     pokes: list[Any] = []
-    server = ActionClient(mirror.node, Calibrate, "calibrate")
+    server = ThreadedActionClient(mirror.node, Calibrate, "calibrate")
     wait_until(server.server_is_ready)
     time.sleep(0.5)
     accepted = server.send_goal_async(

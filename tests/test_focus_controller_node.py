@@ -11,110 +11,17 @@ import pytest
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import MoveFocus
 from dm_msgs.msg import (
-    ActuatorCommand,
     ActuatorState,
-    Calibration,
     Capabilities,
     ErrorCode,
     FocusRequest,
-    FocusState,
-    MirrorInfo,
 )
 from dm_msgs.srv import Flatten, SetFocus
 from rclpy.time import Time
 
-from dm_runtime import qos
-from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
+from focus_bench import MIRROR, Bench, calibration, mirror_info
+from linear_mirror import RADIUS
 from support import NodeProcess, Observer, wait_until
-
-MIRROR = LinearMirror(*hexagon())
-
-
-def mirror_info(serial: str = "T-1") -> MirrorInfo:
-    x, y = hexagon()
-    pairs = make_mirror().neighbours
-    return MirrorInfo(
-        name="PDM30-37",
-        serial=serial,
-        actuators=37,
-        actuator_x=list(x),
-        actuator_y=list(y),
-        neighbour_a=[int(a) for a, _b in pairs],
-        neighbour_b=[int(b) for _a, b in pairs],
-        full_aperture_diameter=0.03,
-        working_aperture_diameter=2 * RADIUS,
-        signal_min=-1.0,
-        signal_max=1.0,
-        neighbour_difference_max=2.0,
-        slew_rate_max=40.0,
-    )
-
-
-def calibration(serial: str = "T-1", radius: float = RADIUS) -> Calibration:
-    points = MIRROR.points
-    return Calibration(
-        id="known",
-        mirror_serial=serial,
-        method="exact",
-        aperture_radius=radius,
-        actuators=37,
-        terms=21,
-        influence_zernike=MIRROR.fit_terms(MIRROR.influence.T).T.ravel().tolist(),
-        zernike_offset=MIRROR.figure_coefficients.tolist(),
-        points=len(points),
-        sample_x=points.x.tolist(),
-        sample_y=points.y.tolist(),
-        sample_weight=points.weight.tolist(),
-        influence_sag=MIRROR.influence.ravel().tolist(),
-        sag_offset=(MIRROR.modes @ MIRROR.figure_coefficients).tolist(),
-        in_sample_rms=1e-10,
-        held_out_rms=2e-10,
-        held_out_max_zernike=3e-10,
-        maps_used=100,
-        quality=Calibration.CALIBRATED,
-    )
-
-
-class Bench:
-    """The controller under test with the stand-ins of its neighbours."""
-
-    def __init__(self, observer: Observer, follow: bool = True) -> None:
-        self.observer = observer
-        node = observer.node
-        self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
-        self.calibration = node.create_publisher(Calibration, "calibration", qos.LATCHED)
-        self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
-        self.request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
-        self.commands: list[ActuatorCommand] = []
-        self.follow = follow
-        node.create_subscription(ActuatorCommand, "actuator_command", self._on_command, qos.COMMAND)
-        self.focus_states = observer.record(FocusState, "focus_state", qos.STATE)
-        self.capabilities: list[Capabilities] = observer.record(Capabilities, "capabilities", qos.LATCHED)
-
-    def _on_command(self, command: ActuatorCommand) -> None:
-        self.commands.append(command)
-        if self.follow:
-            self.publish_state(list(command.signals))
-
-    def publish_state(self, applied: list[float], state: int = ActuatorState.STATE_ACTIVE) -> None:
-        self.state.publish(ActuatorState(driver_state=state, requested=applied, applied=applied, history_known=True))
-
-    def ready(self) -> Bench:
-        """Mirror, calibration and an active driver are known to the controller."""
-        self.info.publish(mirror_info())
-        self.calibration.publish(calibration())
-        wait_until(lambda: self.capabilities and self.capabilities[-1].calibration_id == "known")
-        self.activate()
-        return self
-
-    def activate(self) -> None:
-        wait_until(lambda: self.state.get_subscription_count() > 0)
-        self.publish_state([0.0] * 37)
-
-    def set_focus(self, dry_run: bool = False, **fields: Any) -> Any:
-        return self.observer.call(
-            SetFocus, "set_focus", SetFocus.Request(request=FocusRequest(**fields), dry_run=dry_run)
-        )
 
 
 @pytest.fixture

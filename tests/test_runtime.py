@@ -26,8 +26,9 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
+from dm_runtime.action_client import ThreadedActionClient
 from dm_runtime.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
-from dm_runtime.worker import ServiceCallError, WorkerActionServer, WorkerService, call, sleep
+from dm_runtime.worker import ServiceCallError, WorkerActionServer, WorkerService, answers_arrive, call, sleep
 from support import Observer, wait_until
 
 
@@ -135,6 +136,33 @@ def test_action_succeeds_with_its_result_and_feedback(observer: Observer) -> Non
     wait_until(result.done)
     assert result.result().status == GoalStatus.STATUS_SUCCEEDED
     assert result.result().result.duration == 2.5
+
+
+def test_an_answer_quicker_than_the_sender_is_not_lost(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The executor may take the answer before the sending thread has noted the request's number."""
+    mover = Mover(observer, "refuse")
+    mover.release.set()
+    client = ThreadedActionClient(observer.node, MoveFocus, "move")
+    wait_until(lambda: answers_arrive(client, client.server_is_ready))
+
+    class Dawdling:
+        """The handle of the client, which is slow to return once a goal is sent."""
+
+        def __init__(self, handle: Any) -> None:
+            self.handle = handle
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.handle, name)
+
+        def send_goal_request(self, request: Any) -> int:
+            number = self.handle.send_goal_request(request)
+            time.sleep(0.3)
+            return number
+
+    monkeypatch.setattr(client, "_client_handle", Dawdling(client._client_handle))
+    accepted = client.send_goal_async(MoveFocus.Goal(tolerance=1.0))
+    wait_until(accepted.done)
+    assert accepted.result().accepted
 
 
 def test_action_cancel_is_honoured(observer: Observer) -> None:

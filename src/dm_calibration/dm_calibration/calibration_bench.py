@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from dm_calibration.calibration_messages import doubles, measurement_from
+from dm_calibration.calibration_messages import doubles, measurement_from, stamp_ns
 from dm_calibration.procedure import BenchError, Cancelled, Measurement, MeasurementError
 from dm_runtime import qos
 from dm_runtime.worker import ServiceCallError, call, sleep
@@ -86,6 +87,13 @@ class RosBench:
             raise BenchError(ErrorCode.TIMEOUT, str(error)) from error
 
     def measure(self, label: str) -> Measurement:
+        return self._measured(label, self._check_undisturbed)
+
+    def measure_as_it_stands(self, label: str) -> Measurement:
+        """Take one map of whatever stands at the mirror. Raises as `measure`."""
+        return self._measured(label, lambda: None)
+
+    def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
         request = Measure.Request(label=label, timeout=timeout)
         # The interferometer keeps the time itself; the call waits a little longer for its answer in words.
@@ -95,9 +103,11 @@ class RosBench:
             if error.code in _FATAL:
                 raise
             raise MeasurementError(error.code, str(error)) from error
-        self._check_undisturbed()
+        check()
         try:
-            return measurement_from(response)
+            # The state was looked at after the map, so its stamp is of the write that the map shows.
+            moved_ns = stamp_ns(self.state.header.stamp) if self.state is not None else 0
+            return replace(measurement_from(response), moved_ns=moved_ns)
         except ValueError as error:
             raise BenchError(ErrorCode.INTERNAL, f"measure: {error}") from error
 

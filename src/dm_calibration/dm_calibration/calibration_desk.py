@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from dm_msgs.msg import ErrorCode
@@ -13,7 +15,8 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_errors import Refused
 from dm_calibration.calibrator import Provenance, mismatch
 from dm_calibration.influence.mirror import Mirror
-from dm_calibration.store import CalibrationStore
+from dm_calibration.memory.recipes import RecipeBook, RecipeError
+from dm_calibration.store import CalibrationStore, UnknownCalibrationError
 
 
 class CalibrationDesk:
@@ -34,6 +37,8 @@ class CalibrationDesk:
         self.store = store
         self._aperture_tolerance, self._now_ns, self._publish = aperture_tolerance, now_ns, publish
         self._lock = threading.RLock()
+        # Held while a stored calibration is changed, so that no change gets lost; writing may take long.
+        self._changing = threading.Lock()
         self._mirror: Mirror | None = None
         self._in_use: Calibration | None = None
 
@@ -90,6 +95,17 @@ class CalibrationDesk:
             self._in_use = calibration
             self._publish(calibration, self.store.find(calibration.id) if calibration else None)
 
+    def publish_again(self) -> None:
+        """Publish the calibration in use anew."""
+        with self._lock:
+            if self._in_use is None:
+                return
+            try:
+                file = self.store.find(self._in_use.id)
+            except UnknownCalibrationError:  # removed meanwhile; what is in use stays
+                file = None
+            self._publish(self._in_use, file)
+
     def load(self, name: str) -> Calibration:
         """Load by id or file, or the newest that fits when `name` is empty, and use it.
 
@@ -111,6 +127,64 @@ class CalibrationDesk:
             calibration = newest
         self.use(calibration)
         return calibration
+
+    def change(self, calibration_id: str, changed: Callable[[Calibration], Calibration]) -> Calibration:
+        """Change the calibration in use, in its file as well, and publish it again.
+
+        Args:
+            calibration_id: must be the one in use.
+            changed: makes the new calibration, with the same id and raw data, from the one in use.
+
+        Raises:
+            Refused: another calibration is in use, or none.
+            StoreError: it could not be written; file and calibration in use are as they were.
+        """
+        with self._changing:
+            before = self._checked_in_use(calibration_id)
+            after = changed(before)
+            self.store.replace(after)
+            with self._lock:
+                self._checked_in_use(calibration_id)
+                self.use(after)
+            return after
+
+    def _checked_in_use(self, calibration_id: str) -> Calibration:
+        calibration = self.in_use
+        if calibration is None:
+            raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use: load_calibration first")
+        if calibration.id != calibration_id:
+            raise Refused(
+                ErrorCode.CALIBRATION_MISMATCH,
+                f"calibration_id = {calibration_id!r}: the calibration in use is {calibration.id!r}",
+            )
+        return calibration
+
+    def add_recipes(self, calibration_id: str, book: RecipeBook) -> Calibration:
+        """Keep recipes with the calibration in use, which they were built on; those of the same shape are replaced.
+
+        Raises:
+            Refused: another calibration is in use, recipes of a mirror with another number of actuators, or
+                numbers that are not finite.
+            RecipeError: no recipes, or made from another condition.
+            StoreError: see :meth:`change`.
+        """
+        if not book.recipes:
+            raise RecipeError("recipes: must hold at least one")
+        for recipe in book.recipes:
+            for name in ("curvature", "conic_constant", "max_zernike", "rms"):
+                if not math.isfinite(value := getattr(recipe, name)):
+                    raise Refused(ErrorCode.NOT_FINITE, f"recipes: {name} = {value}: must be a finite number")
+
+        def changed(calibration: Calibration) -> Calibration:
+            count, has = len(book.recipes[0].effective), calibration.fit.actuators
+            if count != has:
+                raise Refused(
+                    ErrorCode.CALIBRATION_MISMATCH,
+                    f"recipes: have {count} effective signals each, calibration {calibration.id} {has} actuators",
+                )
+            return replace(calibration, recipes=calibration.recipes.merged(book))
+
+        return self.change(calibration_id, changed)
 
     def provenance(self, name: str, serial: str, note: str) -> Provenance:
         """A new id and the time for a calibration of mirror `name`, `serial`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dm_msgs.msg import ErrorCode
 
+from dm_calibration.applied_history import MapNotUsableError
 from dm_calibration.calibration import CalibrationFileError
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.names import UnknownNameError
@@ -28,6 +29,7 @@ def error_code(error: Exception) -> int:
     codes: tuple[tuple[type[Exception], int], ...] = (
         (Cancelled, ErrorCode.CANCELED),
         (StoreError, ErrorCode.STORAGE_FAILED),
+        (MapNotUsableError, ErrorCode.MAP_REJECTED),
         (TooFewMapsError, ErrorCode.TOO_FEW_MAPS),
         (TooFewSamplesError, ErrorCode.TOO_FEW_MAPS),
         (CollinearError, ErrorCode.TOO_FEW_MAPS),

@@ -8,19 +8,23 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from dm_msgs.msg import ActuatorMemory, MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorMemory, ActuatorState, MirrorInfo, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.msg import Recipe as RecipeMsg
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from numpy.typing import NDArray
 
+from dm_calibration.applied_history import Report
 from dm_calibration.calibration import Calibration
+from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.mirror import Mirror
 from dm_calibration.memory.law import MemoryLaw
 from dm_calibration.memory.memory_fit import MemoryFit
 from dm_calibration.memory.recipes import Recipe, RecipeBook
+from dm_calibration.memory.tracker import Applied
 from dm_calibration.optics.sampling import SamplePoints
 from dm_calibration.procedure import Measurement
+from dm_calibration.update_storage import Updates
 
 Floats = NDArray[np.float64]
 
@@ -146,6 +150,42 @@ def calibration_message(
         message.memory = memory_message(calibration.memory)
     message.recipes = recipe_book_message(calibration.recipes)
     return message
+
+
+def put_updates(
+    message: CalibrationMsg, updates: Updates, fit: InfluenceFit, doubts: list[str], mirror_changed: bool
+) -> None:
+    """What later maps have told, into the `message` of the calibration that they update.
+
+    Args:
+        fit: the influence function as it is now.
+        doubts: sentences, added to the known limitations.
+        mirror_changed: the calibration no longer counts as CALIBRATED.
+    """
+    for name in ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset"):
+        setattr(message, name, doubles(getattr(fit, name)))
+    message.revision = updates.revision
+    message.checked = time_message(updates.checked_ns)
+    message.gain_drift = abs(updates.drift.largest_gain[0])
+    message.offset_drift = updates.drift.offset_rms
+    message.known_limitations = [*message.known_limitations, *doubts]
+    if mirror_changed:
+        message.quality = CalibrationMsg.APPROXIMATE
+
+
+def report_from(message: ActuatorState) -> Report:
+    """What the driver reports as applied, which must not be empty."""
+    turned_at = np.array(message.turned_at, dtype=np.float64)
+    applied = Applied(
+        time=1e-9 * stamp_ns(message.header.stamp),
+        signals=np.array(message.applied, dtype=np.float64),
+        turns=message.turns,
+        turned_at=turned_at if turned_at.size else None,
+        degausses=message.degausses,
+        history_known=message.history_known,
+        moving=message.moving,
+    )
+    return Report(applied, message.moving, message.driver_state == ActuatorState.STATE_ACTIVE)
 
 
 def memory_message(memory: MemoryFit) -> ActuatorMemory:

@@ -12,7 +12,15 @@ from typing import Any
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.msg import ErrorCode, MirrorInfo
-from dm_msgs.srv import FitInfluenceFunction, FitRegression, ListCalibrations, LoadCalibration, PredictError
+from dm_msgs.srv import (
+    FitInfluenceFunction,
+    FitRegression,
+    ListCalibrations,
+    LoadCalibration,
+    PredictError,
+    StoreRecipes,
+)
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_calibration.calibration import Calibration
@@ -20,8 +28,9 @@ from dm_calibration.calibration_action import CalibrateAction
 from dm_calibration.calibration_bench import RosBench
 from dm_calibration.calibration_desk import CalibrationDesk
 from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
-from dm_calibration.calibration_messages import calibration_message, mirror_from, time_message
+from dm_calibration.calibration_messages import calibration_message, mirror_from, recipe_book_from, time_message
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options
+from dm_calibration.calibration_watch import PUBLISH_PERIOD_S, CalibrationWatch
 from dm_calibration.calibrator import refit
 from dm_calibration.error_prediction import ErrorPrediction
 from dm_calibration.store import CalibrationStore
@@ -50,9 +59,11 @@ class CalibrationNode(Node):
         self._bench = RosBench(self, self._values)
         action = CalibrateAction(self, self._values, self._bench, self._desk)
         self._server = WorkerActionServer(self, Calibrate, "calibrate", action.run, exclusive="refuse")
+        self._watch = CalibrationWatch(self, self._values, self._desk, self._bench, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load)
         WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)
+        WorkerService(self, StoreRecipes, "store_recipes", self._on_store_recipes)
         prediction = ErrorPrediction(self._desk, self._values)
         for kind, name, work in (
             (FitRegression, "fit_regression", prediction.fit),
@@ -60,18 +71,24 @@ class CalibrationNode(Node):
         ):
             WorkerService(self, kind, name, partial(self._serve, work))
         self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._ticker = self.create_timer(PUBLISH_PERIOD_S, self._watch.tick, clock=steady)
         self._publish(None, None)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
 
     def make_safe(self) -> None:
         """Bring the mirror back to mid range when the process ends in the middle of a calibration."""
+        self._watch.stop()
         mirror = self._desk.mirror
         if self._server.busy and mirror is not None:
             self.get_logger().warning(f"ended during a calibration: {self._bench.rest_at_exit(mirror.rest)}")
 
     def _publish(self, calibration: Calibration | None, file: Path | None) -> None:
         error_max = self._values["calibrated_error_max"]
-        self._publisher.publish(calibration_message(calibration, file, self._frame_id, error_max))
+        message = calibration_message(calibration, file, self._frame_id, error_max)
+        self._watch.begin(calibration)
+        self._watch.amend(message)
+        self._publisher.publish(message)
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._frame_id = message.header.frame_id
@@ -150,6 +167,17 @@ class CalibrationNode(Node):
 
         return self._answer(response, work)
 
+    def _on_store_recipes(self, request: Any, response: Any) -> Any:
+        def work() -> None:
+            book = recipe_book_from(request.recipes)
+            calibration = self._desk.add_recipes(request.calibration_id, book)
+            response.message = (
+                f"{len(book.recipes)} recipes stored with calibration {calibration.id}, which now has "
+                f"{len(calibration.recipes.recipes)}"
+            )
+
+        return self._answer(response, work)
+
     def _health(self) -> diagnostics.Health:
         calibration, mirror = self._desk.in_use, self._desk.mirror
         values: dict[str, object] = {"calibrating": self._server.busy, "folder": str(self._desk.store.folder)}
@@ -159,7 +187,8 @@ class CalibrationNode(Node):
             return diagnostics.Health(diagnostics.WARN, "no calibration is in use", values)
         values["held_out_rms_nm"] = round(calibration.fit.held_out_rms * 1e9, 3)
         values["maps_used"] = int(calibration.fit.used.sum())
-        return diagnostics.Health(diagnostics.OK, f"calibration {calibration.id}", values)
+        level, warnings, figures = self._watch.health()
+        return diagnostics.Health(level, "; ".join((f"calibration {calibration.id}", *warnings)), values | figures)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dm_calibration.calibration_updates import UpdateOptions
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.quality import GradeOptions
 from dm_calibration.influence.screening import ScreeningOptions
+from dm_calibration.memory.updates import DriftRates
 from dm_calibration.procedure import ProcedureOptions
 from dm_runtime.parameters import Parameter
 
@@ -94,6 +96,75 @@ PARAMETERS = (
         1e-3,
         live=True,
     ),
+    Parameter(
+        "updates.enable",
+        bool,
+        True,
+        "Take maps that arrive between calibrations to follow the drift of gains and figure.",
+        live=True,
+    ),
+    Parameter(
+        "updates.still_time",
+        float,
+        0.5,
+        "The mirror must stand still for so long before and after the stamp of a map.",
+        "s",
+        0.0,
+        600.0,
+        live=True,
+    ),
+    Parameter(
+        "updates.surprise_max",
+        float,
+        3.0,
+        "A map that differs from its prediction by more than this times the expected difference is not taken.",
+        "",
+        1.0,
+        100.0,
+        live=True,
+    ),
+    Parameter(
+        "updates.surprises_max",
+        int,
+        3,
+        "Maps in a row that differ so much after which the mirror counts as changed.",
+        "",
+        1,
+        1000,
+        live=True,
+    ),
+    Parameter(
+        "updates.gain_rate",
+        float,
+        3e-4,
+        "Expected relative drift of a gain in one day; it grows with the root of time. 0 = the gains stay.",
+        "",
+        0.0,
+        1.0,
+    ),
+    Parameter(
+        "updates.figure_rate",
+        float,
+        1e-9,
+        "Expected rms drift of the figure in one day; it grows with the root of time. 0 = the figure stays.",
+        "m",
+        0.0,
+        1e-6,
+    ),
+    Parameter("updates.gain_drift_max", float, 0.02, "Drift of a gain from which to warn.", "", 0.0, 1.0, live=True),
+    Parameter(
+        "updates.offset_drift_max", float, 50e-9, "Drift of the figure from which to warn.", "m", 0.0, 1e-3, live=True
+    ),
+    Parameter(
+        "updates.stale_after",
+        float,
+        2592000.0,
+        "A calibration that no map has agreed with for so long is stale (default: 30 days).",
+        "s",
+        1.0,
+        1e10,
+        live=True,
+    ),
 )
 
 
@@ -118,4 +189,17 @@ def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> Pro
         maps_per_state=maps_per_state or 1,
         aperture_tolerance=values["aperture_tolerance"],
         fit=fit_options(values),
+    )
+
+
+def update_options(values: Mapping[str, Any]) -> UpdateOptions:
+    """Options of updates from the node's parameters."""
+    return UpdateOptions(
+        surprise_max=values["updates.surprise_max"],
+        surprises_max=values["updates.surprises_max"],
+        valid_fraction_min=values["valid_fraction_min"],
+        aperture_tolerance=values["aperture_tolerance"],
+        # Without a memory law, an actuator may stand on any branch of its loop.
+        signal_sigma=0.5 * values["hysteresis_allowance"],
+        rates=DriftRates(values["updates.gain_rate"], values["updates.figure_rate"]),
     )

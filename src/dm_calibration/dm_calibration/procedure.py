@@ -34,6 +34,7 @@ class Measurement:
         radius: of the aperture the coefficients and points are normalised to, m; 0 = unknown.
         wavelength: m; 0 = unknown.
         system_error_subtracted: 1 yes, 0 no, -1 not told.
+        moved_ns: when the mirror took the shape, ns; 0 = not told.
     """
 
     points: SamplePoints
@@ -48,6 +49,7 @@ class Measurement:
     system_error_subtracted: int = -1
     file: str = ""
     sha256: str = ""
+    moved_ns: int = 0
 
 
 class BenchError(Exception):
@@ -266,6 +268,7 @@ class Procedure:
             file=measured.file,
             sha256=measured.sha256,
             nominal=step.nominal,
+            moved_ns=measured.moved_ns,
         )
 
     def _check(self, measured: Measurement) -> None:

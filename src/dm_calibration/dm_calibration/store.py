@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
-from dm_calibration.hdf5_image import ImageError, read_image, write_image
+from dm_calibration.hdf5_image import ImageError, content_hash, read_image, write_image
+from dm_calibration.whole_file import write_whole
 
 SUFFIX = ".h5"
+#: What was measured, and where: never changed after a calibration was stored.
+_RAW = ("maps/", "points/", "mirror/")
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
@@ -62,19 +63,35 @@ class CalibrationStore:
         target = self._file(calibration.id)
         if target.exists():
             raise StoreError(f"calibration {calibration.id} exists already; it is not overwritten")
+        self._write(target, calibration)
+        return target
+
+    def replace(self, calibration: Calibration) -> Path:
+        """Write `calibration` over the file of its id, in one step: until the new file is whole the old one stays.
+
+        Raises:
+            StoreError: disk full, read-only, other raw data than in the file, ...; the old file is as it was.
+            UnknownCalibrationError: there is no such file.
+            CalibrationFileError: the old file is damaged: it is not overwritten.
+        """
+        target = self.find(calibration.id)
+        stored = to_columns(self.load(calibration.id))[0]
+        columns = to_columns(calibration)[0]
+        raw = [name for name in stored.keys() | columns.keys() if name.startswith(_RAW)]
+        if content_hash({n: stored[n] for n in raw if n in stored}, {}) != content_hash(
+            {n: columns[n] for n in raw if n in columns}, {}
+        ):
+            raise StoreError(f"calibration {calibration.id}: its raw data differ from those in the file; not replaced")
+        self._write(target, calibration)
+        return target
+
+    def _write(self, target: Path, calibration: Calibration) -> None:
         image = write_image(*to_columns(calibration))
-        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            _write_through(temporary, image)
-            temporary.replace(target)
-            _sync_folder(self.folder)
+            write_whole(target, image)
         except OSError as error:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
             reason = error.strerror or str(error)
             raise StoreError(f"calibration {calibration.id} was not stored in {self.folder}: {reason}") from error
-        return target
 
     def load(self, name: str) -> Calibration:
         """The calibration with the id `name`, or in the file `name` of this folder.
@@ -144,23 +161,3 @@ def _read(file: Path) -> Calibration:
     if calibration.id != file.name.removesuffix(SUFFIX):
         raise CalibrationFileError(f"{file.name}: holds the calibration {calibration.id}; was the file renamed?")
     return calibration
-
-
-def _write_through(path: Path, content: bytes) -> None:
-    """Write `content` to a new file and make sure it is on the disk."""
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
-    try:
-        view = memoryview(content)
-        while view:
-            view = view[os.write(handle, view) :]
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

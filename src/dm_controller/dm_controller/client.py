@@ -29,13 +29,14 @@ from dm_msgs.srv import (
     Measure,
     SetFocus,
     SetSignals,
+    UpdateCalibration,
 )
-from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
 from dm_runtime import qos
+from dm_runtime.action_client import ThreadedActionClient
 from dm_runtime.executor import BackgroundExecutor
 from dm_runtime.worker import ServiceCallError, answers_arrive, call
 
@@ -48,6 +49,7 @@ SERVICES = {
     Measure: "measure",
     ListCalibrations: "list_calibrations",
     LoadCalibration: "load_calibration",
+    UpdateCalibration: "update_calibration",
 }
 ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus", Converge: "converge"}
 #: Two clients of one process need two names.
@@ -165,7 +167,7 @@ class DeformableMirrorClient:
         """The service or action client of that name."""
         if name not in self._clients:
             is_action = hasattr(interface, "Goal")
-            make = ActionClient if is_action else Node.create_client
+            make = ThreadedActionClient if is_action else Node.create_client
             self._clients[name] = make(self.node, interface, name)
         return self._clients[name]
 
@@ -244,6 +246,16 @@ class DeformableMirrorClient:
         """Load a stored calibration; "" = the newest that fits."""
         return self.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=name))
 
+    def update_calibration(
+        self, *, dry_run: bool = False, forget: bool = False, timeout_s: float = 70.0
+    ) -> UpdateCalibration.Response:
+        """Compare the calibration in use with a map taken now, and let it improve the calibration unless `dry_run`.
+
+        `forget` takes no map but drops all earlier updates.
+        """
+        request = UpdateCalibration.Request(dry_run=dry_run, forget=forget)
+        return self.call(UpdateCalibration, "update_calibration", request, timeout_s)
+
     # --- actions ---
 
     def run_action(
@@ -301,6 +313,22 @@ class DeformableMirrorClient:
         """Close the loop on the interferometer until the measured surface is the requested one."""
         request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
         goal = Converge.Goal(request=request, method=method, tolerance=float(tolerance), max_maps=max_maps)
+        return self.run_action(Converge, "converge", goal, on_feedback, timeout_s)
+
+    def build_recipes(
+        self,
+        curvatures: Sequence[float],
+        conic_constant: float = 0.0,
+        *,
+        tolerance: float = 0.0,
+        max_maps: int = 0,
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 14400.0,
+    ) -> Converge.Result:
+        """Build a recipe for each curvature [1/m] on the bench, and store them with the calibration in use."""
+        request = FocusRequest(conic_constant=float(conic_constant))
+        wanted = [float(curvature) for curvature in curvatures]
+        goal = Converge.Goal(request=request, curvatures=wanted, tolerance=float(tolerance), max_maps=max_maps)
         return self.run_action(Converge, "converge", goal, on_feedback, timeout_s)
 
     def calibrate(

@@ -1,8 +1,8 @@
-"""The action `converge`: bring the surface to a request in closed loop on the interferometer.
+"""The action `converge`: bring the surface to a request in closed loop on the interferometer, or build recipes there.
 
 To be hosted by the focus controller, which judges the request as for an open-loop move and knows calibration and
-mirror. The loop itself is `dm_controller.closed_loop`; driver and interferometer are reached through the services that
-a calibration uses.
+mirror. The loop itself is `dm_controller.closed_loop`, recipes are `dm_controller.recipe_action`; driver and
+interferometer are reached through the services that a calibration uses.
 """
 
 from __future__ import annotations
@@ -14,14 +14,17 @@ from typing import Any
 import numpy as np
 from dm_msgs.action import Converge
 from dm_msgs.msg import Calibration, ErrorCode, MirrorInfo
+from dm_msgs.srv import Degauss
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_calibration.calibration_bench import RosBench
+from dm_calibration.memory.law import MemoryState
 from dm_calibration.names import UnknownNameError
 from dm_calibration.procedure import BenchError, Cancelled, Measurement, MeasurementError
 from dm_controller.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.conversions import doubles, limits_of, model_of
+from dm_controller.recipe_action import RECIPE_PARAMETERS, RecipeRun
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import MirrorFacts, make_solver
 from dm_controller.target import FocusTarget, TargetError
@@ -43,6 +46,7 @@ CONVERGE_PARAMETERS = (
     Parameter("converge.driver_timeout", float, 30.0, "longest wait for the driver to set a shape", "s", 0.1, 600.0),
     Parameter("converge.measure_timeout", float, 60.0, "longest wait for one map", "s", 0.1, 3600.0),
     Parameter("converge.measure_retries", int, 1, "further tries after a map that failed", "", 0, 20, live=True),
+    *RECIPE_PARAMETERS,
 )  # fmt: skip
 
 
@@ -50,10 +54,16 @@ class _Bench(RosBench):
     """Driver and interferometer of one loop, with further tries of a map that failed."""
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
-        # What RosBench needs for a degauss is left out: a loop never does one.
         names = ("settle_time", "driver_timeout", "measure_timeout")
-        super().__init__(node, {name: values[f"converge.{name}"] for name in names})
+        own = {name: values[f"converge.{name}"] for name in names}
+        super().__init__(node, own | {"degauss_timeout": values["recipes.degauss_timeout"]})
+        self._degauss_steps = int(values["recipes.degauss_steps"])
         self.retries: Callable[[], int] = lambda: int(values["converge.measure_retries"])
+
+    def degauss(self) -> None:
+        """The condition that recipes begin with: the driver's own number of steps may be another."""
+        request = Degauss.Request(steps=self._degauss_steps)
+        self._call(self._degauss, request, self._values["degauss_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
 
     def measure(self, label: str) -> Measurement:
         """One map. Raises MeasurementError after all tries, or BenchError when no other try can succeed."""
@@ -76,6 +86,7 @@ class ConvergeAction:
         decide: judges a FocusRequest; returns an object with the `target` and raises an exception with an `error_code`
             when the request cannot be carried out at all (no calibration, a stale request, no such surface).
         known: the calibration and the mirror in use.
+        standing: what the host knows of the mirror's memory when a goal begins; None = nothing.
     """
 
     def __init__(
@@ -84,9 +95,11 @@ class ConvergeAction:
         values: Mapping[str, Any],
         decide: Callable[[Any], Any],
         known: Callable[[], tuple[Calibration | None, MirrorInfo | None]],
+        standing: Callable[[], MemoryState | None] = lambda: None,
     ) -> None:
         self._node, self._values, self._decide, self._known = node, values, decide, known
         self._bench = _Bench(node, values)
+        self._recipes = RecipeRun(node, values, self._bench, known, standing)
         self._server = WorkerActionServer(node, Converge, "converge", self._run)
 
     @property
@@ -101,11 +114,14 @@ class ConvergeAction:
         def end(outcome: str, error_code: int, message: str) -> tuple[str, Any]:
             result.error_code, result.message = error_code, message
             _fill(result, steps)
+            return told(outcome, result)
+
+        def told(outcome: str, result: Any) -> tuple[str, Any]:
             # One line per severity: rclpy ties a severity to the line that logs.
             if outcome == "succeed":
-                self._node.get_logger().info(f"converge: {message}")
+                self._node.get_logger().info(f"converge: {result.message}")
             else:
-                self._node.get_logger().warning(f"converge: {message}")
+                self._node.get_logger().warning(f"converge: {result.message}")
             return outcome, result
 
         taken: list[LoopStep] = []
@@ -117,6 +133,8 @@ class ConvergeAction:
             )
 
         try:
+            if handle.request.curvatures:
+                return told(*self._build_recipes(handle))
             outcome = self._loop(handle, report)
             steps = outcome.steps
             return end(*self._judge(outcome))
@@ -142,6 +160,12 @@ class ConvergeAction:
                 raise
             return end("abort", error.error_code, str(error))
 
+    def _build_recipes(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+        self._check_figures(handle.request)
+        target: FocusTarget = self._decide(handle.request.request).target
+        self._bench.cancelled = lambda: bool(handle.is_cancel_requested)
+        return self._recipes.run(handle, target)
+
     def _loop(self, handle: ServerGoalHandle, report: Callable[[LoopStep], None]) -> LoopResult:
         goal, bench = handle.request, self._bench
         options = self._options(goal)
@@ -161,12 +185,16 @@ class ConvergeAction:
             creep = Creep(self._values["converge.creep"], before, lambda: clock.now().nanoseconds * 1e-9)
         return converge(solver, target, bench, options, creep=creep, on_step=report, cancelled=bench.cancelled)
 
-    def _options(self, goal: Any) -> LoopOptions:
-        """What the goal asks for, 0 = configured. Raises ValueError naming the field."""
+    def _check_figures(self, goal: Any) -> None:
+        """Raise ValueError naming the field that makes no sense."""
         if not (math.isfinite(goal.tolerance) and goal.tolerance >= 0.0):
             raise ValueError(f"tolerance = {goal.tolerance} m: must be 0 (= configured) or above, and finite")
         if goal.max_maps > 100:
             raise ValueError(f"max_maps = {goal.max_maps}: must be 0 (= configured) to 100")
+
+    def _options(self, goal: Any) -> LoopOptions:
+        """What the goal asks for, 0 = configured. Raises ValueError naming the field."""
+        self._check_figures(goal)
         return LoopOptions(
             goal.tolerance or self._values["converge.tolerance"], goal.max_maps or self._values["converge.max_maps"]
         )

@@ -7,12 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.calibration_messages import doubles
+from dm_calibration.calibration_messages import doubles, memory_law_from
 from dm_controller.model import InfluenceModel
+from dm_controller.open_loop import MemoryFigures
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget
 
-__all__ = ["doubles", "limits_of", "model_of", "target_of"]
+__all__ = ["doubles", "limits_of", "memory_figures_of", "model_of", "target_of"]
+
+#: A law is scaled so that effective signals span this over a full cycle; gains are in the influence function.
+SPAN = 2.0
+SPAN_TOLERANCE = 0.2
 
 
 def target_of(request: Any) -> FocusTarget:
@@ -42,6 +47,39 @@ def model_of(calibration: Any) -> InfluenceModel:
         held_out_rms=calibration.held_out_rms,
         held_out_max_zernike=calibration.held_out_max_zernike,
     )
+
+
+def memory_figures_of(calibration: Any) -> MemoryFigures | None:
+    """The memory of a dm_msgs/Calibration; None when none was identified.
+
+    Raises:
+        ValueError: a field that makes no sense, or a law that has no inverse, naming it.
+    """
+    memory = calibration.memory
+    try:
+        law = memory_law_from(memory)
+    except ValueError as error:
+        raise ValueError(f"memory: {str(error).removeprefix('memory: ')}") from error
+    if law is None:
+        return None
+    slope = law.slope_min()
+    if not slope > 0.0:
+        raise ValueError(
+            f"memory: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"
+        )
+    span = law.span()
+    if not abs(span - SPAN) <= SPAN_TOLERANCE:
+        raise ValueError(
+            f"memory: play_weight: effective signals span {span:.3g}, must be {SPAN:g}: a law of another scale"
+        )
+    sigma = np.array(memory.zernike_sigma, dtype=np.float64)
+    if sigma.shape != (calibration.terms,) or not (np.isfinite(sigma) & (sigma >= 0.0)).all():
+        raise ValueError(f"memory: zernike_sigma: must be {calibration.terms} finite numbers, none negative")
+    for name in ("held_out_max_zernike", "unknown_sigma"):
+        value = getattr(memory, name)
+        if not (np.isfinite(value) and value >= 0.0):
+            raise ValueError(f"memory: {name} = {value:g}: must be finite and not negative")
+    return MemoryFigures(law, sigma, memory.held_out_max_zernike, memory.unknown_sigma)
 
 
 def limits_of(mirror: Any) -> Limits:

@@ -1,19 +1,29 @@
-"""The inverse of the memory law: which signals bring about wanted effective signals, from where the mirror stands."""
+"""The inverse of the memory law: which signals bring about wanted effective signals, from where the mirror stands.
+
+On a straight way the play operators set in one after another, and between two of these places the law is a polynomial
+in the signal. Its value at all places tells the piece that holds the solution, Newton's method finds it there. The work
+grows with actuators times operators.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
+from dm_calibration.memory.duhem import DuhemOperator
 from dm_calibration.memory.law import MemoryLaw, MemoryState
 
 Floats = NDArray[np.float64]
 
-#: Effective signals are met to this; a DAC step is a thousand times as large.
-TOLERANCE = 1e-8
+#: Effective signals are met to this; a DAC step is three hundred times as large.
+TOLERANCE = 1e-7
 ROUNDS_MAX = 60
+#: Newton's step never divides by less; laws that can be inverted are steeper by far.
+SLOPE_MIN = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +44,7 @@ def invert(
 ) -> Inverted:
     """Signals (N,) within `low` .. `high`, applied at the state's time, for `effective` (N,) `ahead` seconds later.
 
-    The law rises with the signal on every way, so each actuator has one solution. All are sought at once by the
-    regula falsi with the Illinois rule (Dowell & Jarratt, BIT 11, 1971), which keeps it between two bounds.
+    The law rises with the signal on every way, so each actuator has one solution.
 
     Raises:
         ValueError: `effective` has another length than the mirror actuators, or is not finite.
@@ -46,23 +55,105 @@ def invert(
         signals = np.clip(effective, low, high)
         return Inverted(signals, effective - signals)
     wanted = law.position_for(state, effective, ahead)
-    # One end of the bracket is where the mirror stands, the other the limit on the wanted side.
-    rising = wanted >= state.position
-    near, near_gap = np.clip(state.signals, low, high), state.position - wanted
-    far = np.where(rising, high, low)
-    far_gap = law.position_at(state, far) - wanted
-    beyond = np.where(rising, far_gap <= 0.0, far_gap >= 0.0)
-    near_gap = np.where(beyond, 0.0, near_gap)
-    signals, gap = near, near_gap
-    for _ in range(ROUNDS_MAX):
-        width = near_gap - far_gap
-        signals = near - near_gap * (near - far) / np.where(width == 0.0, 1.0, width)
-        signals = np.where(beyond, far, signals)
-        gap = law.position_at(state, signals) - wanted
-        if np.abs(np.where(beyond, 0.0, gap)).max() <= TOLERANCE:
-            break
-        kept = gap * far_gap < 0.0  # the solution lies between the new point and the far end
-        near_gap = np.where(kept, far_gap, 0.5 * near_gap)
-        near = np.where(kept, far, near)
-        far, far_gap = signals, gap
-    return Inverted(signals, np.where(beyond, -gap, 0.0))
+    return _pieces(law).solve(state, wanted, low, high)
+
+
+class _Pieces:
+    """The polynomials of one law on a rising and on a falling way.
+
+    Attributes:
+        radius: (R,) half-widths, rising.
+        polynomial: (D + 1, 2, R) coefficients by rising power of the sum over the operators 0 .. k that have set in, on
+            a falling [0] and on a rising [1] way.
+    """
+
+    def __init__(self, law: MemoryLaw) -> None:
+        order = np.argsort(law.play_radius, kind="stable")
+        self._order = None if (np.diff(order) == 1).all() else order
+        self.radius, weight = law.play_radius[order], law.play_weight[order]
+        self._single = np.vstack((np.zeros(len(self.radius)), weight.T))
+        self.polynomial = np.zeros((len(self._single), 2, len(self.radius)))
+        for way, sign in enumerate((-1.0, 1.0)):
+            for k, radius in enumerate(self.radius):
+                # What has set in follows the signal at the distance of its half-width.
+                shifted = Polynomial(self._single[:, k])(Polynomial([-sign * radius, 1.0])).coef
+                self.polynomial[: len(shifted), way, k] = shifted
+        self.polynomial = self.polynomial.cumsum(axis=2)
+        self._duhem = DuhemOperator(law.duhem_slope) if law.duhem_slope.size else None
+        self._duhem_weight = law.duhem_weight
+        self._duhem_slope = law.duhem_weight * np.concatenate(([1.0], -law.duhem_slope, [0.0]))
+
+    def solve(self, state: MemoryState, wanted: Floats, low: float, high: float) -> Inverted:
+        """Signals for the static effective signals `wanted` (N,)."""
+        rising = wanted >= state.position
+        way, sign = rising.astype(np.intp), np.where(rising, 1.0, -1.0)
+        if len(self.radius) == 1 and self.radius[0] == 0.0:  # no play: one piece, which begins where the mirror stands
+            start = np.minimum(np.maximum(state.signals + (wanted - state.position), low), high)
+            near, far = np.where(rising, state.signals, low), np.where(rising, high, state.signals)
+            polynomial, none = self.polynomial[:, 0], np.zeros(1)
+            return self._newton(
+                state, wanted, sign, polynomial, none, start, np.maximum(near, low), np.minimum(far, high)
+            )
+        play = state.play if self._order is None else state.play[:, self._order]
+        value = _horner(self._single, play)
+        waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)  # operators that have not set in yet
+        onset = play + sign[:, None] * self.radius
+        at_onset = _horner(self.polynomial[:, way], onset) + waiting
+        if self._duhem is not None:
+            change = onset - state.signals[:, None]
+            at_onset += self._duhem_weight * self._duhem.move(state.fading[:, None], change)
+        still = sign[:, None] * (wanted[:, None] - at_onset)
+        last = len(self.radius) - 1
+        piece = np.maximum(np.count_nonzero(still >= 0.0, axis=1) - 1, 0)
+        following = np.minimum(piece + 1, last)
+        rows = np.arange(len(wanted))
+        polynomial, fixed = self.polynomial[:, way, piece], waiting[rows, piece]
+        begin, end = onset[rows, piece], np.where(piece < last, onset[rows, following], np.where(rising, high, low))
+        # The chord of a narrow piece comes close; beyond the last place the slope is about 1.
+        before, after = still[rows, piece], still[rows, following]
+        chord = np.where(before > after, (end - begin) / np.where(before > after, before - after, 1.0), sign)
+        near, far = np.minimum(begin, end), np.maximum(begin, end)
+        start = np.minimum(np.maximum(begin + chord * before, low), high)
+        return self._newton(state, wanted, sign, polynomial, fixed, start, np.maximum(near, low), np.minimum(far, high))
+
+    def _newton(
+        self,
+        state: MemoryState,
+        wanted: Floats,
+        sign: Floats,
+        polynomial: Floats,
+        fixed: Floats,
+        signals: Floats,
+        low: Floats,
+        high: Floats,
+    ) -> Inverted:
+        """The root between `low` and `high` (N,) of what rises there, or the end that comes nearest to it."""
+        derivative = polynomial[1:] * np.arange(1.0, len(polynomial))[:, None]
+        gap = wanted
+        for _ in range(ROUNDS_MAX):
+            value = _horner(polynomial, signals) + fixed
+            slope = _horner(derivative, signals) if len(derivative) > 1 else derivative[0]
+            if self._duhem is not None:
+                fading = self._duhem.move(state.fading, signals - state.signals)
+                value += self._duhem_weight * fading
+                slope = slope + _horner(self._duhem_slope, sign * fading)
+            gap = value - wanted
+            below = gap < 0.0
+            low, high = np.where(below, signals, low), np.where(below, high, signals)
+            step = np.minimum(np.maximum(signals - gap / np.maximum(slope, SLOPE_MIN), low), high)
+            if np.abs(step - signals).max() <= TOLERANCE:
+                break
+            signals = step
+        return Inverted(signals, np.where(np.abs(gap) <= 2.0 * TOLERANCE, 0.0, -gap))
+
+
+#: A law never changes, so what is worked out from it is kept.
+_pieces = lru_cache(maxsize=8)(_Pieces)
+
+
+def _horner(coefficients: Floats, x: Floats) -> Floats:
+    """Polynomials with `coefficients` (D + 1, ...) by rising power, D > 0, at x (...)."""
+    total = coefficients[-1] * x + coefficients[-2]
+    for coefficient in coefficients[-3::-1]:
+        total = total * x + coefficient
+    return np.asarray(total)

@@ -67,15 +67,22 @@ class InfluenceModel:
 class Plan:
     """A command and what it is expected to do.
 
-    Lengths in m; `upper` are 95 % bounds that include the calibration's held-out error.
+    Lengths in m; `lower` and `upper` are 95 % bounds that include the calibration's held-out error.
     """
 
     signals: NDArray[np.float64]
     rms: float
+    rms_lower: float
     rms_upper: float
     max_zernike: float
     max_zernike_upper: float
     saturated: NDArray[np.bool_]
+
+
+def rms_bounds(rms: float, spread: float) -> tuple[float, float]:
+    """95 % interval of an rms, m, when an independent error with the rms `spread` (m) comes on top, in squares."""
+    reach = (1.96 * spread) ** 2
+    return float(np.sqrt(max(rms**2 - reach, 0.0))), float(np.sqrt(rms**2 + reach))
 
 
 class CalibratedMirror:
@@ -88,6 +95,7 @@ class CalibratedMirror:
 
     Attributes:
         matrix: (K - 3 + P, N), `rows` of the influence function.
+        sag_root: (N, N), m: its product with signals is as long as their rms sag, piston and tilt removed.
     """
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
@@ -97,7 +105,9 @@ class CalibratedMirror:
         self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
         self._tilt_free = self._terms[:, :FREE_TERMS]
         self.matrix = self.rows(model.influence_zernike, model.influence_sag)
-        response = np.linalg.norm(self._reduce(model.influence_sag, self._tilt_free), axis=0)
+        reduced = self._reduce(model.influence_sag, self._tilt_free)
+        self.sag_root: NDArray[np.float64] = np.linalg.qr(reduced)[1]
+        response = np.linalg.norm(reduced, axis=0)
         self._programme = BoundedProgramme(self.matrix, limits, ridge=(RIDGE_SHARE * float(np.median(response))) ** 2)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
@@ -161,7 +171,8 @@ class CalibratedMirror:
         return Plan(
             signals=signals,
             rms=rms,
-            rms_upper=float(np.hypot(rms, 1.96 * model.held_out_rms)),
+            rms_lower=rms_bounds(rms, model.held_out_rms)[0],
+            rms_upper=rms_bounds(rms, model.held_out_rms)[1],
             max_zernike=largest,
             max_zernike_upper=largest + model.held_out_max_zernike,
             saturated=self.limits.at_limit(signals),

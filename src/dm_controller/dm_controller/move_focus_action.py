@@ -12,6 +12,7 @@ from dm_msgs.msg import ActuatorState, ErrorCode, FocusRequest, FocusState
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
+from dm_controller.conditioning import Waiting
 from dm_runtime.worker import WorkerActionServer, sleep
 
 
@@ -20,7 +21,9 @@ class MoveFocusAction:
 
     Args:
         node: hosts the action.
-        carry_out: (request, dry_run) -> FocusState: judge a request and, unless it is refused or a dry run, send it.
+        carry_out: (request, dry_run): judge a request and, unless it is refused or a dry run, send it. Returns its
+            state and, when the mirror is conditioned first, what waits for the end of that.
+        drop: do not carry out what waits.
         send: publish signals (N,) as a command.
         driver: the driver's latest state; None before the first.
         values: parameters `settle_time` and `move_timeout`.
@@ -29,13 +32,15 @@ class MoveFocusAction:
     def __init__(
         self,
         node: Node,
-        carry_out: Callable[[FocusRequest, bool], FocusState],
+        carry_out: Callable[[FocusRequest, bool], tuple[FocusState, Waiting | None]],
+        drop: Callable[[Waiting], None],
         send: Callable[[Any], Any],
         driver: Callable[[], ActuatorState | None],
         values: Mapping[str, Any],
     ) -> None:
         self._clock = node.get_clock()
-        self._carry_out, self._send, self._driver, self._values = carry_out, send, driver, values
+        self._carry_out, self._drop, self._send = carry_out, drop, send
+        self._driver, self._values = driver, values
         self._server = WorkerActionServer(node, MoveFocus, "move_focus", self._run, exclusive="preempt")
 
     def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
@@ -49,7 +54,7 @@ class MoveFocusAction:
 
         goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
         if goal.tolerance > 0.0:
-            preview = self._carry_out(goal.request, True)
+            preview, _ = self._carry_out(goal.request, True)
             if preview.error_code == ErrorCode.OK and preview.predicted_max_zernike > goal.tolerance:
                 result.state = preview
                 return end(
@@ -58,7 +63,13 @@ class MoveFocusAction:
                     f"tolerance = {goal.tolerance * 1e9:.2f} nm: the predicted largest coefficient error is "
                     f"{preview.predicted_max_zernike * 1e9:.2f} nm; nothing moved",
                 )
-        result.state = self._carry_out(goal.request, False)
+        result.state, waiting = self._carry_out(goal.request, False)
+        if waiting is not None:
+            stopped = self._await_conditioning(goal_handle, waiting, result.state.predicted_duration)
+            if stopped is not None:
+                return end(*stopped)
+            assert waiting.state is not None
+            result.state = waiting.state
         if result.state.error_code != ErrorCode.OK:
             return end("abort", result.state.error_code, result.state.message)
         wanted = np.asarray(result.state.signals)
@@ -85,6 +96,25 @@ class MoveFocusAction:
                 self._send(driver.applied)
             return "canceled", ErrorCode.CANCELED, "canceled; the mirror holds the shape it had reached"
         return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
+
+    def _await_conditioning(
+        self, goal_handle: ServerGoalHandle, waiting: Waiting, expected_s: float
+    ) -> tuple[str, int, str] | None:
+        """Wait until the mirror is degaussed and the command is out; None when it is, or was refused."""
+        started, next_feedback = time.monotonic(), 0.0
+        while not waiting.done:
+            if self._told_to_stop(goal_handle):
+                self._drop(waiting)
+                if goal_handle.is_cancel_requested:
+                    return "canceled", ErrorCode.CANCELED, "canceled; the degauss under way ends at mid range"
+                return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
+            elapsed = time.monotonic() - started
+            if elapsed >= next_feedback:
+                next_feedback = elapsed + 0.1
+                progress = min(1.0, elapsed / expected_s) if expected_s > 0.0 else 0.0
+                goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN, progress=progress))
+            time.sleep(0.002)
+        return None
 
     def _await_shape(self, goal_handle: ServerGoalHandle, wanted: np.ndarray) -> tuple[str, int, str] | None:
         """Wait until the driver reports the wanted shape; None when it stands."""

@@ -7,6 +7,7 @@ again, a little later: creep has changed what the same signals do.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.memory.law import MemoryLaw, MemoryState
 from dm_controller.inverse import invert
-from dm_controller.model import FREE_TERMS, CalibratedMirror, Plan
+from dm_controller.model import FREE_TERMS, CalibratedMirror, Plan, rms_bounds
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget
 
@@ -22,6 +23,9 @@ Floats = NDArray[np.float64]
 
 #: Draws for the 95 % quantile of the largest of many errors.
 DRAWS = 4000
+#: Shortest time after a move at which a calibration sees the surface, s: one map takes about that long. Creep of less
+#: age is extrapolated.
+YOUNGEST_MAP_S = 1.0
 #: Part of the expected error beyond which effective signals that a limit denies count, normalised.
 MISSED_MAX = 1e-6
 
@@ -43,10 +47,12 @@ class Move:
     Attributes:
         plan: command and prediction; its signals are what the electronics get.
         effective: (N,) effective signals aimed at: what holding the shape means.
+        duration: s that the way takes at the slew rate.
     """
 
     plan: Plan
     effective: Floats
+    duration: float = 0.0
 
 
 class OpenLoop:
@@ -55,12 +61,16 @@ class OpenLoop:
     Args:
         mirror: its influence function acts on effective signals.
         memory: None = the mirror's memory is not identified: effective signals are signals.
+        slew_rate: of the signals, 1/s; infinite = moves take no time.
     """
 
-    def __init__(self, mirror: CalibratedMirror, memory: MemoryFigures | None = None) -> None:
-        self.mirror, self.memory = mirror, memory
+    def __init__(
+        self, mirror: CalibratedMirror, memory: MemoryFigures | None = None, slew_rate: float = math.inf
+    ) -> None:
+        self.mirror, self.memory, self.slew_rate = mirror, memory, slew_rate
         self.law = memory.law if memory is not None else MemoryLaw.linear()
-        self._unknown_max_zernike, self._unknown_rms = self._unknown_history()
+        self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[FREE_TERMS:])
+        self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
 
     def plan(
         self,
@@ -70,6 +80,7 @@ class OpenLoop:
         known: bool = True,
         effective: Floats | None = None,
         ahead: float = 0.0,
+        error: float | None = None,
     ) -> Move:
         """The move to `target` that begins at `time` (s) from `state`.
 
@@ -77,7 +88,8 @@ class OpenLoop:
             state: None = unknown altogether; then the mirror is taken to be degaussed.
             known: whether the state can be trusted; if not, the bounds are widened.
             effective: (N,) effective signals to aim at instead of the model's own (a recipe).
-            ahead: s after `time` at which the shape is to be right; creep is quickest just after a move.
+            ahead: s after the way at which the shape is to be right; creep is quickest just after a move.
+            error: m, 95 % bound of the largest coefficient error under `effective`, where it was measured.
 
         Raises:
             TargetError: no such surface exists over the aperture.
@@ -85,17 +97,26 @@ class OpenLoop:
         limits = self.mirror.limits
         planned = self.mirror.plan(target)
         aim = planned.signals if effective is None else effective
+        travel = float(np.abs(aim - state.signals).max()) / self.slew_rate if state is not None else 0.0
+        if effective is not None:
+            planned = self.mirror.predict(target, aim)
+        if error is not None:
+            planned = replace(planned, max_zernike=min(planned.max_zernike, error), max_zernike_upper=error)
         if self.memory is None:
-            return Move(planned if effective is None else self.mirror.predict(target, aim), aim)
+            return Move(planned, aim, travel)
         if state is None:
             state, known = self.law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
-        inverted = invert(self.law, self.law.advance(state, time), aim, limits.low, limits.high, ahead)
+        # A move counts from its last write; older creep goes on during the way.
+        at = self.law.advance(state, time + travel)
+        inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
         signals, missed = inverted.signals, inverted.missed
         if not limits.allow_neighbours(signals):
-            signals, missed = self._within_neighbours(signals, state, time, aim)
+            signals, missed = self._within_neighbours(signals, at, aim)
         if np.abs(missed).max() > MISSED_MAX and effective is None:
             planned = self.mirror.predict(target, aim - missed)
-        return Move(self._bounded(planned, signals, known), aim)
+        step = aim - missed - self.law.effective(at)  # but for creep, how far the actuators go
+        bounded = self._bounded(planned, signals, known, self._young_creep(step, ahead), error)
+        return Move(bounded, aim, travel)
 
     def hold(self, state: MemoryState, time: float, effective: Floats, ahead: float = 0.0) -> Floats:
         """(N,) signals, applied at `time` (s), that keep `effective` (N,) and are right `ahead` s later."""
@@ -104,31 +125,55 @@ class OpenLoop:
         signals = invert(self.law, at, effective, limits.low, limits.high, ahead).signals
         return signals if limits.allow_neighbours(signals) else state.signals
 
-    def _bounded(self, plan: Plan, signals: Floats, known: bool) -> Plan:
+    def drift(self, state: MemoryState, time: float, effective: Floats) -> float:
+        """Largest coefficient error (m) at `time` (s) of a mirror that should stand at `effective` (N,)."""
+        gap = self.law.effective(self.law.advance(state, time)) - effective
+        return self._largest(gap)
+
+    def _largest(self, effective: Floats) -> float:
+        """Largest coefficient beyond tilt, m, of effective signals (N,)."""
+        return float(np.abs(self._zernike @ effective).max())
+
+    def _young_creep(self, step: Floats, ahead: float) -> tuple[float, float]:
+        """What extrapolation adds to the largest coefficient error and to the rms sag error of a move, m.
+
+        Creep within `ahead` s of a step (N,) follows from the law, which no map younger than YOUNGEST_MAP_S confirms:
+        what it says of the time between is taken to be right to one half.
+        """
+        if not 0.0 < ahead < YOUNGEST_MAP_S:
+            return 0.0, 0.0
+        share = 0.5 * self.law.creep_rate * math.log10(YOUNGEST_MAP_S / ahead)
+        return share * self._largest(step), share * float(np.linalg.norm(self.mirror.sag_root @ step))
+
+    def _bounded(
+        self, plan: Plan, signals: Floats, known: bool, young: tuple[float, float], error: float | None
+    ) -> Plan:
         memory = self.memory
         assert memory is not None
-        rms_spread, largest_spread = self.mirror.model.held_out_rms, memory.held_out_max_zernike
+        rms_spread = self.mirror.model.held_out_rms
+        largest_spread = memory.held_out_max_zernike if error is None else error - plan.max_zernike
         if not known:
             rms_spread = float(np.hypot(rms_spread, self._unknown_rms))
-            largest_spread = float(np.hypot(largest_spread, self._unknown_max_zernike))
+            largest_spread = float(np.hypot(largest_spread, self.unknown_max_zernike))
+        rms_lower, rms_upper = rms_bounds(plan.rms, float(np.hypot(rms_spread, young[1] / 1.96)))
         return replace(
             plan,
             signals=signals,
-            rms_upper=float(np.hypot(plan.rms, 1.96 * rms_spread)),
-            max_zernike_upper=plan.max_zernike + largest_spread,
+            rms_lower=rms_lower,
+            rms_upper=rms_upper,
+            max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, young[0])),
             saturated=self.mirror.limits.at_limit(signals),
         )
 
-    def _within_neighbours(
-        self, signals: Floats, state: MemoryState, time: float, aim: Floats
-    ) -> tuple[Floats, Floats]:
+    def _within_neighbours(self, signals: Floats, at: MemoryState, aim: Floats) -> tuple[Floats, Floats]:
         """The part of the way from the present signals that keeps neighbours within their limit, and what it misses."""
         limits = self.mirror.limits
-        at = self.law.advance(state, time)
         a, b = limits.pairs.T
         now, then = at.signals[a] - at.signals[b], signals[a] - signals[b]
         room = limits.neighbour_difference - np.sign(then) * now
-        share = np.where(np.abs(then) > limits.neighbour_difference, room / np.maximum(np.sign(then) * (then - now), 1e-12), 1.0)
+        share = np.where(
+            np.abs(then) > limits.neighbour_difference, room / np.maximum(np.sign(then) * (then - now), 1e-12), 1.0
+        )
         moved = at.signals + float(np.clip(share.min(), 0.0, 1.0)) * (signals - at.signals)
         reached = self.law.position_at(at, moved) + self.law.creep(at)
         return moved, aim - reached

@@ -44,6 +44,7 @@ class MapRecord:
         valid_fraction: valid pixels of the aperture, 0..1.
         file, sha256: the map file it came from; "" = none.
         nominal: (K,) coefficients of the surface that was aimed at, m; None when signals were prescribed.
+        moved_ns: when the mirror took this shape, ns; 0 = not told.
     """
 
     label: str
@@ -60,6 +61,7 @@ class MapRecord:
     file: str = ""
     sha256: str = ""
     nominal: Floats | None = None
+    moved_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class MapSet:
     file: tuple[str, ...]
     sha256: tuple[str, ...]
     nominal: Floats
+    moved_ns: NDArray[np.int64]
 
     def __post_init__(self) -> None:
         points = self.points
@@ -97,6 +100,7 @@ class MapSet:
             "residual_rms": (count,),
             "valid_fraction": (count,),
             "nominal": (count, terms),
+            "moved_ns": (count,),
         }
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
@@ -122,6 +126,13 @@ class MapSet:
     def reference(self) -> NDArray[np.bool_]:
         """(M,) which maps are reference frames."""
         return np.array([kind == REFERENCE for kind in self.kind], dtype=bool)
+
+    def moved_s(self) -> Floats:
+        """(M,) s since the first map: when the mirror took each shape; right after the map before where not told."""
+        before = np.concatenate((self.stamp_ns[:1], self.stamp_ns[:-1]))
+        told = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns)
+        told[1:] &= self.moved_ns[1:] >= self.stamp_ns[:-1]
+        return np.asarray(1e-9 * (np.where(told, self.moved_ns, before) - self.stamp_ns[0]))
 
     @classmethod
     def from_records(cls, records: Sequence[MapRecord], points: SamplePoints) -> MapSet:
@@ -149,6 +160,7 @@ class MapSet:
             file=tuple(record.file for record in records),
             sha256=tuple(record.sha256 for record in records),
             nominal=np.stack([unknown if record.nominal is None else record.nominal for record in records]),
+            moved_ns=np.array([record.moved_ns for record in records], dtype=np.int64),
         )
 
     def select(self, keep: NDArray[np.bool_]) -> MapSet:

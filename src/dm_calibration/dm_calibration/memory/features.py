@@ -43,18 +43,22 @@ def fading_feature(signals: Floats, operator: DuhemOperator) -> Floats:
     return values
 
 
-def crept(features: Floats, time: Floats, start: float) -> Floats:
-    """What creep adds to features (M, F, N) per unit of creep rate, seen at `time` (M,) s.
+def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
+    """What creep adds to features (M, F, N) per unit of creep rate, seen at `time` (M,) s; all before `start` was 0.
 
-    Row m has stood since row m - 1 was looked at, the first since `start`; all before was 0.
+    Args:
+        moved: (M,) s, when each row began to stand, between the looks; None = right after the look before.
     """
     element = CREEP_TIMES[:, None, None]
     state = np.zeros((len(CREEP_TIMES), *features.shape[1:]))
     result = np.empty_like(features)
-    rest = np.exp(-np.diff(time, prepend=start) / CREEP_TIMES[:, None]).T
+    moved = np.concatenate(([start], time[:-1])) if moved is None else np.maximum(moved, start)
+    still = np.exp(-np.diff(np.column_stack((moved, time)).ravel(), prepend=start)[:, None] / CREEP_TIMES)
+    before = np.zeros(features.shape[1:])
     for row, now in enumerate(features):
-        state = now + (state - now) * rest[row].reshape(element.shape)
-        result[row] = state.sum(axis=0)
+        state = before + (state - before) * still[2 * row].reshape(element.shape)
+        state = now + (state - now) * still[2 * row + 1].reshape(element.shape)
+        result[row], before = state.sum(axis=0), now
     return result * _per_element()
 
 

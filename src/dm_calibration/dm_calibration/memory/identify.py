@@ -76,12 +76,14 @@ class Run:
         time: (M,) s, of the maps, rising.
         responses: what was measured.
         start: s, when the degauss had ended; None = just before the first map.
+        moved: (M,) s, when the mirror took each shape; None = right after the map before.
     """
 
     signals: Floats
     time: Floats
     responses: Responses
     start: float | None = None
+    moved: Floats | None = None
 
     def __post_init__(self) -> None:
         if (np.diff(self.time) < 0.0).any():
@@ -118,7 +120,7 @@ class _Problem:
         self.run, self.candidate, self._scatter = run, candidate, scatter
         self.radius = np.concatenate(([0.0], (np.arange(candidate.plays) + 0.5) / max(candidate.plays, 1)))
         self._plays = play_features(run.signals, self.radius, candidate.powers)
-        self._plays_crept = crept(self._plays, run.time, run.began)
+        self._plays_crept = crept(self._plays, run.time, run.began, run.moved)
         self._measured = run.responses.values / scatter
         settled = relaxation(run.time, run.began)
         self._figure = np.column_stack((np.ones(len(run.time)), settled, (run.time - run.began) / np.ptp(run.time)))
@@ -157,7 +159,7 @@ class _Problem:
         if not self.candidate.slopes:
             return features
         fading = fading_feature(self.run.signals, DuhemOperator(slope))
-        fading = fading + rate * crept(fading, self.run.time, self.run.began)
+        fading = fading + rate * crept(fading, self.run.time, self.run.began, self.run.moved)
         return np.concatenate((features, fading), axis=1)
 
     def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats, Floats]:

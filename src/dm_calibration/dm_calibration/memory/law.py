@@ -191,14 +191,16 @@ class MemoryLaw:
         """Smallest slope of the effective signal over signals of +-`span`, on any way.
 
         After a turn the operators set in one by one, narrow ones first; what has set in follows the signal at a
-        distance of its half-width.
+        distance of its half-width. Those of half-width r have set in only where the turn can lie 2 r behind.
         """
         order = np.argsort(self.play_radius)
         radius, weight = self.play_radius[order], self.play_weight[order]
-        value = np.linspace(-span, span, 201)[:, None] + np.array([-1.0, 1.0])[:, None, None] * radius
+        signal, way = np.linspace(-span, span, 201)[:, None], np.array([1.0, -1.0])[:, None, None]
+        value = signal - way * radius
         slope = np.zeros_like(value)
         for power in range(weight.shape[1], 0, -1):
             slope = slope * value + power * weight[:, power - 1]
+        slope = np.where(2.0 * radius <= span + way * signal, slope, 0.0)
         smallest = float(np.cumsum(slope, axis=2).min())
         if self._duhem is not None:
             low, high = self._duhem.slope_range
@@ -218,12 +220,15 @@ class MemoryLaw:
         return replace(self, play_weight=factor * self.play_weight, duhem_weight=factor * self.duhem_weight)
 
 
-def follow(law: MemoryLaw, state: MemoryState, signals: Floats, time: Floats) -> tuple[Floats, MemoryState]:
-    """Effective signals of a sequence: moved to row m right after row m - 1 was looked at, looked at at `time[m]`.
+def follow(
+    law: MemoryLaw, state: MemoryState, signals: Floats, time: Floats, moved: Floats | None = None
+) -> tuple[Floats, MemoryState]:
+    """Effective signals of a sequence, looked at at `time`.
 
     Args:
         signals: (M, N) as applied.
         time: (M,) s, rising.
+        moved: (M,) s, when each was applied, between the looks; None = right after the look before.
 
     Returns:
         (M, N) effective signals, and the state after the last.
@@ -235,7 +240,8 @@ def follow(law: MemoryLaw, state: MemoryState, signals: Floats, time: Floats) ->
         row = int(np.flatnonzero(np.diff(time) < 0.0)[0]) + 1
         raise ValueError(f"time stamps: row {row} is {time[row - 1] - time[row]:.3f} s before the row before it")
     result = np.empty_like(signals)
-    for row, (shape, when) in enumerate(zip(signals, time, strict=True)):
-        state = law.advance(law.move(state, shape, state.time), float(when))
+    starts = np.concatenate(([state.time], time[:-1])) if moved is None else moved
+    for row, (shape, start, when) in enumerate(zip(signals, starts, time, strict=True)):
+        state = law.advance(law.move(state, shape, float(start)), float(when))
         result[row] = law.effective(state)
     return result, state

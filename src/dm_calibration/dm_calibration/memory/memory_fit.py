@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import PISTON_TILT
 from dm_calibration.influence.maps import CHECK, MapSet
-from dm_calibration.memory.identify import Identification, Run, identify
+from dm_calibration.memory.features import relaxation
+from dm_calibration.memory.identify import CANDIDATES, Candidate, Identification, Run, identify
 from dm_calibration.memory.law import MemoryLaw, follow
 from dm_calibration.memory.responses import responses_of
 from dm_calibration.optics.zernike import TERM_RMS
@@ -49,10 +50,15 @@ class MemoryFit:
     remarks: tuple[str, ...]
 
 
-def fit_memory(maps: MapSet, progress: Callable[[str], None] = lambda step: None) -> MemoryFit:
+def fit_memory(
+    maps: MapSet, progress: Callable[[str], None] = lambda step: None, candidates: Sequence[Candidate] = CANDIDATES
+) -> MemoryFit:
     """Identify the law from the maps of one run, in the order measured, which begins with a degauss.
 
     Maps of kind CHECK test the law before they join the final fit.
+
+    Args:
+        candidates: classes of laws to choose from.
 
     Raises:
         ExcitationError: the maps do not show the memory.
@@ -60,9 +66,9 @@ def fit_memory(maps: MapSet, progress: Callable[[str], None] = lambda step: None
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S)
+    run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s())
     test = np.array([kind == CHECK for kind in maps.kind])
-    found = identify(run, test, progress=progress)
+    found = identify(run, test, candidates, progress=progress)
     covariance = _error_covariance(found, run, maps.terms)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
@@ -85,7 +91,30 @@ def effective_maps(maps: MapSet, law: MemoryLaw) -> MapSet:
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
     state = law.demagnetised(maps.actuators, -BEFORE_FIRST_MAP_S)
-    return replace(maps, applied=follow(law, state, maps.applied, time)[0])
+    effective = follow(law, state, maps.applied, time, maps.moved_s())[0]
+    if law.creep_rate:
+        fading = law.creep_rate * relaxation(time, -BEFORE_FIRST_MAP_S)
+        effective += np.outer(fading, _crept_before(maps, effective, fading))
+    return replace(maps, applied=effective)
+
+
+def _crept_before(maps: MapSet, effective: Floats, fading: Floats) -> Floats:
+    """(N,) effective signals that the mirror had crept to before the degauss, from what fades in the figure.
+
+    Without this the fading goes into the figure, which then belongs to the time of the run only. Expected to be of
+    order 1, like all effective signals; that keeps patterns quiet which the maps hardly show.
+    """
+    responses = responses_of(maps)
+    keep, count = responses.usable, responses.coefficients
+    design = np.column_stack((np.ones(len(maps)), fading, effective))[keep]
+    values = responses.values[keep]
+    solution = np.linalg.lstsq(design, values, rcond=1e-10)[0]
+    freedom = max(len(design) - design.shape[1], 1)
+    scatter = np.sqrt(np.square(values - design @ solution).sum(axis=0) / freedom)
+    scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
+    scatter *= np.sqrt(np.linalg.pinv(design.T @ design)[1, 1])
+    influence, faded = solution[2:] / scatter, solution[1] / scatter
+    return np.linalg.solve(influence @ influence.T + np.eye(len(influence)), influence @ faded)
 
 
 def unknown_history_sigma(law: MemoryLaw, seed: int = 0, actuators: int = 500) -> float:

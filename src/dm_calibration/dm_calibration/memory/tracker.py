@@ -22,6 +22,7 @@ class Applied:
         turns, turned_at: how often the way has bent since activation, and (N,) where it did last; None = never.
         degausses: over the full range, since activation.
         history_known: no write was lost since the last of them.
+        moving: on the way to another shape.
     """
 
     time: float
@@ -30,6 +31,7 @@ class Applied:
     turned_at: Floats | None
     degausses: int
     history_known: bool
+    moving: bool = False
 
 
 class MemoryTracker:
@@ -50,6 +52,7 @@ class MemoryTracker:
         self.unknown = "the driver has not reported yet"
         self._middle = middle
         self._last: Applied | None = None
+        self._set_off: MemoryState | None = None  # the state when the move under way began
 
     @property
     def known(self) -> bool:
@@ -69,16 +72,19 @@ class MemoryTracker:
         if last is None or self.state is None:
             self._guess(report, "it moved before this node followed it")
             return
-        if report.turns < last.turns or report.degausses < last.degausses:
-            self._guess(report, "the driver was started or activated again")
-            return
-        time = report.time
-        if time < self.state.time:
+        if report.time < self.state.time:
             # Hysteresis knows no time; creep stands still until the clock has caught up.
-            self.state = replace(self.state, time=time)
+            self.state = replace(self.state, time=report.time)
+        if report.turns < last.turns or report.degausses < last.degausses:
+            # It stood where the driver left it or came up, which this report tells, from about then on.
+            self.state = self.law.move(self.state, report.signals, self.state.time)
+            self._guess_keeping_creep(report, "the driver was started or activated again")
+            return
         if report.degausses > last.degausses:
             self._degaussed(report, last)
             return
+        if report.moving and (not last.moving or report.turns > last.turns):
+            self._set_off = self.law.advance(self.state, report.time)
         if not report.history_known:
             self._guess_keeping_creep(report, "writes were lost, or a degauss was left")
             return
@@ -96,7 +102,10 @@ class MemoryTracker:
     def _degaussed(self, report: Applied, last: Applied) -> None:
         """Begin a new history; moves since the degauss are known if there was at most one turn."""
         assert self.state is not None
-        self.state = self.law.degaussed(self.state, report.time, self._middle)
+        # While it swings about the middle, creep follows the middle.
+        began = self._set_off or self.state
+        self.state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
+        self._set_off = None
         # The end of the degauss is a turn itself, and one left for it may precede.
         seen = report.turns - last.turns <= 2 and report.degausses == last.degausses + 1
         self.unknown = "" if seen and report.history_known else "moves after the degauss were not seen"

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dgels
+from scipy.linalg.lapack import dgels, dtrtrs
 from scipy.optimize import lsq_linear, nnls
 
 #: Signals closer to a limit than this count as standing at it.
@@ -144,7 +144,8 @@ class BoundedProgramme:
         if target.shape != (self._projection.shape[1],) or not np.isfinite(target).all():
             raise ValueError(f"right-hand side: must be {self._projection.shape[1]} finite numbers")
         projected = self._projection @ target
-        signals: NDArray[np.float64] = solve_triangular(self._triangle, projected)
+        # The triangle is known to be regular: the checks of `solve_triangular` would take longer than this.
+        signals: NDArray[np.float64] = dtrtrs(self._triangle, projected)[0]
         if self.limits.allow(signals):
             return signals
         if not self.limits.neighbours_can_bind:

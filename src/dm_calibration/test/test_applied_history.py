@@ -1,0 +1,120 @@
+"""The state of the mirror that belongs to the stamp of a map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dm_calibration.applied_history import AppliedHistory, MapNotUsableError, Report
+from dm_calibration.memory.law import MemoryLaw
+from dm_calibration.memory.tracker import Applied
+
+#: A signal with a backlash of half-width 0.3 that carries half of it.
+LAW = MemoryLaw(np.array([0.0, 0.3]), np.array([[0.5], [0.5]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
+
+
+class Driver:
+    """Moves and reports."""
+
+    def __init__(self, history: AppliedHistory) -> None:
+        self.history = history
+        self.signals, self.turned_at = np.zeros(2), np.zeros(2)
+        self.turns = self.degausses = 0
+        self.report(0.0)
+
+    def report(self, time: float, moving: bool = False, active: bool = True) -> None:
+        applied = Applied(time, self.signals, self.turns, self.turned_at, self.degausses, self.degausses > 0)
+        self.history.observe(Report(applied, moving, active), time)
+
+    def go(self, time: float, value: float) -> None:
+        self.turns, self.turned_at = self.turns + 1, self.signals
+        self.signals = np.full(2, value)
+        self.report(time)
+
+    def degauss(self, time: float) -> None:
+        self.degausses += 1
+        self.go(time, 0.0)
+
+
+@pytest.fixture
+def history() -> AppliedHistory:
+    return AppliedHistory()
+
+
+@pytest.fixture
+def driver(history: AppliedHistory) -> Driver:
+    return Driver(history)
+
+
+def test_a_map_gets_the_signals_of_its_own_time(history: AppliedHistory, driver: Driver) -> None:
+    driver.go(10.0, 0.2)
+    driver.go(20.0, 0.4)
+    standing = history.standing(15.0, 1.0)
+    assert (standing.effective == 0.2).all()
+    assert standing.since == 10.0
+    assert (history.standing(25.0, 1.0).effective == 0.4).all()
+
+
+@pytest.mark.parametrize(
+    ("time", "words"),
+    [
+        (-1.0, "no report so old"),
+        (10.4, r"moved 0.400 s before the stamp of the map: must stand still for 1 s"),
+        (19.5, r"moved 0.500 s after the stamp of the map"),
+        (30.5, "pdm_driver was not active"),
+        (40.5, "the mirror was moving"),
+    ],
+)
+def test_a_mirror_that_did_not_stand_still(time: float, words: str, history: AppliedHistory, driver: Driver) -> None:
+    driver.go(10.0, 0.2)
+    driver.go(20.0, 0.4)
+    driver.report(30.0, active=False)
+    driver.report(40.0, moving=True)
+    with pytest.raises(MapNotUsableError, match=words):
+        history.standing(time, 1.0)
+
+
+def test_holding_a_shape_against_creep_is_no_move(history: AppliedHistory, driver: Driver) -> None:
+    driver.go(10.0, 0.2)
+    driver.go(20.0, 0.2001)
+    assert history.standing(20.2, 1.0).effective == pytest.approx(0.2001)
+
+
+def test_effective_signals_follow_the_memory(history: AppliedHistory, driver: Driver) -> None:
+    history.follow(LAW)
+    driver.degauss(1.0)
+    driver.go(2.0, 0.8)
+    driver.go(4.0, 0.4)
+    assert history.standing(6.0, 1.0).effective == pytest.approx(0.5 * 0.4 + 0.5 * 0.5)
+
+
+def test_a_law_that_comes_later_is_followed_from_the_last_degauss(history: AppliedHistory, driver: Driver) -> None:
+    driver.degauss(1.0)
+    driver.go(2.0, 0.8)
+    driver.go(4.0, 0.4)
+    history.follow(LAW)
+    assert history.standing(6.0, 1.0).effective == pytest.approx(0.45)
+
+
+def test_an_unknown_history_is_refused(history: AppliedHistory, driver: Driver) -> None:
+    history.follow(LAW)
+    driver.go(2.0, 0.8)
+    with pytest.raises(MapNotUsableError, match=r"history of the actuators is not known: .*; a degauss"):
+        history.standing(4.0, 1.0)
+
+
+def test_a_silent_driver_is_noticed(history: AppliedHistory, driver: Driver) -> None:
+    driver.go(10.0, 0.2)
+    assert not history.heard_since(10.5)
+    driver.report(10.6)
+    assert history.heard_since(10.5)
+
+
+def test_another_number_of_signals_starts_anew(history: AppliedHistory, driver: Driver) -> None:
+    history.follow(LAW)
+    driver.report(1.0)
+    driver.signals = np.zeros(3)
+    with pytest.raises(ValueError, match="applied: 3 signals, before there were 2"):
+        driver.report(2.0)
+    with pytest.raises(MapNotUsableError, match="no report so old"):
+        history.standing(5.0, 1.0)

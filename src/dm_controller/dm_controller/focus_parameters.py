@@ -1,0 +1,98 @@
+"""Parameters of the node `focus_controller`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from dm_controller.converge_action import CONVERGE_PARAMETERS
+from dm_runtime.parameters import Parameter
+
+PARAMETERS: Final = (
+    Parameter(
+        "reachable_tolerance",
+        float,
+        2e-8,
+        "largest predicted Zernike coefficient error at which a curvature still counts as reachable",
+        "m",
+        1e-10,
+        1e-5,
+        live=True,
+    ),
+    Parameter("request_age", float, 1.0, "focus requests with an older stamp are refused; 0 = never", "s", 0.0, 3600.0),
+    Parameter(
+        "settle_time",
+        float,
+        0.05,
+        "wait after the last write before a MoveFocus goal succeeds, and when a shape is to be right",
+        "s",
+        0.0,
+        60.0,
+    ),
+    Parameter("move_timeout", float, 10.0, "longest time a move may take", "s", 0.1, 600.0),
+    Parameter(
+        "time_budget",
+        float,
+        0.0,
+        "time in which AUTO may condition the mirror, for requests that name none; 0 = never by itself",
+        "s",
+        0.0,
+        3600.0,
+        live=True,
+    ),
+    Parameter(
+        "condition.degauss_steps",
+        int,
+        0,
+        "half-swings of the degauss that conditions; 0 = as the recipes were built, without recipes as the driver does",
+        "",
+        0,
+        10000,
+        live=True,
+    ),
+    Parameter("condition.timeout", float, 180.0, "longest wait for that degauss", "s", 0.1, 3600.0, live=True),
+    Parameter("hold.enable", bool, True, "correct a shape for creep while it is held", live=True),
+    Parameter("hold.period", float, 1.0, "shortest time between two corrections", "s", 0.01, 3600.0),
+    Parameter(
+        "hold.tolerance",
+        float,
+        2e-10,
+        "predicted Zernike coefficient error from which a held shape is corrected",
+        "m",
+        1e-12,
+        1e-6,
+        live=True,
+    ),
+    Parameter(
+        "hold.slew", float, 0.02, "largest change of a signal in one correction, normalised", "", 1e-5, 2.0, live=True
+    ),
+    Parameter(
+        "hold.resolution",
+        float,
+        3.0518e-5,
+        "step of the electronics, normalised (16 bit over the range: 2/65535); less than half of it is not corrected",
+        "",
+        0.0,
+        0.1,
+        live=True,
+    ),
+    Parameter(
+        "calibration_age_max",
+        float,
+        2_592_000.0,
+        "age from which a calibration that no map has confirmed is called stale; it is still used; 0 = never",
+        "s",
+        0.0,
+        1e9,
+        live=True,
+    ),
+    Parameter(
+        "aperture_tolerance",
+        float,
+        0.01,
+        "allowed relative difference of calibrated and working aperture",
+        "",
+        0.0,
+        0.5,
+    ),
+    *CONVERGE_PARAMETERS,
+)

@@ -1,0 +1,114 @@
+"""Driver and interferometer as the calibration node meets them, with a linear mirror behind."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.srv import Degauss, Measure, SetSignals
+
+from dm_calibration.influence.mirror import Mirror
+from dm_runtime import qos
+from linear_mirror import RADIUS, LinearMirror
+
+
+def doubles(values: np.ndarray) -> array[float]:
+    return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+class StandIn:
+    """Driver and interferometer as the calibration node meets them, on the observer's node."""
+
+    def __init__(self, node: Any, mirror: Mirror, plant: LinearMirror) -> None:
+        self.node, self.mirror, self.plant = node, mirror, plant
+        self.signals = mirror.rest
+        self.degaussed = 0
+        self.measured: list[str] = []
+        self.failing: set[str] = set()
+        self.other_wavelength: set[str] = set()
+        self.other_aperture: set[str] = set()
+        self.disturbed_at = ""
+        self.driver_state, self.history_known = ActuatorState.STATE_ACTIVE, True
+        self.turns, self.turned_at, self.written = 0, mirror.rest, node.get_clock().now()
+        self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
+        self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+        self.zernike = node.create_publisher(ZernikeCoefficients, "zernike", qos.STATE)
+        self.samples = node.create_publisher(SurfaceSamples, "surface_samples", qos.STATE)
+        node.create_timer(0.1, self.publish_state)  # a driver reports in any case
+        node.create_service(SetSignals, "set_signals", self.on_set_signals)
+        node.create_service(Degauss, "degauss", self.on_degauss)
+        node.create_service(Measure, "measure", self.on_measure)
+        self.publish_info(mirror)
+        self.publish_state()
+
+    def publish_info(self, mirror: Mirror) -> None:
+        message = MirrorInfo(name=mirror.name, serial=mirror.serial, actuators=mirror.actuators)
+        message.header.frame_id = "mirror"
+        message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
+        message.neighbour_a = array("I", mirror.neighbours[:, 0].astype(np.uint32).tobytes())
+        message.neighbour_b = array("I", mirror.neighbours[:, 1].astype(np.uint32).tobytes())
+        message.working_aperture_diameter = 2.0 * mirror.working_radius
+        message.signal_min, message.signal_max = mirror.signal_min, mirror.signal_max
+        message.neighbour_difference_max = mirror.neighbour_difference_max
+        self.info.publish(message)
+
+    def publish_state(self, driver_state: int | None = None) -> None:
+        """Report, as from now on in `driver_state`."""
+        self.driver_state = self.driver_state if driver_state is None else driver_state
+        message = ActuatorState(driver_state=self.driver_state, history_known=self.history_known)
+        message.requested = message.applied = doubles(self.signals)
+        message.header.stamp = self.written.to_msg()
+        message.turns, message.degausses, message.turned_at = self.turns, self.degaussed, doubles(self.turned_at)
+        self.state.publish(message)
+
+    def move(self, signals: np.ndarray) -> None:
+        self.turns, self.turned_at = self.turns + 1, self.signals
+        self.signals, self.written = np.array(signals), self.node.get_clock().now()
+        self.publish_state()
+
+    def on_set_signals(self, request: Any, response: Any) -> Any:
+        self.move(np.array(request.signals))
+        response.applied = doubles(self.signals)
+        return response
+
+    def on_degauss(self, _request: Any, response: Any) -> Any:
+        self.degaussed += 1
+        self.history_known = True
+        self.move(self.mirror.rest)
+        return response
+
+    def on_measure(self, request: Any, response: Any) -> Any:
+        self.measured.append(request.label)
+        if request.label == self.disturbed_at:
+            self.move(np.full(self.mirror.actuators, 0.3))
+        if request.label in self.failing:
+            response.error_code, response.message = ErrorCode.MAP_TIMEOUT, "no new file within 5 s"
+            return response
+        response = self.map(response)
+        if request.label in self.other_aperture:
+            response.zernike.radius = 10e-3
+        if request.label in self.other_wavelength:
+            response.zernike.wavelength = 635e-9
+        response.info.file, response.info.sha256 = f"/maps/{request.label}.dat", "00"
+        return response
+
+    def map(self, response: Any = None, bump: float = 0.0) -> Any:
+        """A map of what stands at the mirror; `bump` (m) is astigmatism that the mirror does not have."""
+        response = response if response is not None else Measure.Response()
+        sag = self.plant.sag(self.signals) + bump * self.plant.modes[:, 4]
+        zernike, samples = response.zernike, response.samples
+        zernike.header.stamp = samples.header.stamp = self.node.get_clock().now().to_msg()
+        zernike.radius = samples.radius = RADIUS
+        zernike.wavelength = 632.8e-9
+        zernike.coefficients = doubles(self.plant.fit_terms(sag))
+        zernike.residual_rms, zernike.valid_fraction = 3e-9, 0.97
+        samples.x, samples.y = doubles(self.plant.points.x), doubles(self.plant.points.y)
+        samples.weight, samples.sag = doubles(self.plant.points.weight), doubles(sag)
+        return response
+
+    def publish_map(self, message: Any) -> None:
+        """As the interferometer does after each map."""
+        self.zernike.publish(message.zernike)
+        self.samples.publish(message.samples)

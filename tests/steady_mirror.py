@@ -1,0 +1,83 @@
+"""A mirror without memory whose gains and figure can be made to drift, calibrated by pokes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.applied_history import Standing
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.influence.fit import FitOptions
+from dm_calibration.memory.law import MemoryLaw
+from dm_calibration.memory.memory_fit import MemoryFit
+from dm_calibration.plan import PlanKind, make_plan
+from dm_calibration.procedure import Measurement, Procedure
+from linear_mirror import RADIUS, LinearMirror, make_mirror
+
+Floats = NDArray[np.float64]
+
+RINGS = 2
+NOISE = 0.5e-9
+
+
+class SteadyMirror:
+    """Implements dm_calibration.procedure.Bench."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self.mirror = make_mirror(RINGS)
+        self.plant = LinearMirror(self.mirror.x, self.mirror.y, noise=NOISE, piston_tilt=1e-7, seed=seed)
+        self.signals = self.mirror.rest
+        self.clock_ns = 10**15
+        self._first = self.plant.influence, self.plant.figure_coefficients
+
+    def drift(self, gain: Floats | float, figure: Floats | float = 0.0) -> None:
+        """Change gains (N,) relatively and figure coefficients (21,) m, against when it was made."""
+        self.plant.influence = self._first[0] * (1.0 + gain)
+        self.plant.figure_coefficients = self._first[1] + figure
+
+    def degauss(self) -> None:
+        self.signals = self.mirror.rest
+
+    def apply(self, signals: Floats) -> Floats:
+        self.signals = signals
+        return signals
+
+    def settle(self, dwell: float = 0.0) -> bool:
+        self.clock_ns += 10**9
+        return True
+
+    def measure(self, label: str, days: float = 0.0, bump: float = 0.0) -> Measurement:
+        """One map, `days` later; `bump` (m) is astigmatism that the mirror does not have."""
+        self.clock_ns += 10**9 + round(days * 86400e9)
+        sag = self.plant.sag(self.signals) + bump * self.plant.modes[:, 4]
+        return Measurement(
+            points=self.plant.points,
+            sag=sag,
+            coefficients=self.plant.fit_terms(sag),
+            sigma=np.full(21, 1e-10),
+            stamp_ns=self.clock_ns,
+            residual_rms=2e-9,
+            valid_fraction=0.98,
+            radius=RADIUS,
+            wavelength=632.8e-9,
+        )
+
+    def standing(self) -> Standing:
+        """What stands at the mirror, as if it had just come."""
+        return Standing(self.signals, 1e-9 * self.clock_ns)
+
+    def calibrate(self, stamp_ns: int = 0) -> Calibration:
+        """Push-pull pokes, fitted; the last map not long before `stamp_ns` where given."""
+        plan = make_plan(PlanKind.POKES, self.mirror)
+        if stamp_ns:
+            self.clock_ns = stamp_ns - 2 * 10**9 * len(plan.steps)
+        outcome = Procedure(plan, self.mirror, self).run()
+        provenance = Provenance("steady", self.clock_ns)
+        return evaluate(outcome, self.mirror, FitOptions(), provenance)[0]
+
+
+def without_effect(error: float = 1e-10) -> MemoryFit:
+    """A memory that remembers nothing, predicted within `error` (m), so that only its history counts."""
+    sigma = np.concatenate((np.zeros(3), np.full(18, error)))
+    return MemoryFit("none", MemoryLaw.linear(), sigma, 3.0 * error, 0.05, 100, ())

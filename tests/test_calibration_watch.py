@@ -1,0 +1,262 @@
+"""The node `calibration` keeps its calibration true: maps over topics and by service, storage, diagnostics."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from dm_msgs.msg import Calibration as CalibrationMsg
+from dm_msgs.msg import ErrorCode
+from dm_msgs.srv import LoadCalibration, UpdateCalibration
+
+from calibration_stand_in import StandIn
+from dm_calibration.store import CalibrationStore
+from dm_runtime import qos
+from linear_mirror import LinearMirror
+from steady_mirror import NOISE, SteadyMirror, without_effect
+from support import NodeProcess, Observer, wait_until
+
+STILL_S = 0.1
+
+
+class Suite:
+    """A calibration node with a calibration in use, its mirror, and an observer of both."""
+
+    def __init__(self, observer: Observer, process: NodeProcess, bench: StandIn, folder: Path) -> None:
+        self.observer, self.process, self.bench, self.folder = observer, process, bench, folder
+        self.received = observer.record(CalibrationMsg, "calibration", qos.LATCHED)
+        self.health = observer.record(DiagnosticArray, "/diagnostics")
+        wait_until(lambda: self.received and self.received[-1].id == "steady", 20, process.output)
+        self.random = np.random.default_rng(3)
+
+    @property
+    def calibration(self) -> Any:
+        return self.received[-1]
+
+    def status(self, words: str) -> Any:
+        """The first status that says `words`, from now on."""
+        self.health.clear()
+
+        def found() -> Any:
+            return next((m.status[0] for m in self.health if words in m.status[0].message), None)
+
+        return wait_until(found, 10, f"diagnostics with {words!r}: {[m.status[0].message for m in self.health]}")
+
+    def shape(self) -> None:
+        """Another shape, and long enough for a map of it."""
+        self.bench.move(self.random.uniform(-0.7, 0.7, self.bench.mirror.actuators))
+        time.sleep(2 * STILL_S)
+
+    def call(self, **fields: Any) -> Any:
+        return self.observer.call(UpdateCalibration, "update_calibration", UpdateCalibration.Request(**fields))
+
+    def expect(self, revision: int) -> None:
+        wait_until(lambda: self.calibration.revision == revision, 10, f"revision {revision}: {self.process.output}")
+
+
+@pytest.fixture
+def steady() -> SteadyMirror:
+    return SteadyMirror()
+
+
+@pytest.fixture
+def begin(
+    start: Callable[..., NodeProcess], observer: Observer, steady: SteadyMirror, tmp_path: Path
+) -> Callable[..., Suite]:
+    """begin(memory=..., **parameters) starts a node with a calibration of the steady mirror in use."""
+    folder = tmp_path / "calibrations"
+    plant = LinearMirror(steady.mirror.x, steady.mirror.y, noise=NOISE, seed=2)
+
+    def begin(memory: bool = False, **changes: Any) -> Suite:
+        if not folder.exists():
+            calibration = steady.calibrate(time.time_ns())
+            CalibrationStore(folder).save(replace(calibration, memory=without_effect()) if memory else calibration)
+        values = {
+            "calibration_folder": str(folder),
+            "load_on_start": "newest",
+            "hysteresis_allowance": 0.0,
+            "updates.still_time": STILL_S,
+            **changes,
+        }
+        process = start("dm_calibration", "calibration", values)
+        return Suite(observer, process, StandIn(observer.node, steady.mirror, plant), folder)
+
+    return begin
+
+
+@pytest.fixture
+def suite(begin: Callable[..., Suite]) -> Iterator[Suite]:
+    suite = begin()
+    yield suite
+    assert "Traceback" not in suite.process.output, suite.process.output
+
+
+def test_update_by_service_is_stored_published_and_forgotten(suite: Suite, begin: Callable[..., Suite]) -> None:
+    file = suite.folder / "steady.h5"
+    content = file.read_bytes()
+    suite.shape()
+    dry = suite.call(dry_run=True)
+    assert (dry.error_code, dry.accepted, dry.revision) == (ErrorCode.OK, True, 0), dry.message
+    assert 0.2 < dry.surprise < 3.0
+    assert 0.0 < dry.max_zernike < 5e-9
+    assert 0.0 < dry.rms < 5e-9
+    taken = suite.call()
+    assert (taken.error_code, taken.accepted, taken.revision) == (ErrorCode.OK, True, 1), taken.message
+    assert 0.0 < taken.gain_drift < 0.01
+    suite.expect(1)
+    assert suite.calibration.checked.sec > 0
+    assert suite.calibration.gain_drift == taken.gain_drift
+    assert suite.calibration.offset_drift == taken.offset_drift
+    stored = CalibrationStore(suite.folder).load("steady")
+    assert not np.array_equal(stored.fit.influence_sag.ravel(), np.array(suite.calibration.influence_sag))
+    again = suite.observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration="steady"))
+    assert again.error_code == ErrorCode.OK
+    assert suite.calibration.revision == 1
+    assert file.read_bytes() == content
+
+    both = suite.call(dry_run=True, forget=True)
+    assert both.error_code == ErrorCode.INVALID_ARGUMENT
+    assert "only one of them" in both.message
+    assert suite.call(forget=True).revision == 0
+    suite.expect(0)
+    assert np.array_equal(stored.fit.influence_sag.ravel(), np.array(suite.calibration.influence_sag))
+    assert [path.name for path in suite.folder.iterdir()] == ["steady.h5"]
+
+
+def test_updates_outlive_the_node(suite: Suite, begin: Callable[..., Suite]) -> None:
+    suite.shape()
+    taken = suite.call()
+    assert suite.process.stop() == 0
+    later = begin()
+    later.expect(1)
+    assert later.calibration.gain_drift == taken.gain_drift > 0.0
+
+
+def test_maps_that_the_interferometer_publishes_are_taken_once(suite: Suite) -> None:
+    for revision in (1, 2, 3):
+        suite.shape()
+        message = suite.bench.map()
+        suite.bench.publish_map(message)
+        suite.expect(revision)
+    suite.bench.publish_map(message)
+    suite.shape()
+    suite.bench.publish_map(suite.bench.map())
+    suite.expect(4)
+
+
+def test_the_command_checks_and_tells_by_its_exit_status(suite: Suite, tmp_path: Path) -> None:
+    suite.shape()
+    figures = tmp_path / "figures.json"
+    command = [sys.executable, "-m", "dm_controller.cli", "check", "--json", str(figures)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert json.loads(figures.read_text())["check"]["revision"] == 1
+    suite.bench.plant.figure_coefficients[4] += 100e-9
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "the map disagrees" in done.stdout
+
+
+def test_switched_off_only_the_service_takes_maps(begin: Callable[..., Suite]) -> None:
+    suite = begin(**{"updates.enable": False})
+    suite.shape()
+    suite.bench.publish_map(suite.bench.map())
+    assert suite.call().revision == 1
+
+
+def test_the_mirror_moved_or_the_map_is_another(suite: Suite) -> None:
+    suite.shape()
+    old = suite.bench.map()
+    time.sleep(STILL_S / 2)
+    suite.bench.move(suite.bench.mirror.rest)
+    suite.bench.publish_map(old)
+    wait_until(lambda: "map not taken: the mirror moved" in suite.process.output, 10, suite.process.output)
+    figures = {pair.key: pair.value for pair in suite.status("calibration steady").values}
+    assert figures["maps_refused"] == "1"
+    assert "s after the stamp of the map: must stand still for 0.1 s" in figures["last_refusal"]
+    suite.shape()
+    suite.bench.other_wavelength = {"calibration check"}
+    refused = suite.call()
+    assert refused.error_code == ErrorCode.MAP_REJECTED
+    assert "wavelength 635.000 nm, the calibration's is 632.800 nm" in refused.message
+    suite.bench.other_wavelength, suite.bench.failing = set(), {"calibration check"}
+    refused = suite.call()
+    assert refused.error_code == ErrorCode.MAP_TIMEOUT
+    assert not refused.accepted
+    assert refused.revision == suite.calibration.revision == 0
+
+
+def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:
+    quality = suite.calibration.quality
+    before = np.array(suite.calibration.influence_sag)
+    for bad in (1, 2, 3):
+        suite.shape()
+        suite.bench.publish_map(suite.bench.map(bump=100e-9))
+        told = partial(lambda number: suite.process.output.count("bad map, or the mirror has changed") == number, bad)
+        wait_until(told, 10)
+    assert quality == CalibrationMsg.CALIBRATED
+    wait_until(lambda: suite.calibration.quality == CalibrationMsg.APPROXIMATE, 10)
+    assert suite.calibration.known_limitations[-1].startswith("The last 3 maps disagree with this calibration")
+    assert np.array_equal(np.array(suite.calibration.influence_sag), before)
+    status = suite.status("the mirror has changed, calibrate again")
+    assert status.level == b"\x01"
+
+
+def test_a_stale_calibration_says_so(begin: Callable[..., Suite]) -> None:
+    suite = begin(**{"updates.stale_after": 5.0})
+    assert suite.status("Stale: no map has agreed with this calibration").level == b"\x01"
+    wait_until(lambda: any(s.startswith("Stale") for s in suite.calibration.known_limitations), 10)
+    suite.shape()
+    assert suite.call().accepted
+    wait_until(lambda: not any(s.startswith("Stale") for s in suite.calibration.known_limitations), 10)
+
+
+def test_drift_beyond_its_limit_is_a_warning(begin: Callable[..., Suite]) -> None:
+    suite = begin(**{"updates.gain_drift_max": 1e-9})
+    suite.shape()
+    suite.call()
+    status = suite.status("the gain of actuator")
+    assert status.level == b"\x01"
+    figures = {pair.key: pair.value for pair in status.values}
+    assert f"actuator {figures['gain_drift_actuator']} has drifted by" in status.message
+    assert figures["maps_taken"] == figures["revision"] == "1"
+
+
+def test_with_a_memory_an_unknown_history_is_refused_until_a_degauss(begin: Callable[..., Suite]) -> None:
+    suite = begin(memory=True)
+    suite.shape()
+    refused = suite.call()
+    assert refused.error_code == ErrorCode.MAP_REJECTED
+    assert "the history of the actuators is not known" in refused.message
+    suite.bench.on_degauss(None, None)
+    suite.shape()
+    taken = suite.call()
+    assert taken.accepted, taken.message
+
+
+def test_a_damaged_file_of_updates_is_told(suite: Suite, begin: Callable[..., Suite]) -> None:
+    suite.shape()
+    suite.call()
+    assert suite.process.stop() == 0
+    (suite.folder / "steady.updates.hdf5").write_bytes(b"damaged")
+    suite.received.clear()
+    later = begin()
+    assert later.calibration.revision == 0
+    assert "updates of steady are ignored: steady.updates.hdf5: not a whole HDF5 file" in later.process.output
+
+
+def test_without_a_calibration(start: Callable[..., NodeProcess], observer: Observer, tmp_path: Path) -> None:
+    start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path)})
+    for fields in ({}, {"forget": True}):
+        answer = observer.call(UpdateCalibration, "update_calibration", UpdateCalibration.Request(**fields))
+        assert (answer.error_code, answer.message) == (ErrorCode.NOT_CALIBRATED, "no calibration is in use")

@@ -1,0 +1,97 @@
+"""A hundred nights of drift on the twin: a map each night keeps true what would be wrong without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dm_calibration.applied_history import AppliedHistory, Report
+from dm_calibration.calibration_updates import CalibrationUpdates, UpdateOptions
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.optics.zernike import TERM_RMS, basis
+from dm_calibration.plan import PlanKind, PlanOptions
+from dm_calibration.procedure import Measurement
+from dm_controller.experiments.twin_bench import TwinBench, TwinConfig
+
+NIGHTS = 100
+ASTIGMATISM = 4
+
+
+class AgeingTwin:
+    """A Preisach twin whose gains and figure drift, with what its driver has reported."""
+
+    def __init__(self) -> None:
+        self.bench = TwinBench(TwinConfig(law="preisach", seed=41))
+        self.calibration = self.bench.calibrate(PlanKind.MEMORY, PlanOptions(memory_maps=150))
+        self.history = AppliedHistory()
+        assert self.calibration.memory is not None
+        self.history.follow(self.calibration.memory.law)
+        self._gain = self.bench._piezo.gain.copy()
+        self._heard = 0
+        self._figure = 0.0
+        self.bench.degauss()
+
+    def age(self, gain: np.ndarray | float, astigmatism_rms: float) -> None:
+        self.bench._piezo.gain = self._gain * (1.0 + gain)
+        self._figure = astigmatism_rms / TERM_RMS[ASTIGMATISM]
+
+    def night(self, rng: np.random.Generator) -> None:
+        """A day passes; then another shape."""
+        self.bench.time += 86400.0
+        self.bench.apply(np.clip(rng.uniform(-0.6, 0.6) + 0.25 * rng.standard_normal(37), -1.0, 1.0))
+        self.bench.settle()
+        for applied in self.bench.reports[self._heard :]:
+            self.history.observe(Report(applied, moving=False, active=True), applied.time)
+        self._heard = len(self.bench.reports)
+
+    def measurement(self, sag: np.ndarray) -> Measurement:
+        measured = self.bench.measurement_of(sag)
+        points = measured.points
+        measured.coefficients[ASTIGMATISM] += self._figure
+        measured.sag[:] += self._figure * basis(points.x, points.y)[:, ASTIGMATISM]
+        return measured
+
+    def error(self, fit: InfluenceFit, effective: np.ndarray) -> float:
+        """Largest coefficient error of a prediction, m."""
+        true = self.measurement(self.bench.true_map()).coefficients
+        return float(np.abs(fit.zernike_offset + fit.influence_zernike @ effective - true)[3:].max())
+
+
+@pytest.fixture(scope="module")
+def twin() -> AgeingTwin:
+    return AgeingTwin()
+
+
+def test_maps_of_the_nights_keep_the_calibration_true(twin: AgeingTwin, tmp_path: Path) -> None:
+    updates = CalibrationUpdates(tmp_path, UpdateOptions)
+    assert updates.begin(twin.calibration) == ""
+    rng = np.random.default_rng(42)
+    drift = 0.01 * rng.uniform(0.2, 1.0, 37)
+    errors = []
+    for night in range(NIGHTS):
+        share = (night + 1) / NIGHTS
+        twin.age(drift * share, 20e-9 * share)
+        twin.night(rng)
+        measured = twin.measurement(twin.bench.take_map())
+        standing = twin.history.standing(1e-9 * measured.stamp_ns, 0.1)
+        fits = (twin.calibration.fit, updates.changed_fit())
+        errors.append([twin.error(fit, standing.effective) for fit in fits if fit is not None])
+        assert updates.take(measured, standing).accepted, night
+    without, kept = np.median(errors[-20:], axis=0)
+    assert kept < 0.2 * without
+    assert kept < 632.8e-9 / 200
+    before = updates.updates
+    assert before is not None
+    assert before.drift.offset_rms == pytest.approx(20e-9, rel=0.2)
+
+    # A map of a bumped bench changes nothing.
+    twin.age(drift, 40e-9)
+    twin.night(rng)
+    bumped = twin.measurement(twin.bench.take_map())
+    verdict = updates.take(bumped, twin.history.standing(1e-9 * bumped.stamp_ns, 0.1))
+    assert not verdict.accepted
+    after = updates.updates
+    assert after is not None
+    assert after.drift is before.drift

@@ -1,0 +1,61 @@
+"""The service `store_recipes` of the real calibration node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dm_msgs.action import Calibrate
+from dm_msgs.msg import Calibration, ErrorCode
+from dm_msgs.srv import StoreRecipes
+
+from calibration_stand_in import StandIn
+from dm_calibration.calibration_messages import recipe_book_from, recipe_book_message
+from dm_calibration.memory.recipes import Recipe, RecipeBook
+from dm_calibration.store import CalibrationStore
+from dm_runtime import qos
+from linear_mirror import LinearMirror, make_mirror
+from support import NodeProcess, Observer, wait_until
+
+
+def book(actuators: int) -> RecipeBook:
+    values = np.linspace(-0.5, 0.5, actuators)
+    return RecipeBook((Recipe(0.02, 0.0, values, values, 3e-10, 2e-9, 24),), 100, 1e-10, 7)
+
+
+def test_recipes_are_stored_and_published_again(
+    start: Callable[..., NodeProcess], observer: Observer, tmp_path: Path
+) -> None:
+    mirror = make_mirror(rings=1)
+    bench = StandIn(observer.node, mirror, LinearMirror(mirror.x, mirror.y, noise=1e-9))
+    received = observer.record(Calibration, "calibration", qos.LATCHED)
+    node = start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path / "c"), "settle_time": 0.01})
+    wait_until(lambda: received, 20, node.output)
+    bench.publish_info(mirror)
+
+    def store(calibration_id: str, actuators: int) -> Any:
+        recipes = recipe_book_message(book(actuators))
+        return observer.call(
+            StoreRecipes, "store_recipes", StoreRecipes.Request(calibration_id=calibration_id, recipes=recipes)
+        )
+
+    assert store("x", mirror.actuators).error_code == ErrorCode.NOT_CALIBRATED
+    goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True)
+    made = observer.run_goal(Calibrate, "calibrate", goal, 60).result
+    assert made.error_code == ErrorCode.OK, made.message
+    wait_until(lambda: received[-1].id == made.id, 10)
+
+    refused = store("another", mirror.actuators)
+    assert refused.error_code == ErrorCode.CALIBRATION_MISMATCH
+    assert f"the calibration in use is '{made.id}'" in refused.message
+    assert store(made.id, 37).error_code == ErrorCode.CALIBRATION_MISMATCH
+    assert not CalibrationStore(tmp_path / "c").load(made.id).recipes.recipes
+
+    answer = store(made.id, mirror.actuators)
+    assert answer.error_code == ErrorCode.OK, answer.message
+    wait_until(lambda: received[-1].recipes.recipes, 10)
+    for stored in (recipe_book_from(received[-1].recipes), CalibrationStore(tmp_path / "c").load(made.id).recipes):
+        assert stored.degauss_steps == 100
+        np.testing.assert_array_equal(stored.recipes[0].effective, book(mirror.actuators).recipes[0].effective)
