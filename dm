@@ -37,10 +37,19 @@ The two commands to begin with
 
 On the bench
   up         start the nodes (--config FILE: against hardware; without: with the virtual bench)
-  calibrate  measure and store a calibration
+  calibrate  measure and store a calibration (--plan memory: hysteresis and creep too)
   focus      ask for a curvature (or --dioptre): prediction first, then the move
-  compare    all solvers on the same twin, open and closed loop, beside the fitting limit
+  recipes    build conditioned recipes for a list of curvatures on the interferometer
+  check      compare the calibration in use with a map, and let the map improve it
+  report     a page and a PDF of one calibration, to keep
+  record     write what the nodes say to an MCAP file;  replay  plays it back
+  console    a web page of the bench, on the loopback
+
+On the twin, with figures
+  compare    all solvers, open and closed loop, beside the fitting limit (--history: hysteresis and creep)
   paper      the paper's tables and figures on one bench, as a page
+  bench      how fast everything is, beside what one would use instead
+  torture    faults injected into real processes: harm, loss, time to recover
 
   doctor     say what is missing or wrong, and how to cure it
   exec       run any command inside the environment: ./dm exec python my_script.py

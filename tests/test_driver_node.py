@@ -38,6 +38,7 @@ def parameters(unit: Edac40TcpUnit, **changes: Any) -> dict[str, Any]:
     """A whole configuration; keyword `a__b` sets the parameter `a.b`, None removes it."""
     values: dict[str, Any] = {
         "mirror.serial": "07-123",
+        "state_folder": "",
         "electronics.kind": "edac40_tcp",
         "electronics.address": "127.0.0.1",
         "electronics.port": unit.port,

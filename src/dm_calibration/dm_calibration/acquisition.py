@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import re
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -61,6 +62,10 @@ class AcquisitionSettings:
             raise ValueError("trigger_command needs watch_folder, where its map files arrive; watch_folder is empty")
         if self.trigger_command and not self.trigger_command[0]:
             raise ValueError("trigger_command = ['', ...]: the first entry must name a program")
+        if not re.fullmatch(r"(\.[A-Za-z0-9_-]{1,16}){1,2}", self.trigger_suffix):
+            raise ValueError(
+                f"trigger_output_suffix = {self.trigger_suffix!r}: must be an ending such as .datx, and name no folder"
+            )
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+
+from dm_calibration.hdf5_sandbox import SandboxError, read_in_sandbox
 
 #: A dataset: a numeric array, or texts.
 Column = NDArray[np.generic] | tuple[str, ...]
@@ -22,8 +26,10 @@ Attribute = bool | int | float | str | tuple[str, ...]
 
 #: Attribute that holds the hash over everything else.
 HASH = "content_sha256"
-#: Files of more data than this are not calibrations.
-SIZE_MAX = 1 << 30
+#: Larger files are not calibrations [bytes].
+SIZE_MAX = 1 << 28
+#: More groups and datasets than this are not a calibration, but perhaps a loop.
+_OBJECTS_MAX = 1000
 
 _TEXT = h5py.string_dtype("utf-8")
 
@@ -53,26 +59,53 @@ def write_image(columns: Mapping[str, Column], attributes: Mapping[str, Attribut
 def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
     """Columns and attributes of a file written by :func:`write_image`.
 
-    Only plain datasets are read: links out of the file, virtual and external storage are refused.
+    The HDF5 library runs in a process of its own (see :mod:`dm_calibration.hdf5_sandbox`), and only plain datasets are
+    read: links out of the file, virtual and external storage are refused.
 
     Raises:
         ImageError: not HDF5, truncated, damaged, not plain, or the hash does not agree.
         OSError: the file cannot be opened at all.
     """
     with path.open("rb") as raw:
-        try:
-            with h5py.File(raw, "r") as file:
-                columns = {name: _column(name, dataset) for name, dataset in _datasets(file, "")}
-                attributes = {name: _attribute(value) for name, value in file.attrs.items()}
-        except ImageError:
-            raise
-        except Exception as error:  # h5py raises OSError, RuntimeError, KeyError, ... for damaged files
-            raise ImageError(f"not a whole HDF5 file: {error}") from error
+        size = os.fstat(raw.fileno()).st_size
+        if size > SIZE_MAX:
+            raise ImageError(f"{size} bytes: a calibration has at most {SIZE_MAX}")
+        content = raw.read(size)
+    try:
+        answer = read_in_sandbox("image", content)
+    except SandboxError as error:
+        raise ImageError(f"not a whole HDF5 file: {error}") from error
+    if answer.error:
+        raise ImageError(answer.error)
+    columns: dict[str, Column] = {**answer.arrays, **_as_tuples(answer.facts["texts"])}
+    attributes: dict[str, Attribute] = _as_tuples(answer.facts["attributes"])
     stored = attributes.pop(HASH, "")
     if stored == "":
         raise ImageError(f"attribute {HASH} is missing: not written by this suite")
     if stored != content_hash(columns, attributes):
         raise ImageError("the content does not agree with its hash: the file was damaged or changed")
+    return columns, attributes
+
+
+def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Texts as tuples again, which JSON hands over as lists."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+
+
+def parse_image(content: bytes) -> tuple[dict[str, Column], dict[str, Attribute]]:
+    """Columns and attributes of an HDF5 image, the hash unchecked. Damaged files may crash the process.
+
+    Raises:
+        ImageError: not HDF5, truncated, damaged, or not plain.
+    """
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            columns = {name: _column(name, dataset) for name, dataset in _datasets(file, len(content))}
+            attributes = {name: _attribute(value) for name, value in file.attrs.items()}
+    except ImageError:
+        raise
+    except Exception as error:  # h5py raises OSError, RuntimeError, KeyError, ... for damaged files
+        raise ImageError(f"not a whole HDF5 file: {error}") from error
     return columns, attributes
 
 
@@ -101,22 +134,33 @@ def content_hash(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
     return digest.hexdigest()
 
 
-def _datasets(group: h5py.Group, prefix: str) -> Iterator[tuple[str, h5py.Dataset]]:
-    size = 0
-    for name in group:
-        path = f"{prefix}{name}"
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise ImageError(f"{path} is a link, which is not followed")
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            yield from _datasets(item, f"{path}/")
-            continue
-        if item.is_virtual or item.external:
-            raise ImageError(f"{path} keeps its data outside the file, which is not followed")
-        size += item.size * item.dtype.itemsize
-        if size > SIZE_MAX:
-            raise ImageError(f"{path}: more than {SIZE_MAX >> 20} MiB of data")
-        yield path, item
+def _datasets(file: h5py.File, length: int) -> Iterator[tuple[str, h5py.Dataset]]:
+    """All datasets by path. What they hold must stand in the file of `length` bytes, so that no claim costs memory."""
+    size = objects = 0
+    groups: list[tuple[str, h5py.Group]] = [("", file)]
+    while groups:
+        prefix, group = groups.pop()
+        for name in group:
+            path = f"{prefix}{name}"
+            objects += 1
+            if objects > _OBJECTS_MAX:
+                raise ImageError(f"more than {_OBJECTS_MAX} objects: not a calibration")
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise ImageError(f"{path} is a link, which is not followed")
+            item = group[name]
+            if isinstance(item, h5py.Group):
+                groups.append((f"{path}/", item))
+                continue
+            if not isinstance(item, h5py.Dataset):
+                raise ImageError(f"{path} is neither a group nor a dataset")
+            if item.is_virtual or item.external:
+                raise ImageError(f"{path} keeps its data outside the file, which is not followed")
+            if item.chunks is not None:
+                raise ImageError(f"{path} is stored in chunks, which this suite does not write")
+            size += (item.size or 0) * item.dtype.itemsize
+            if size > length:
+                raise ImageError(f"{path}: {size} bytes of data so far, the file has {length}")
+            yield path, item
 
 
 def _column(name: str, dataset: h5py.Dataset) -> Column:

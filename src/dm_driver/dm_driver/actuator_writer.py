@@ -14,10 +14,11 @@ from collections.abc import Callable, Iterator
 
 from dm_driver.degauss import degauss_waypoints
 from dm_driver.electronics.base import DriveElectronics, ElectronicsError
+from dm_driver.last_shape import LastShape
 from dm_driver.moves import Counters, Kind, Move, Outcome, WriterState
 from dm_driver.output_stage import OutputStage
 from dm_driver.refusal import Reason, Refusal
-from dm_driver.safety_limiter import SafetyLimiter, Shape, Watchdog
+from dm_driver.safety_limiter import SafetyLimiter, Shape, Watchdog, largest_change
 
 RECONNECT_PERIOD_S = 1.0
 CHECK_PERIOD_S = 0.25
@@ -26,6 +27,9 @@ CHECK_PERIOD_S = 0.25
 CONFIRM_S = 0.05
 #: A degauss of at least this share of the full range wipes the memory.
 FULL_CYCLE = 0.999
+
+#: Ends of the way to the safe shape after which the mirror stands where a driver brought it.
+_UNDER_CONTROL = (Outcome.REACHED, Outcome.SUPERSEDED)
 
 Listener = Callable[[WriterState, bool], None]
 
@@ -42,6 +46,7 @@ class ActuatorWriter:
             write in the middle of a move, True for everything else. Must return soon.
         watchdog_s: without a command for this long the mirror goes to `safe_shape`; 0 = never.
         stamp_ns: the clock that `WriterState.stamp_ns` is taken from.
+        last: what an earlier driver of this unit sent last, and where this one notes what it sends.
     """
 
     def __init__(
@@ -53,6 +58,7 @@ class ActuatorWriter:
         listener: Listener = lambda state, edge: None,
         watchdog_s: float = 0.0,
         stamp_ns: Callable[[], int] = time.time_ns,
+        last: LastShape | None = None,
     ) -> None:
         self.counters = Counters()
         self._electronics = electronics
@@ -62,6 +68,8 @@ class ActuatorWriter:
         self._listener = listener
         self._watchdog = Watchdog(watchdog_s)
         self._stamp_ns = stamp_ns
+        self._last = last if last is not None else LastShape(None, limiter.limits.actuators)
+        self._noting = True
         self._thread = threading.Thread(target=self._run, name="actuator_writer", daemon=True)
         # Everything below is guarded by this condition; it is notified at every change.
         self._change = threading.Condition()
@@ -101,19 +109,43 @@ class ActuatorWriter:
             return self._change.wait_for(lambda: self._link_up or self._stopping, timeout_s) and self._link_up
 
     def enable(self, timeout_s: float) -> bool:
-        """Allow writes; the safe shape is written first. Returns whether that happened within `timeout_s`.
+        """Allow writes; the mirror goes to the safe shape first. Returns whether it got there within `timeout_s`.
 
-        It is written in one step: no unit can be read back, so the real outputs are unknown and there is nothing to
-        ramp from. Without a link it is written as soon as the link stands.
+        No unit can be read back. The way begins at what was written last, by this object or as told by `last`: that
+        shape is written again, then the ramp follows. When nothing is known, there is nothing to ramp from and the safe
+        shape is written in one step. Without a link this happens as soon as the link stands.
         """
+        known = self._known_shape()
+        move: Move | None = None
         with self._change:
             self._enabled = self._accepting = self._rewrite_due = True
-            self._shape = self._requested = self._safe_shape
+            self._shape = self._requested = self._safe_shape if known is None else known
             self._sequence = self._degausses = self._turns = 0
             self._turned_at = None
             self._history_known = False
+            if known is not None and largest_change(known, self._safe_shape) > 0.0:
+                move = Move(Kind.SAFE, [self._safe_shape], self._safe_shape)
+                self._put(move)
             self._change.notify_all()
-            return self._change.wait_for(lambda: not self._rewrite_due, timeout_s)
+            written = self._change.wait_for(lambda: not self._rewrite_due, timeout_s)
+        if move is None or not written:
+            return written
+        assert known is not None
+        # A command that came meanwhile is as good: the way to it is a ramp too.
+        return move.wait(timeout_s + self._limiter.ramp_time(known, self._safe_shape)) in _UNDER_CONTROL
+
+    def _known_shape(self) -> Shape | None:
+        """Where the outputs stand, as far as anybody can know; None = unknown."""
+        with self._change:
+            if self._written is not None:
+                return self._shape
+        shape = self._last.load()
+        if shape is None:
+            return None
+        try:
+            return self._limiter.check_shape(shape)
+        except Refusal:  # the limits have changed: no legal way begins there
+            return None
 
     def disable(self, timeout_s: float) -> Outcome:
         """Ramp to the safe shape, then forbid writes. Commands are refused from the call on."""
@@ -292,6 +324,7 @@ class ActuatorWriter:
                     self._lose_link(f"internal error: {type(error).__name__}: {error}")
         finally:
             self._electronics.close()
+            self._last.close()
             with self._change:
                 self._end_moves(Outcome.STOPPED)
                 self._link_up = False
@@ -351,6 +384,7 @@ class ActuatorWriter:
 
     def _write(self, previous: Shape | None, shape: Shape) -> None:
         self._limiter.check_write(previous, shape)
+        self._note(shape)
         codes = self._output.codes(shape)
         self._electronics.write(codes, self._output.wired)
         stamp_ns = self._stamp_ns()
@@ -365,6 +399,15 @@ class ActuatorWriter:
             self._check_at = now + CHECK_PERIOD_S
             self._change.notify_all()
         self.counters.frames += 1
+
+    def _note(self, shape: Shape) -> None:
+        try:
+            self._last.note(shape)
+            self._noting = True
+        except OSError as error:  # a full disk must not stop the mirror
+            if self._noting:
+                logging.getLogger(__name__).warning("the last shape cannot be recorded: %s", error)
+            self._noting = False
 
     def _check(self) -> None:
         self._check_at = time.monotonic() + CHECK_PERIOD_S

@@ -70,6 +70,13 @@ PARAMETERS: Final = (
     Parameter("limits.command_age", float, 1.0, "Commands with an older stamp are refused.", "s", 1e-3, 1e9),
     Parameter("limits.command_lead", float, 0.5, "Commands stamped further ahead are refused.", "s", 1e-3, 1e9),
     Parameter("limits.watchdog", float, 0.0, "Without a command for this long: safe shape; 0 = never.", "s", 0.0, 1e6),
+    Parameter(
+        "state_folder",
+        str,
+        "~/.ros/dm_driver",
+        "Folder that keeps what was last sent to each unit: a driver that was killed goes on from there in steps. "
+        "Empty = keep nothing.",
+    ),
     Parameter("safe_signals", "float[]", [], "The safe shape; empty = all -1 (volts.min).", low=-1.0, high=1.0),
     Parameter("degauss.steps", int, 100, "Half-swings of a degauss.", low=1, high=10000),
 )

@@ -27,6 +27,7 @@ from dm_driver.driver_configuration import DriverConfiguration, build_configurat
 from dm_driver.driver_health import driver_health
 from dm_driver.driver_messages import Complaint, mirror_info_message, state_message, unconfigured_message
 from dm_driver.driver_parameters import PARAMETERS
+from dm_driver.last_shape import LastShape, record_path
 from dm_driver.moves import Move, Outcome, WriterState
 from dm_driver.refusal import Reason, Refusal
 from dm_runtime import diagnostics, parameters, qos
@@ -106,6 +107,7 @@ class PdmDriver(LifecycleNode):
             listener=self._on_writer,
             watchdog_s=self._values["limits.watchdog"],
             stamp_ns=lambda: int(self.get_clock().now().nanoseconds),
+            last=self._last_shape(configuration),
         )
         self._writer.start()
         self._writer.wait_for_link(self._values["electronics.timeout"])
@@ -115,12 +117,23 @@ class PdmDriver(LifecycleNode):
         self._publish_state()
         return TransitionCallbackReturn.SUCCESS
 
+    def _last_shape(self, configuration: DriverConfiguration) -> LastShape:
+        """The record of what was last sent to this unit; an empty one where none can be kept."""
+        settings, actuators = configuration.settings, configuration.limiter.limits.actuators
+        place = settings.serial_port or f"{settings.address}-{settings.port}"
+        path = record_path(self._values["state_folder"], configuration.kind, place, self._values["mirror.serial"])
+        try:
+            return LastShape(path, actuators)
+        except (OSError, RuntimeError) as error:  # RuntimeError: ~name of an unknown user
+            self.get_logger().warning(f"state_folder = {self._values['state_folder']!r} cannot be used: {error}")
+            return LastShape(None, actuators)
+
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         writer = self._writer
         assert writer is not None
         self._complaint = Complaint()
         if writer.enable(MARGIN_S if writer.state().link_up else 0.0):
-            self.get_logger().info("active; the safe shape is written")
+            self.get_logger().info("active; the mirror stands in the safe shape")
         else:
             self.get_logger().warning(
                 f"active, but the electronics are unreachable: {writer.state().fault}; the safe shape is written as"

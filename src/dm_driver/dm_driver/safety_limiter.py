@@ -150,7 +150,7 @@ class SafetyLimiter:
         Both must be legal. No signal changes by more than `limits.step` from one to the next, and every one is legal
         (see the head of this module). At least one shape is yielded, also when nothing changes.
         """
-        steps = max(1, math.ceil(_largest_change(start, target) / self.limits.step - SLACK))
+        steps = max(1, math.ceil(largest_change(start, target) / self.limits.step - SLACK))
         difference = target - start
         low, high = self.limits.signal_min, self.limits.signal_max
         for number in range(1, steps):
@@ -167,11 +167,11 @@ class SafetyLimiter:
 
     def pause_after(self, previous: Shape, shape: Shape) -> float:
         """Seconds that must pass after writing `shape` over `previous` before the next write."""
-        return _largest_change(previous, shape) / self.limits.slew_rate
+        return largest_change(previous, shape) / self.limits.slew_rate
 
     def ramp_time(self, start: Shape, target: Shape) -> float:
         """Seconds from the first to the last write of a move."""
-        change = _largest_change(start, target)
+        change = largest_change(start, target)
         steps = max(1, math.ceil(change / self.limits.step - SLACK))
         return change / self.limits.slew_rate * (steps - 1) / steps
 
@@ -224,5 +224,6 @@ class Watchdog:
         return now >= self.deadline
 
 
-def _largest_change(start: Shape, target: Shape) -> float:
+def largest_change(start: Shape, target: Shape) -> float:
+    """Largest change of a signal between two shapes (N,)."""
     return float(np.abs(target - start).max())

@@ -1,20 +1,24 @@
 """Node `virtual_bench`: the digital twin of mirror, drive electronics and interferometer.
 
 Other nodes meet it as they meet hardware: on the wire and in map files. ROS carries only what a person at the bench
-would do: pull the plug (`~/power`), press the instrument's button (`~/trigger`), read the labels (`~/endpoints`).
+would do: pull the plug (`~/power`), press the instrument's button (`~/trigger`), read the labels (`~/endpoints`); and
+the images of the camera behind the mirror (`image_raw`), which a driver of a real camera would publish.
 """
 
 from __future__ import annotations
 
+import array
 import json
 import sys
 import threading
+import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -51,6 +55,12 @@ class VirtualBenchNode(Node):
             self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=1))
             self._ticker = threading.Thread(target=self._tick, args=(values["clock.period"],), daemon=True)
             self._ticker.start()
+        self._photographer: threading.Thread | None = None
+        if self.bench.camera is not None:
+            # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
+            self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
+            self._photographer = threading.Thread(target=self._film, args=(1 / values["camera.rate"],), daemon=True)
+            self._photographer.start()
         places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
         law = f"{values['piezo.law']} {100 * values['piezo.hysteresis']:g} %, creep {100 * values['piezo.creep']:g} %"
         self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; clock speed {speed:g}")
@@ -65,6 +75,19 @@ class VirtualBenchNode(Node):
         while not self._stop.wait(period):
             seconds, nanoseconds = divmod(self._fast_clock.now_ns(), 1_000_000_000)
             self._clock_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+
+    def _film(self, period: float) -> None:
+        while not self._stop.wait(period - time.monotonic() % period):
+            seconds, nanoseconds = divmod(round(self._now() * 1e9), 1_000_000_000)
+            try:
+                picture = self.bench.photograph()
+            except OSError:  # the bench is closing
+                return
+            height, width = picture.shape
+            message = Image(height=height, width=width, encoding="mono8", step=width)
+            message.header.stamp, message.header.frame_id = Time(sec=seconds, nanosec=nanoseconds), "camera"
+            message.data = array.array("B", picture.tobytes())
+            self._image_publisher.publish(message)
 
     def _on_event(self, severe: bool, text: str) -> None:
         logger = self.get_logger()
@@ -121,6 +144,8 @@ class VirtualBenchNode(Node):
         self._stop.set()
         if self._ticker is not None:
             self._ticker.join(2)
+        if self._photographer is not None:
+            self._photographer.join(2)
         self.bench.close()
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import os
 import stat
 from pathlib import Path
 
+from ..hdf5_sandbox import SandboxError, read_in_sandbox
 from . import dat
 from .asc import parse_asc
 from .dat import is_dat, parse_dat
-from .datx import is_datx, parse_datx
+from .datx import is_datx
 from .surface_map import MapFileError, NoValidPixelsError, SurfaceMap
 from .text_header import XYZ_TITLE, is_text
 from .xyz import UNITS as XYZ_UNITS
@@ -48,7 +48,7 @@ def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> Su
         raise MapFileError(f"{path}: {error.strerror or error}") from error
     except MapFileError as error:
         raise type(error)(f"{path}: {error}") from error
-    return dataclasses.replace(surface_map, file=str(path), sha256=hashlib.sha256(content).hexdigest())
+    return dataclasses.replace(surface_map, file=str(path), content=content)
 
 
 def _read(path: Path) -> bytes:
@@ -66,7 +66,8 @@ def _read(path: Path) -> bytes:
             raise MapFileError(
                 f"begins with bytes {start[:8].hex(' ') or '(none)'}: not a ZYGO .dat, .datx, .asc or .xyz file"
             )
-        return start + file.read(status.st_size - len(start))
+        file.seek(0)
+        return file.read(status.st_size)
 
 
 def _open_without_waiting(path: str, flags: int) -> int:
@@ -78,7 +79,20 @@ def _parse(content: bytes, suffix: str, xyz_unit: str | None) -> SurfaceMap:
     if is_dat(content):
         return parse_dat(content)
     if is_datx(content):
-        return parse_datx(content)
+        return _parse_datx(content)
     if content.lstrip().startswith(XYZ_TITLE) or suffix == ".xyz":
         return parse_xyz(content, xyz_unit)
     return parse_asc(content)
+
+
+def _parse_datx(content: bytes) -> SurfaceMap:
+    """`datx.parse_datx` in a process that may crash: damaged files do that to the HDF5 library."""
+    try:
+        answer = read_in_sandbox("datx", content)
+    except SandboxError as error:
+        raise MapFileError(f"the HDF5 content is damaged: {error}") from error
+    if answer.error:
+        kind = NoValidPixelsError if answer.error_kind == NoValidPixelsError.__name__ else MapFileError
+        raise kind(answer.error)
+    facts = answer.facts | {"origin": tuple(answer.facts["origin"])}
+    return SurfaceMap(sag=answer.arrays["sag"], **facts)

@@ -20,10 +20,12 @@ _FIELDS = {
     "intensity_width": (52, ">H"),
     "intensity_height": (54, ">H"),
     "intensity_buckets": (56, ">H"),
+    "intensity_bytes": (60, ">I"),
     "origin_x": (64, ">h"),
     "origin_y": (66, ">h"),
     "width": (68, ">H"),
     "height": (70, ">H"),
+    "phase_bytes": (72, ">I"),
     "time_stamp": (76, ">I"),
     "scale_factor": (164, ">f"),
     "wavelength": (168, ">f"),
@@ -31,6 +33,8 @@ _FIELDS = {
     "lateral_resolution": (184, ">f"),
     "phase_resolution": (218, ">h"),
     "data_sign": (232, ">h"),
+    "camera_width": (234, ">h"),
+    "camera_height": (236, ">h"),
     "system_type": (238, ">h"),
     "system_serial": (242, ">H"),  # declared signed, but real serial numbers exceed 32767
     "part_name": (258, "40s"),
@@ -75,6 +79,7 @@ def check_length(header: dict[str, Any], length: int) -> int:
     """
     pixels = check_size(header["width"], header["height"])
     intensities = header["intensity_width"] * header["intensity_height"] * header["intensity_buckets"]
+    _check_sizes(header, intensities, pixels)
     offset: int = header["header_size"] + 2 * intensities
     expected = offset + 4 * pixels
     if length != expected:
@@ -84,6 +89,25 @@ def check_length(header: dict[str, Any], length: int) -> int:
             f"{intensities} intensity values; the file is {problem}"
         )
     return offset
+
+
+def _check_sizes(header: dict[str, Any], intensities: int, pixels: int) -> None:
+    """What the header tells twice about sizes must agree: the format has no checksum. 0 = not told."""
+    for name, needed in (("phase_bytes", 4 * pixels), ("intensity_bytes", 2 * intensities)):
+        told = header[name]
+        if told not in (0, needed):
+            raise MapFileError(f"{name.replace('_', ' ')} = {told}: must be {needed} for the sizes in the header")
+    if intensities:
+        for size in ("width", "height"):
+            most = header[f"intensity_{size}"]
+            if header[size] > most:
+                raise MapFileError(f"phase {size} = {header[size]}: must be at most that of the intensity, {most}")
+    for size, origin, camera in (("width", "origin_x", "camera_width"), ("height", "origin_y", "camera_height")):
+        if header[camera] and not 0 <= header[origin] <= header[camera] - header[size]:
+            raise MapFileError(
+                f"phase {size} = {header[size]} from pixel {header[origin]} on: must lie on the camera,"
+                f" {header[camera]} pixels"
+            )
 
 
 def parse_dat(content: bytes) -> SurfaceMap:

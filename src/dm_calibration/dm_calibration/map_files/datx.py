@@ -10,20 +10,32 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from .datx_structure import SIGNATURE, check_end, check_storage
 from .surface_map import (
     MapFileError,
     SurfaceMap,
     check_factor,
+    check_heights,
     check_pitch,
     check_size,
     check_wavelength,
     no_valid_pixels,
 )
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-
 #: Units of length a surface may be stored in, as m. "Fringes" is scaled by the optical factors instead.
 _LENGTHS = {"nanometers": 1e-9, "micrometers": 1e-6, "millimeters": 1e-3, "meters": 1.0, "angstroms": 1e-10}
+
+#: Types that heights are stored in; a file whose type description is damaged has another.
+_HEIGHT_TYPES = ("<f8", "<f4", "<i4", "<i2", "<u4", "<u2", "<i8", "<u8")
+
+#: "No Data" lies far beyond any height; Mx stores the largest double.
+_NO_DATA_LEAST = 1e30
+
+#: Rows of /MetaData; real files have some dozens.
+_LINKS_MAX = 10_000
+
+#: Two witnesses of one value may differ by this much (one is sometimes stored in single precision).
+_AGREEMENT = 1e-6
 
 _FILTER_NAMES = {h5py.h5z.FILTER_SZIP: "Szip", h5py.h5z.FILTER_DEFLATE: "gzip"}
 
@@ -45,21 +57,25 @@ def parse_datx(content: bytes) -> SurfaceMap:
         MapFileError: not a whole, meaningful map; the message names what is missing or wrong.
     """
     try:
+        check_end(content)
         with h5py.File(io.BytesIO(content), "r") as file:
-            return _parse(file)
+            return _parse(file, len(content))
     except MapFileError:
         raise
     except Exception as error:  # h5py raises whatever a damaged file provokes: OSError, KeyError, RuntimeError, ...
         raise MapFileError(f"the HDF5 content is damaged or truncated: {type(error).__name__}: {error}") from error
 
 
-def _parse(file: h5py.File) -> SurfaceMap:
+def _parse(file: h5py.File, length: int) -> SurfaceMap:
     metadata = _metadata(file)
     surface = _object(file, _path(metadata, "Surface"))
     if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
         raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
+    if surface.dtype.str not in _HEIGHT_TYPES or not surface.id.get_type().equal(h5py.h5t.py_create(surface.dtype)):
+        raise MapFileError(f"{surface.name}: type {surface.dtype}: must be a plain little-endian number")
     height, width = surface.shape
     check_size(width, height)
+    check_storage(surface, length)
     extra = _extra_attributes(file, metadata)
 
     wavelength = _number(surface, "Wavelength")
@@ -72,7 +88,10 @@ def _parse(file: h5py.File) -> SurfaceMap:
     no_data = _number(surface, "No Data")
     if no_data is None:
         raise _missing(surface, "No Data")
+    if not (math.isnan(no_data) or no_data >= _NO_DATA_LEAST):
+        raise MapFileError(f"{surface.name}: No Data = {no_data:g}: must be NaN or at least {_NO_DATA_LEAST:g}")
     pitch = _pitch(surface, extra)
+    _check_witnesses(surface, extra, wavelength)
 
     sag = _read(surface)
     invalid = ~np.isfinite(sag)
@@ -83,6 +102,7 @@ def _parse(file: h5py.File) -> SurfaceMap:
         raise no_valid_pixels(sag.shape)
     sag *= scale
     sag[invalid] = math.nan
+    check_heights(sag)
 
     software = " ".join(filter(None, (_extra_text(extra, "Software Info Name"), _extra_text(extra, "System Type"))))
     time_stamp = _extra_number(extra, "Time Stamp")
@@ -113,6 +133,8 @@ def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
     table = _object(file, "/MetaData")
     if not isinstance(table, h5py.Dataset) or len(table.dtype.names or ()) != 3:
         raise MapFileError("/MetaData: must be a table of Source, Link and Destination")
+    if not 0 < (table.size or 0) <= _LINKS_MAX or table.external or table.is_virtual:
+        raise MapFileError(f"/MetaData: {table.size} rows: must be 1 to {_LINKS_MAX}, stored in the file")
     return {(_text(source), _text(link)): _text(destination) for source, link, destination in table[()]}
 
 
@@ -210,23 +232,28 @@ def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
 
 
 def _converter_pitch(surface: h5py.Dataset, name: str) -> float | None:
-    """Parameters[1] of a converter compound (category, unit, parameters), m per pixel."""
-    if name not in surface.attrs:
+    """Parameters[1] of a converter, m per pixel."""
+    parameters = _converter(surface, name)
+    if parameters is None:
         return None
-    converter = np.asarray(surface.attrs[name]).ravel()
-    try:
-        return check_pitch(float(converter[0][2][1]))
-    except (IndexError, TypeError, ValueError):
-        raise MapFileError(f"{surface.name}: attribute '{name}': must hold category, unit and parameters") from None
+    if len(parameters) < 2:
+        raise MapFileError(f"{surface.name}: attribute '{name}': must hold category, unit and parameters")
+    return check_pitch(parameters[1])
 
 
 def _pitch(surface: h5py.Dataset, extra: dict[str, Any]) -> float | None:
     x, y = _converter_pitch(surface, "X Converter"), _converter_pitch(surface, "Y Converter")
     if x is not None and y is not None and abs(x - y) > _SQUARE_TOLERANCE * x:
         raise MapFileError(f"{surface.name}: pixels of {x:g} m x {y:g} m: must be square")
-    if x is not None or y is not None:
-        return x if x is not None else y
-    return check_pitch(_extra_number(extra, "Lateral Resolution") or 0.0)
+    told = check_pitch(_extra_number(extra, "Lateral Resolution") or 0.0)
+    pitch = x if x is not None else y
+    if pitch is None:
+        return told
+    if told is not None and abs(pitch - told) > _SQUARE_TOLERANCE * pitch:
+        raise MapFileError(
+            f"{surface.name}: X Converter: {pitch:g} m per pixel, Lateral Resolution {told:g} m: must agree"
+        )
+    return pitch
 
 
 def _origin(surface: h5py.Dataset) -> tuple[int, int]:
@@ -238,14 +265,38 @@ def _origin(surface: h5py.Dataset) -> tuple[int, int]:
         return (0, 0)
 
 
+def _check_witnesses(surface: h5py.Dataset, extra: dict[str, Any], wavelength: float) -> None:
+    """Values that the file tells twice must agree: the format has no checksum."""
+    told = _converter(surface, "Z Converter")
+    scale, obliquity = _number(surface, "Interferometric Scale Factor"), _number(surface, "Obliquity Factor")
+    witnesses: list[tuple[str, float | None, float | None]]
+    witnesses = [("Wavelength", wavelength, _extra_number(extra, "Wavelength"))]
+    if told is not None and len(told) >= 4:  # (0, wavelength, scale factor, obliquity)
+        witnesses += [("Wavelength", wavelength, told[1])]
+        witnesses += [("Interferometric Scale Factor", scale, told[2]), ("Obliquity Factor", obliquity, told[3])]
+    for name, value, witness in witnesses:
+        if value is None or not witness:  # a witness of 0 says nothing, as everywhere in this format
+            continue
+        if not abs(value - witness) <= _AGREEMENT * abs(value):
+            raise MapFileError(f"{surface.name}: {name} = {value:g}, but elsewhere {witness:g}: must agree")
+
+
+def _converter(surface: h5py.Dataset, name: str) -> list[float] | None:
+    """The parameters of a converter compound (category, unit, parameters); None when it is absent."""
+    if name not in surface.attrs:
+        return None
+    try:
+        return [float(value) for value in np.asarray(surface.attrs[name]).ravel()[0][2]]
+    except (IndexError, TypeError, ValueError):
+        raise MapFileError(f"{surface.name}: attribute '{name}': must hold category, unit and parameters") from None
+
+
 def _read(surface: h5py.Dataset) -> NDArray[np.float64]:
     """The stored values as (height, width) float64.
 
     Raises:
-        MapFileError: the values lie outside the file, or a compression filter is not available.
+        MapFileError: a compression filter is not available.
     """
-    if surface.external or surface.is_virtual:
-        raise MapFileError(f"{surface.name}: its values lie in another file, which is not followed")
     properties = surface.id.get_create_plist()
     for index in range(properties.get_nfilters()):
         identifier, _flags, _values, name = properties.get_filter(index)
@@ -255,4 +306,4 @@ def _read(surface: h5py.Dataset) -> NDArray[np.float64]:
                 f"{surface.name}: compressed with the HDF5 filter {label}, which this h5py lacks; "
                 "save the map uncompressed or as .dat, or install an HDF5 library with that filter"
             )
-    return surface[()].astype(np.float64)
+    return surface[()].astype(np.float64, copy=False)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,12 @@ COUNTS_PER_FRINGE = {0: 4096, 1: 32768, 2: 131072}
 
 #: Largest map that is read; the largest cameras of these instruments have 12 million pixels.
 MAX_PIXELS = 2**25
+
+#: Pixels converted at a time: 1 MB.
+_BLOCK_PIXELS = 2**17
+
+#: Largest height of a map, m: far beyond the range of any interferometer.
+HEIGHT_MAX = 10.0
 
 _WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
 _PITCH_RANGE = (1e-9, 0.1)  # m per pixel
@@ -45,7 +53,7 @@ class SurfaceMap:
         time_stamp: Unix time of the measurement, s; None when not told.
         system_error_subtracted: None when not told. Maps that differ in it must not be mixed.
         file: where the map was read from.
-        sha256: of the file's bytes, hexadecimal.
+        content: the file's bytes, for :attr:`sha256`.
     """
 
     sag: NDArray[np.float64]
@@ -59,7 +67,15 @@ class SurfaceMap:
     time_stamp: float | None = None
     system_error_subtracted: bool | None = None
     file: str = ""
-    sha256: str = ""
+    content: bytes = field(default=b"", repr=False)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Of the file's bytes, hexadecimal; "" without a file. Found when first asked for: it takes as long as reading.
+
+        A record of where a calibration comes from needs it, a map that is only looked at does not.
+        """
+        return hashlib.sha256(self.content).hexdigest() if self.content else ""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -105,6 +121,13 @@ def check_size(width: int, height: int) -> int:
     return width * height
 
 
+def check_heights(sag: NDArray[np.float64]) -> None:
+    """Raise MapFileError for heights that no surface in front of an interferometer has; `sag` may hold NaN."""
+    lowest, highest = float(np.fmin.reduce(sag, axis=None)), float(np.fmax.reduce(sag, axis=None))
+    if max(-lowest, highest) > HEIGHT_MAX:
+        raise _outside("height", f"{lowest:g} to {highest:g} m", f"-{HEIGHT_MAX:g} to {HEIGHT_MAX:g} m")
+
+
 def sag_per_count(
     scale_factor: float, wavelength: float, obliquity: float, resolution_code: int, data_sign: int
 ) -> float:
@@ -132,12 +155,19 @@ def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> NDA
     Raises:
         NoValidPixelsError: every pixel is invalid.
     """
-    invalid = counts >= INVALID_COUNTS
-    if invalid.all():
+    # In blocks of rows that stay in the processor's cache: intermediate maps would cost more than the arithmetic.
+    sag = np.empty(counts.shape)
+    rows = max(_BLOCK_PIXELS // max(counts.shape[1], 1), 1)
+    valid = 0
+    for start in range(0, len(sag), rows):
+        block = sag[start : start + rows]
+        block[...] = counts[start : start + rows]
+        invalid = block >= INVALID_COUNTS
+        valid += invalid.size - int(np.count_nonzero(invalid))
+        block *= metres_per_count
+        block[invalid] = math.nan
+    if not valid:
         raise no_valid_pixels(counts.shape)
-    sag = counts.astype(np.float64)
-    sag *= metres_per_count
-    sag[invalid] = math.nan
     return sag
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from .surface_map import (
     MapFileError,
     SurfaceMap,
+    check_heights,
     check_pitch,
     check_size,
     check_wavelength,
@@ -53,6 +54,7 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
         raise no_valid_pixels(sag.shape)
     metres = UNITS[unit]
     sag *= wavelength if metres is None else metres
+    check_heights(sag)
     return SurfaceMap(
         sag=sag,
         wavelength=wavelength,

@@ -1,4 +1,4 @@
-"""The whole virtual bench: drive unit, mirror, interferometer and their ports, without ROS."""
+"""The whole virtual bench: drive unit, mirror, interferometer, camera and their ports, without ROS."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dm_driver.virtual.camera import CameraConfig, SceneCamera
 from dm_driver.virtual.drive_unit import DriveConfig, DriveUnit
 from dm_driver.virtual.electronics import OFF, ElectronicsServer, PortsConfig
 from dm_driver.virtual.interferometer import Interferometer, InterferometerConfig
@@ -41,6 +43,7 @@ class BenchConfig:
     plate: PlateConfig = field(default_factory=PlateConfig)
     piezo: PiezoConfig = field(default_factory=PiezoConfig)
     interferometer: InterferometerConfig = field(default_factory=InterferometerConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
     drive: DriveConfig = field(default_factory=DriveConfig)
     ports: PortsConfig = field(default_factory=PortsConfig)
     monitor: MonitorConfig = field(default_factory=MonitorConfig)
@@ -71,7 +74,8 @@ class VirtualBench:
         self.config = config
         self._now = now
         self._on_event = on_event
-        gains, figure, noise = (np.random.default_rng(seed) for seed in np.random.SeedSequence(config.seed).spawn(3))
+        seeds = np.random.SeedSequence(config.seed).spawn(5)
+        gains, figure, noise, scene, shot_noise = (np.random.default_rng(seed) for seed in seeds)
         self.plate = Plate(config.plate)
         self.unit = DriveUnit(config.drive)
         if len(config.drive.wiring) != len(self.plate.x):
@@ -79,6 +83,9 @@ class VirtualBench:
         signals = self.unit.signals()
         self.piezo = PiezoActuators(config.piezo, gains, signals, now())
         self.interferometer = Interferometer(config.interferometer, self.plate, figure, noise)
+        self.camera: SceneCamera | None = None
+        if config.camera.rate > 0:
+            self.camera = SceneCamera(config.camera, config.interferometer.field_diameter, scene, shot_noise)
         self.monitor = Monitor(config.monitor, neighbour_pairs(self.plate.x, self.plate.y), signals)
         self.maps_written = 0
         self._measuring = threading.Lock()
@@ -114,6 +121,16 @@ class VirtualBench:
             return self.piezo.displacement
 
         return self.electronics.run(sample)
+
+    def photograph(self) -> NDArray[np.uint8]:
+        """An image (height, width) of the scene through the mirror as its surface truly is at this moment.
+
+        Raises:
+            ValueError: the bench has no camera.
+        """
+        if self.camera is None:
+            raise ValueError("camera.rate = 0: this bench has no camera")
+        return self.camera.expose(self.interferometer.surface(self.displacement()))
 
     def measure(self, path: Path | None = None) -> Path:
         """Measure the surface at this moment and write the map file; the suffix of `path` gives the format.

@@ -6,8 +6,10 @@ which they arrived, and whoever asks for the state sees every frame that was sen
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
+import time
 import tty
 from collections import deque
 from collections.abc import Callable
@@ -161,7 +163,8 @@ class ElectronicsServer:
         placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         placeholder.setblocking(False)
         self._listener = placeholder
-        _bind(placeholder, port, "electronics.tcp_port")
+        # A connection that was waiting when the port was closed holds its number for a moment longer.
+        _bind(placeholder, port, "electronics.tcp_port", patience_s=0.0 if self._client is None else 1.0)
         self.endpoints["tcp_port"] = placeholder.getsockname()[1]
         if self._client is None:
             placeholder.listen(1)
@@ -291,8 +294,12 @@ class ElectronicsServer:
                 self._on_update()
 
 
-def _bind(endpoint: socket.socket, port: int, name: str) -> None:
-    try:
-        endpoint.bind((LOOPBACK, port))
-    except OSError as error:
-        raise OSError(f"{name} = {port}: {error}") from None
+def _bind(endpoint: socket.socket, port: int, name: str, patience_s: float = 0.0) -> None:
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            return endpoint.bind((LOOPBACK, port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or time.monotonic() >= deadline:
+                raise OSError(f"{name} = {port}: {error}") from None
+        time.sleep(0.005)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dm_driver.virtual.zernike import Array
 
-LAWS = ("none", "prandtl_ishlinskii", "preisach", "bouc_wen")
+LAWS = ("none", "prandtl_ishlinskii", "preisach", "bouc_wen", "mixed")
 
 
 class Memory(ABC):
@@ -114,11 +114,57 @@ class BoucWenMemory(Memory):
         return -self._z
 
 
+class AsymmetricBoucWenMemory(Memory):
+    """Bouc-Wen of order 2 that saturates earlier on falling than on rising moves, the lag -z.
+
+    Along the way, dz/d|u| = 1 - onward z^2 where z points along the way and 1 + back z^2 where it points against it
+    (the generalised law of Song & Der Kiureghian, J. Engineering Mechanics 132, 2006, with three constants).
+    Monotone moves have a closed form.
+    """
+
+    def __init__(self, count: int, onward: tuple[float, float] = (2.0, 3.2), back: float = 0.8) -> None:
+        self._onward = onward
+        self._back = back
+        self._z = np.zeros(count)
+        self._u = np.zeros(count)
+
+    def move(self, u: Array) -> Array:
+        way = np.sign(u - self._u)
+        left = np.abs(u - self._u)
+        z = way * self._z
+        # While z < 0 it is a tangent of the way, which reaches zero after `to_zero`.
+        rate = np.sqrt(self._back)
+        angle = np.arctan(rate * np.minimum(z, 0.0))
+        to_zero = -angle / rate
+        first = np.minimum(left, to_zero)
+        z_below = np.tan(angle + rate * first) / rate
+        # From zero on a hyperbolic tangent.
+        limit = 1 / np.sqrt(np.where(way < 0, self._onward[1], self._onward[0]))
+        start = np.minimum(np.maximum(z, 0.0) / limit, 1 - 1e-12)
+        z_above = limit * np.tanh(np.arctanh(start) + (left - first) / limit)
+        moved = np.where((z < 0) & (left <= to_zero), z_below, z_above)
+        self._z = np.where(way == 0, self._z, way * moved)
+        self._u = np.array(u, float)
+        return -self._z
+
+
+class MixedMemory(Memory):
+    """Half the loop by a Preisach operator, half by an asymmetric Bouc-Wen law of order 2."""
+
+    def __init__(self, count: int, preisach: float = 4.0, bouc_wen: float = 0.5) -> None:
+        self._preisach, self._bouc_wen = PreisachMemory(count), AsymmetricBoucWenMemory(count)
+        self._weight = preisach, bouc_wen
+
+    def move(self, u: Array) -> Array:
+        return self._weight[0] * self._preisach.move(u) + self._weight[1] * self._bouc_wen.move(u)
+
+
 _MEMORIES = {
     "none": NoMemory,
     "prandtl_ishlinskii": PlayMemory,
     "preisach": PreisachMemory,
     "bouc_wen": BoucWenMemory,
+    "mixed": MixedMemory,
 }
 
 

@@ -120,6 +120,14 @@ class Interferometer:
         other._noise = noise_rng
         return other
 
+    def surface(self, displacement: Array) -> Array:
+        """The true surface over the field, without the instrument's noise, for bases at `displacement` (37,), m.
+
+        Returns:
+            Sag in m as coefficients (p, q) of T_p(y) T_q(x), x and y in units of the field's radius.
+        """
+        return np.tensordot(displacement, self._influence, 1) + self._figure
+
     def _evaluate(self, coefficients: Array) -> Array:
         return (self._rows @ coefficients) @ self._columns.T
 

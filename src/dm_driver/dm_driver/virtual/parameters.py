@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dm_driver.virtual.bench import BenchConfig, FilesConfig
+from dm_driver.virtual.camera import CameraConfig
 from dm_driver.virtual.drive_unit import DriveConfig
 from dm_driver.virtual.electronics import PortsConfig
 from dm_driver.virtual.hysteresis import LAWS
@@ -18,7 +19,7 @@ from dm_driver.virtual.plate import PlateConfig
 from dm_driver.virtual.zygo_files import FORMATS, UNITS
 from dm_runtime.parameters import Parameter
 
-_PLATE, _PIEZO, _CAMERA = PlateConfig(), PiezoConfig(), InterferometerConfig()
+_PLATE, _PIEZO, _CAMERA, _SCENE = PlateConfig(), PiezoConfig(), InterferometerConfig(), CameraConfig()
 _DRIVE, _PORTS, _WATCH, _FILES = DriveConfig(), PortsConfig(), MonitorConfig(), FilesConfig()
 _PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
 
@@ -64,6 +65,28 @@ TABLE = (
         "interferometer.rotate_deg", int, _CAMERA.rotate_deg, "Picture turned anticlockwise by 0, 90, 180 or 270.",
         "deg", 0, 270,
     ),
+    Parameter(
+        "camera.rate", float, _SCENE.rate, "Images per second of wall time on image_raw; 0 = no camera.", "Hz",
+        0.0, 200.0,
+    ),
+    Parameter("camera.width", int, _SCENE.width, "Image width.", "px", 16, 2048),
+    Parameter("camera.height", int, _SCENE.height, "Image height.", "px", 16, 2048),
+    Parameter("camera.pixel_pitch", float, _SCENE.pixel_pitch, "Pixel pitch.", "m", 1e-7, 1e-3),
+    Parameter("camera.focal_length", float, _SCENE.focal_length, "Focal length of the lens.", "m", 1e-3, 10.0),
+    Parameter(
+        "camera.rest_distance", float, _SCENE.rest_distance,
+        "Object distance in focus while the mirror is flat; 0 = infinity.", "m", 0.0, 1e6,
+    ),
+    Parameter(
+        "camera.relay_magnification", float, _SCENE.relay_magnification,
+        "Diameter of the beam on the mirror / of the entrance pupil.", "", 0.01, 100.0,
+    ),
+    Parameter("camera.wavelength", float, _SCENE.wavelength, "Wavelength of the images.", "m", 1e-7, 2e-5),
+    Parameter(
+        "camera.distances", "float[]", list(_SCENE.distances),
+        "Distances of the objects, from left to right; 0 = infinity.", "m", 0.0, 1e6,
+    ),
+    Parameter("camera.photons", float, _SCENE.photons, "Electrons per pixel at the mean grey level.", "", 1.0, 1e9),
     Parameter("electronics.tcp_port", int, _PORTS.tcp_port, f"EDAC40 over TCP {_PORT_TEXT}", low=-1, high=65535),
     Parameter("electronics.udp_port", int, _PORTS.udp_port, f"EDAC40 over UDP {_PORT_TEXT}", low=-1, high=65535),
     Parameter(
@@ -129,6 +152,7 @@ def bench_config(values: Mapping[str, Any]) -> BenchConfig:
         plate=PlateConfig(**group("plate")),
         piezo=PiezoConfig(**group("piezo")),
         interferometer=InterferometerConfig(**group("interferometer")),
+        camera=CameraConfig(**group("camera") | {"distances": tuple(values["camera.distances"])}),
         drive=DriveConfig(
             **electronics,
             volts_min=values["volts.min"],

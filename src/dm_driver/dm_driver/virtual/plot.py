@@ -26,7 +26,7 @@ from dm_driver.virtual.zernike import Array
 COLOURS = "cividis"
 DARK, LIGHT, WARM = "#00204d", "#7c7b78", "#c2410c"
 PIXELS = 400
-LAW_TITLES = dict(zip(LAWS, ("none", "Prandtl–Ishlinskii", "Preisach", "Bouc–Wen"), strict=True))
+LAW_TITLES = dict(zip(LAWS, ("none", "Prandtl–Ishlinskii", "Preisach", "Bouc–Wen", "mixed"), strict=True))
 
 
 class View:

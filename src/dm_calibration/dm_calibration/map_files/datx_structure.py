@@ -1,0 +1,66 @@
+"""Checks of a `.datx` file's structure, before memory is claimed for what it promises."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Final
+
+import h5py
+
+from .surface_map import MapFileError
+
+SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+
+#: Where the superblock, by its version, tells the size of addresses and the end of the file (HDF5 format
+#: specification, section II.A).
+_SIZE_OF_OFFSETS = {0: 13, 1: 13, 2: 9, 3: 9}
+_END_ADDRESS = {0: 40, 1: 44, 2: 28, 3: 28}
+
+#: Deflate, the densest filter that Mx uses, cannot shrink data further [bytes per byte].
+_DENSEST = 1032
+
+
+def check_end(content: bytes) -> None:
+    """The superblock tells where the file ends; the library minds a shorter file only.
+
+    Raises:
+        MapFileError: the file is longer or shorter, or has no superblock that can be understood.
+    """
+    version = content[len(SIGNATURE)] if len(content) > 64 else -1
+    if version not in _END_ADDRESS:
+        raise MapFileError(f"HDF5 superblock version = {version}: must be one of {', '.join(map(str, _END_ADDRESS))}")
+    sizes = content[_SIZE_OF_OFFSETS[version]]
+    if sizes != 8:
+        raise MapFileError(f"HDF5 superblock: size of offsets = {sizes}: must be 8")
+    (end,) = struct.unpack_from("<Q", content, _END_ADDRESS[version])
+    if end != len(content):
+        problem = "truncated" if len(content) < end else "longer than its superblock says"
+        raise MapFileError(f"file length = {len(content)} bytes: must be {end}; the file is {problem}")
+
+
+def check_storage(surface: h5py.Dataset, length: int) -> None:
+    """Compare what the map promises with what stands in the file of `length` bytes.
+
+    Raises:
+        MapFileError: values in another file, or more or fewer than are stored.
+    """
+    if surface.external or surface.is_virtual:
+        raise MapFileError(f"{surface.name}: its values lie in another file, which is not followed")
+    stored, needed = surface.id.get_storage_size(), surface.size * surface.dtype.itemsize
+    if surface.chunks is None:
+        agrees = stored == needed and (surface.id.get_offset() or length) + stored <= length
+    else:
+        whole = math.prod(-(-size // chunk) for size, chunk in zip(surface.shape, surface.chunks, strict=True))
+        largest = math.prod(surface.chunks) * surface.dtype.itemsize
+        agrees = (
+            0 < stored <= length
+            and needed <= _DENSEST * stored
+            and largest <= max(_DENSEST * stored, needed)
+            and surface.id.get_num_chunks() == whole
+        )
+    if not agrees:
+        raise MapFileError(
+            f"{surface.name}: {surface.shape[1]} x {surface.shape[0]} values of {surface.dtype} do not agree with"
+            f" {stored} bytes stored in a file of {length}"
+        )

@@ -1,0 +1,127 @@
+"""`dm torture`: faults and damaged files against real nodes and readers, and what they cost."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dm_controller.cli.output import JsonOption, console, fail, progress_bar, write_json
+
+#: Damaged files per format: of a short run, and at most.
+FILES_LEAST, FILES_MOST = 1_000, 100_000
+
+
+def show_faults(records: Any, words: dict[str, str]) -> None:
+    """Print the table of faults."""
+    from rich.table import Table
+
+    table = Table(title="faults; harm = frames beyond a limit at the electronics")
+    for heading in ("fault", "injected", "harm", "lost", "recovery p50, s", "max, s", ""):
+        table.add_column(heading, justify="left" if heading in ("fault", "") else "right")
+    for record in records:
+        figures = record.figures()
+        middle, longest = figures["recovery_s_p50"], figures["recovery_s_max"]
+        table.add_row(
+            record.name,
+            str(record.injected),
+            str(record.limit_violations),
+            str(record.lost),
+            "" if middle is None else f"{middle:.2f}",
+            "" if longest is None else f"{longest:.2f}",
+            words[record.name],
+        )
+        for remark in record.remarks[:3]:
+            table.add_row("", "", "", "", "", "", f"[yellow]{remark[:200]}[/]")
+    console.print(table)
+
+
+def show_fuzz(results: dict[str, Any]) -> None:
+    """Print the table of damaged files."""
+    from rich.table import Table
+
+    table = Table(title="damaged files, by what the reader made of them")
+    columns = ("files", "crashes", "hangs", "wrong_maps", "refused", "intact", "other_samples", "other_header")
+    table.add_column("format")
+    for column in columns:
+        table.add_column(column.replace("_", " "), justify="right")
+    for name, result in results.items():
+        table.add_row(name, *(str(getattr(result, column)) for column in columns))
+    console.print(table)
+    console.print(
+        "other samples, other header: formats without a checksum, where a changed value is a legal other one; "
+        "see docs/safety.md"
+    )
+
+
+def torture(
+    minutes: Annotated[
+        float, typer.Option(min=0.0, help="Go on for so long, half for faults, half for files; 0 = once.")
+    ] = 0.0,
+    faults: Annotated[str, typer.Option(help="Only these, separated by commas; 'fuzz' for the readers.")] = "",
+    seed: Annotated[int, typer.Option(min=0, help="Of the damage and of the moments at which faults come.")] = 1,
+    json: JsonOption = None,
+) -> None:
+    """Inject faults into real processes and damage files; exit status 1 when anything was harmed or lost."""
+    from dm_controller.suite import own_domain
+    from dm_controller.torture.driver_faults import select
+    from dm_controller.torture.faults import run_faults
+    from dm_controller.torture.fuzz import fuzz_all
+    from dm_controller.torture.intact import FORMATS
+
+    names = [name.strip() for name in faults.split(",") if name.strip()]
+    others = ",".join(name for name in names if name != "fuzz")
+    chosen = select(others) if others or not names else []
+    fuzzing = not names or "fuzz" in names
+    started = time.monotonic()
+    deadline = started + 60.0 * minutes
+    records: list[Any] = []
+    results: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="dm-torture-") as name, own_domain() as domain, progress_bar() as bar:
+        folder = Path(name)
+        if chosen:
+            task = bar.add_task("faults", total=len(chosen))
+            half = started + 30.0 * minutes if fuzzing else deadline
+            records = run_faults(
+                chosen,
+                folder,
+                domain,
+                seed,
+                half,
+                lambda fault: bar.update(task, advance=1, description=fault),
+            )
+            bar.update(task, completed=len(chosen), description="faults: done")
+        if fuzzing:
+            files = FILES_MOST if minutes else FILES_LEAST
+            # Every fault comes once, however short the time; the readers get their half in any case.
+            end = max(deadline, time.monotonic() + 30.0 * minutes) if minutes else float("inf")
+            tasks = {form: bar.add_task(f"damaged {form}", total=files) for form in FORMATS}
+            results = fuzz_all(
+                dict.fromkeys(FORMATS, files),
+                folder,
+                seed,
+                end,
+                lambda form, count: bar.update(tasks[form], advance=count),
+                workers=len(FORMATS) if minutes else 2,  # all of them share the time there is
+            )
+    if records:
+        show_faults(records, {fault.name: fault.words for fault in chosen})
+    if results:
+        show_fuzz(results)
+    figures = {
+        "faults": [record.figures() for record in records],
+        "fuzz": {form: result.figures() for form, result in results.items()},
+        "soak": None,
+        "seed": seed,
+        "seconds": time.monotonic() - started,
+    }
+    write_json(json, figures)
+    harmed = [record.name for record in records if not record.harmless]
+    harmed += [f"reader of {form}" for form, result in results.items() if result.harm]
+    if harmed:
+        fail(f"harmed or lost: {', '.join(harmed)}")
+        raise typer.Exit(1)
+    console.print(f"no harm, nothing lost, in {time.monotonic() - started:.0f} s")

@@ -1,0 +1,91 @@
+"""What was last sent to the electronics, kept where a killed driver cannot take it along.
+
+No unit can be read back, and its outputs hold when the driver dies. A new driver that knows nothing must write its
+first shape in one step; one that finds this record goes on from where the old one ended. A shape is recorded *before*
+it is sent: what stands at the outputs is then the record or at most one step away from it.
+
+Two slots are written in turn, each with a check sum, so that one is whole at any moment. The operating system keeps
+what a killed process wrote; only a crash of the whole computer may lose the last seconds.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from dm_driver.safety_limiter import Shape
+
+_HEAD = struct.Struct("<8sQI")  # magic, number of the write, actuators
+_CHECK = struct.Struct("<I")
+_MAGIC = b"dmshape1"
+
+
+class LastShape:
+    """The record of one drive unit.
+
+    Args:
+        path: the file; its folder is made. None = nothing is kept.
+        actuators: N.
+
+    Raises:
+        OSError: the file cannot be made or opened.
+    """
+
+    def __init__(self, path: Path | None, actuators: int) -> None:
+        self._actuators = actuators
+        self._slot = _HEAD.size + 8 * actuators + _CHECK.size
+        self._number = 0
+        self._descriptor = -1
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+
+    def load(self) -> Shape | None:
+        """(N,) the newest whole record; None when there is none for this number of actuators."""
+        if self._descriptor < 0:
+            return None
+        newest = None
+        for at in (0, self._slot):
+            number, shape = self._parse(os.pread(self._descriptor, self._slot, at))
+            if shape is not None and number >= self._number:
+                self._number, newest = number, shape
+        return newest
+
+    def note(self, shape: Shape) -> None:
+        """Record `shape` (N,) as what is about to be sent.
+
+        Raises:
+            OSError: the disk is full, or gone.
+        """
+        if self._descriptor < 0:
+            return
+        self._number += 1
+        content = _HEAD.pack(_MAGIC, self._number, self._actuators) + shape.astype("<f8").tobytes()
+        os.pwrite(self._descriptor, content + _CHECK.pack(zlib.crc32(content)), self._slot * (self._number % 2))
+
+    def close(self) -> None:
+        """Forget the file; what is in it stays."""
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+
+    def _parse(self, slot: bytes) -> tuple[int, Shape | None]:
+        if len(slot) != self._slot or _CHECK.unpack(slot[-_CHECK.size :])[0] != zlib.crc32(slot[: -_CHECK.size]):
+            return 0, None
+        magic, number, actuators = _HEAD.unpack_from(slot)
+        if magic != _MAGIC or actuators != self._actuators:
+            return 0, None
+        return number, np.frombuffer(slot, "<f8", actuators, _HEAD.size).copy()
+
+
+def record_path(folder: str, *names: object) -> Path | None:
+    """The file in `folder` for the unit and mirror that `names` tell apart; None for an empty folder name."""
+    if not folder:
+        return None
+    stem = "_".join(re.sub(r"[^A-Za-z0-9.-]+", "-", str(name)).strip("-.") for name in names)
+    return Path(folder).expanduser() / f"{stem[:200]}.shape"
