@@ -13,10 +13,10 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from dm_calibration.regression.f_statistic import adjusted_r2_of_f, p_of_f
+from dm_calibration.report.document import Section, Table, write_html, write_pdf
 from dm_controller.cli.paper import paper
 from dm_controller.experiments.twin_bench import TwinConfig
 from dm_controller.paper import control, reported
-from dm_controller.paper.document import Section, Table, write_html, write_pdf
 from dm_controller.paper.results import PaperOptions
 from dm_controller.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from dm_calibration.influence.surfaces import TABLE_1 as NAMES
 from dm_calibration.optics.regions import AREA_FRACTIONS, OUTSIDE_MEAN, RegionStatistics
+from dm_calibration.report.document import Picture, Section, Table
 from dm_controller.paper import reported
-from dm_controller.paper.document import Picture, Section, Table
 from dm_controller.paper.figures import regional_errors_figure, regions_figure, weights_figure
 from dm_controller.paper.results import STANDARD, Results
 from dm_controller.paper.samples import PIXELS, POINTS, Samples

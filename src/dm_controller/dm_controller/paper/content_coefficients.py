@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dm_calibration.report.document import Picture, Section, Table
 from dm_controller.paper import reported
 from dm_controller.paper.control import (
     LOOP_MAPS,
@@ -15,7 +16,6 @@ from dm_controller.paper.control import (
     share_within,
 )
 from dm_controller.paper.control_figures import coefficients_figure, sweep_figure
-from dm_controller.paper.document import Picture, Section, Table
 from dm_controller.paper.results import IDEAL, LAW_METHOD, STANDARD, BenchResults, Results
 
 NM = 1e9

@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 
 from dm_calibration.optics.conic import conic_sag
+from dm_calibration.report.document import Picture, Section, Table
 from dm_controller.paper import reported
 from dm_controller.paper.content_coefficients import FIGURES, SHOWN, WITH, best, parts
 from dm_controller.paper.control import LOOP_MAPS, LOOP_MEMORY, METHODS, OPEN_MEMORY
 from dm_controller.paper.control_figures import surfaces_figure
-from dm_controller.paper.document import Picture, Section, Table
 from dm_controller.paper.regressions import LEVEL
 from dm_controller.paper.results import STANDARD, BenchResults, Results
 

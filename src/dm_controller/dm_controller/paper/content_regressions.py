@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dm_calibration.regression.surface_error import ErrorRegression, Reading
+from dm_calibration.report.document import Picture, Section, Table
 from dm_controller.paper import reported
-from dm_controller.paper.document import Picture, Section, Table
 from dm_controller.paper.figures import predictions_figure
 from dm_controller.paper.regressions import LEVEL, TAKEN, relative_errors
 from dm_controller.paper.results import STANDARD, BenchResults, Results

@@ -6,7 +6,7 @@ import numpy as np
 
 from dm_calibration.optics.sampling_study import SamplingResult
 from dm_calibration.optics.zernike import PISTON_TILT, TERM_RMS, TERMS
-from dm_controller.paper.document import Picture, Section, Table
+from dm_calibration.report.document import Picture, Section, Table
 from dm_controller.paper.figures import sampling_figure
 from dm_controller.paper.results import Results
 

@@ -13,8 +13,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from dm_calibration.optics.zernike import TERMS
+from dm_calibration.report.colours import BLUE, GREEN, ORANGE, PURPLE, VERMILION
 from dm_controller.paper.control import LOOP_MEMORY, OPEN_MEMORY, Series
-from dm_controller.paper.figures import BLUE, GREEN, NM, ORANGE, PURPLE, VERMILION
+from dm_controller.paper.figures import NM
 from dm_controller.paper.reported import CLAIM_PARTS, WAVELENGTH
 from dm_controller.solvers.base import FREE
 

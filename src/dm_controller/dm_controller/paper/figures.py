@@ -17,9 +17,8 @@ from dm_calibration.influence.region_weighting import RegionWeighting
 from dm_calibration.optics.regions import AREA_FRACTIONS, RegionStatistics
 from dm_calibration.optics.sampling_study import SamplingStudy
 from dm_calibration.optics.zernike import PISTON_TILT, TERMS
+from dm_calibration.report.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 
-#: Colours that stay apart for colour-blind readers (Okabe & Ito 2008).
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
 NM = 1e9
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+from dm_calibration.report.document import Section, write_html, write_pdf
 from dm_controller.paper import content, content_coefficients, content_control, content_regressions, content_sampling
-from dm_controller.paper.document import Section, write_html, write_pdf
 from dm_controller.paper.results import Results
 
 TITLE = "Flexible spherical/aspherical surface control: the paper's tables and figures on the virtual bench"

@@ -1,9 +1,11 @@
-"""A page of sections with tables and pictures, written as HTML with PNGs and as PDF. Knows nothing of mirrors."""
+"""A page of sections with tables and pictures, written as HTML and as PDF. Knows nothing of mirrors."""
 
 from __future__ import annotations
 
+import base64
+import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -11,8 +13,11 @@ from string import Template
 
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 PNG_DPI = 110
+#: Of pictures on paper.
+PAPER_DPI = 200
 #: A4 upright, inches.
 PAGE = (8.27, 11.69)
 MARGIN = 0.08
@@ -92,6 +97,36 @@ $sections
 def write_html(folder: Path, title: str, sections: Sequence[Section]) -> Path:
     """Write `index.html` and its pictures into `folder`; returns the page."""
     folder.mkdir(parents=True, exist_ok=True)
+
+    def place(picture: Picture) -> str:
+        file = f"{picture.name}.png"
+        (folder / file).write_bytes(_png(picture.figure))
+        return file
+
+    page = folder / "index.html"
+    page.write_text(_html(title, sections, place))
+    return page
+
+
+def one_html(title: str, sections: Sequence[Section]) -> str:
+    """The page as one file, with its pictures inside."""
+    return _html(
+        title,
+        sections,
+        lambda picture: f"data:image/png;base64,{base64.b64encode(_png(picture.figure)).decode('ascii')}",
+    )
+
+
+def _png(figure: Figure, dpi: float = PNG_DPI) -> bytes:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=dpi)
+    # The layout stands now; finding it again for the PDF would take longer than drawing.
+    figure.set_layout_engine("none")
+    return stream.getvalue()
+
+
+def _html(title: str, sections: Sequence[Section], place: Callable[[Picture], str]) -> str:
+    """The page; `place` puts a picture somewhere and returns its address."""
     parts, links = [], []
     for number, section in enumerate(sections, start=1):
         links.append(f'<a href="#s{number}">{escape(section.title)}</a>')
@@ -99,18 +134,11 @@ def write_html(folder: Path, title: str, sections: Sequence[Section]) -> Path:
         parts += [f"<p>{escape(paragraph)}</p>" for paragraph in section.paragraphs]
         parts += [_html_table(table) for table in section.tables]
         for picture in section.pictures:
-            file = f"{picture.name}.png"
-            picture.figure.savefig(folder / file, dpi=PNG_DPI)
-            # The layout stands now; finding it again for the PDF would take longer than drawing.
-            picture.figure.set_layout_engine("none")
             caption = escape(picture.caption)
-            parts.append(
-                f'<figure><img src="{escape(file)}" alt="{caption}"><figcaption>{caption}</figcaption></figure>'
-            )
+            address = escape(place(picture))
+            parts.append(f'<figure><img src="{address}" alt="{caption}"><figcaption>{caption}</figcaption></figure>')
         parts.append("</section>")
-    page = folder / "index.html"
-    page.write_text(_PAGE.substitute(title=escape(title), links="\n".join(links), sections="\n".join(parts)))
-    return page
+    return _PAGE.substitute(title=escape(title), links="\n".join(links), sections="\n".join(parts))
 
 
 def _html_table(table: Table) -> str:
@@ -123,10 +151,17 @@ def _html_table(table: Table) -> str:
 
 
 def write_pdf(path: Path, title: str, sections: Sequence[Section]) -> Path:
-    """Write all sections to a PDF: pages of text and tables, each followed by its pictures, one to a page."""
+    """Write all sections to a PDF, as :func:`pdf_pages`; returns its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(pdf_pages(title, sections))
+    return path
+
+
+def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
+    """All sections as a PDF on A4 pages: text, tables and pictures one below the other."""
+    stream = io.BytesIO()
     # Without a date, the same run gives the same file.
-    with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as pages:
+    with PdfPages(stream, metadata={"Title": title, "CreationDate": None}) as pages:
         paper = _Paper(pages, title)
         for section in sections:
             paper.text(section.title, size=13, weight="bold", keep=4)
@@ -134,12 +169,10 @@ def write_pdf(path: Path, title: str, sections: Sequence[Section]) -> Path:
                 paper.text(paragraph)
             for table in section.tables:
                 paper.table(table)
-            if section.pictures:
-                paper.end()
             for picture in section.pictures:
-                pages.savefig(picture.figure)
+                paper.picture(picture)
         paper.end()
-    return path
+    return stream.getvalue()
 
 
 class _Paper:
@@ -180,20 +213,42 @@ class _Paper:
         widths = [max(len(row[k]) for row in (table.header, *table.rows)) for k in range(len(table.header))]
         size = min(8.0, 8.0 * 92 / (sum(widths) + 2 * len(widths)))
         right = [MARGIN + edge for edge in _edges(widths)]
-        self.text(table.caption, size=9.0, weight="bold", keep=min(len(table.rows) + 2, 12))
-        for number, row in enumerate((table.header, *table.rows)):
-            page = self._room(ROW)
-            for k, cell in enumerate(row):
-                page.text(
-                    MARGIN if k == 0 else right[k],
-                    self._y,
-                    cell,
-                    fontsize=size,
-                    fontweight="bold" if number == 0 else "normal",
-                    ha="left" if k == 0 else "right",
-                    va="top",
-                )
-            self._y -= ROW
+        height = ROW * (len(table.rows) + 3)
+        # A table that fits on a page is not torn.
+        kept = height if height < 1.0 - 2.5 * MARGIN else 12 * ROW
+        self.text(table.caption, size=9.0, weight="bold", keep=round(kept / LINE))
+        self._row(table.header, right, size, "bold")
+        for row in table.rows:
+            if self._page is None or self._y - ROW < MARGIN:
+                self._row(table.header, right, size, "bold")  # again on every page
+            self._row(row, right, size)
+        self._y -= ROW
+
+    def picture(self, picture: Picture) -> None:
+        """A picture as wide as the text, or as high as a page, with its caption below it."""
+        width, height = picture.figure.get_size_inches()
+        share = min((1.0 - 2 * MARGIN) * PAGE[0] / width, (1.0 - 3 * MARGIN) * PAGE[1] / height)
+        across, down = width * share / PAGE[0], height * share / PAGE[1]
+        page = self._room(down + 3 * LINE)
+        self._y -= down
+        axes = page.add_axes((MARGIN, self._y, across, down))
+        axes.imshow(imread(io.BytesIO(_png(picture.figure, PAPER_DPI * share))), aspect="auto")
+        axes.set_axis_off()
+        self._y -= 0.4 * LINE
+        self.text(picture.caption, size=8.5)
+
+    def _row(self, cells: Sequence[str], right: Sequence[float], size: float, weight: str = "normal") -> None:
+        page = self._room(ROW)
+        for k, cell in enumerate(cells):
+            page.text(
+                MARGIN if k == 0 else right[k],
+                self._y,
+                cell,
+                fontsize=size,
+                fontweight=weight,
+                ha="left" if k == 0 else "right",
+                va="top",
+            )
         self._y -= ROW
 
 

@@ -1,0 +1,175 @@
+"""The report in words, part one: what it comes to, what was measured with what, what to beware of, every map."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import PurePath
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.quality import GRADE_NAMES
+from dm_calibration.report.document import Section, Table
+
+NM = 1e9
+#: What the sentences of a poke check begin with.
+POKE_CHECK = "Poke check: "
+#: Hexadecimal digits of a file's SHA-256 that the table of maps shows.
+SHA_SHOWN = 12
+
+
+def utc(time_ns: int) -> str:
+    """A time in words."""
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(time_ns * 1e-9))
+
+
+def length(metres: float, wavelength: float) -> str:
+    """A length in nm, and as a share of the wavelength where that is known."""
+    if not np.isfinite(metres):
+        return "not known"
+    share = f" (λ/{wavelength / metres:.0f})" if wavelength > 0.0 and metres > 0.0 else ""
+    return f"{metres * NM:.2f} nm{share}"
+
+
+def remeasured(calibration: Calibration) -> str:
+    """The largest re-measured error of the recipes, in words."""
+    recipes = calibration.recipes.recipes
+    if not recipes:
+        return "not measured"
+    return length(max(recipe.max_zernike for recipe in recipes), calibration.wavelength)
+
+
+def summary(calibration: Calibration) -> Section:
+    """What a user must know first."""
+    fit, memory, wavelength = calibration.fit, calibration.memory, calibration.wavelength
+    grades = Counter(GRADE_NAMES[grade] for grade in fit.grades)
+    rows = [
+        ("residual sag of the maps used, in-sample", length(fit.in_sample_rms, wavelength)),
+        ("residual sag of maps held out of the fit", length(fit.held_out_rms, wavelength)),
+        ("largest coefficient error, held out, 95 % of the maps", length(fit.held_out_max_zernike, wavelength)),
+        ("figure drift during the run, rms", length(fit.drift_rms, wavelength)),
+        ("condition number (rms-normalised modes)", f"{fit.condition_number:.1f}"),
+        ("actuators", ", ".join(f"{count} {name}" for name, count in grades.items())),
+        ("signals seen", f"{fit.signal_min:+.3f} … {fit.signal_max:+.3f}"),
+    ]
+    if memory is not None:
+        rows.insert(
+            3, ("largest coefficient error of a move in open loop, held out, 95 %",
+                length(memory.held_out_max_zernike, wavelength)),
+        )  # fmt: skip
+    rows.insert(
+        4 if memory is not None else 3, ("largest coefficient error, re-measured (recipes)", remeasured(calibration))
+    )
+    if memory is None:
+        kind = (
+            "This calibration is linear and without memory: after any move, hysteresis and creep leave an error that "
+            "depends on the moves before. The held-out residual holds it."
+        )
+    else:
+        kind = (
+            f"This calibration knows how the mirror remembers ({memory.name}). Its influence function acts on "
+            "effective signals, which follow from the history of all moves since the last degauss."
+        )
+    warnings = len(calibration.limitations)
+    return Section(
+        "Summary",
+        [
+            kind,
+            "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that "
+            "had no part in it: the honest one. Re-measured is what a map showed after a command of this calibration "
+            "was applied. All lengths are surface sag, piston and tilt removed.",
+            f"{calibration.maps_dropped} maps were dropped, and {warnings} sentences of caution follow below."
+            if warnings or calibration.maps_dropped
+            else "No map was dropped, and nothing calls for caution.",
+        ],
+        [Table("Key figures", ("figure", "value"), rows)],
+    )
+
+
+def provenance(calibration: Calibration, file: str, sha256: str) -> Section:
+    """What was measured, when, with what."""
+    maps, fit = calibration.maps, calibration.fit
+    first, last = int(maps.stamp_ns.min()), int(maps.stamp_ns.max())
+    wavelength = f"{calibration.wavelength * NM:.2f} nm" if calibration.wavelength > 0.0 else "not told by the maps"
+    kinds = Counter(maps.kind)
+    rows = [
+        ("calibration", calibration.id),
+        ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
+        ("actuators", str(fit.actuators)),
+        ("calibrated aperture", f"{2e3 * calibration.aperture_radius:.3f} mm diameter"),
+        ("wavelength", wavelength),
+        ("stored", utc(calibration.created_ns)),
+        ("first map", utc(first)),
+        ("last map", f"{utc(last)}, {(last - first) / 60e9:.1f} min later"),
+        ("maps", ", ".join(f"{count} {kind}" for kind, count in kinds.items())),
+        ("maps in the fit", f"{int(fit.used.sum())} of {len(maps)}"),
+        ("method", fit.method),
+        ("fitted", f"{maps.terms} Zernike coefficients (Born & Wolf) and sag at {maps.points.x.size} points"),
+        ("software", f"dm_calibration {calibration.software_version}"),
+        ("note", calibration.note or "none"),
+    ]
+    if file:
+        rows += [("file", file), ("SHA-256 of the file", sha256)]
+    shapes = [(name, target.strip()) for name, _, target in (text.partition(":") for text in calibration.targets)]
+    solved = [Table("Shapes that were solved on an influence function", ("surface", "aim"), shapes)] if shapes else []
+    return Section(
+        "What was measured, when and with what",
+        [
+            "The calibration file holds everything this page is made of: signals, coefficients and sag of every map, "
+            "names and full SHA-256 of the map files, and the result."
+        ],
+        [Table("Provenance", ("item", "value"), rows), *solved],
+    )
+
+
+def cautions(calibration: Calibration) -> Section:
+    """Poke check, limitations, dropped maps."""
+    findings = [text.removeprefix(POKE_CHECK) for text in calibration.limitations if text.startswith(POKE_CHECK)]
+    others = [text for text in calibration.limitations if not text.startswith(POKE_CHECK)]
+    checked = (
+        [f"Poke check. {finding}" for finding in findings]
+        if findings
+        else ["Poke check: the responses lie where the configured layout puts the actuators."]
+    )
+    fit, maps = calibration.fit, calibration.maps
+    rejected = [(maps.label[i], fit.reasons[i]) for i in np.flatnonzero(~fit.used)]
+    never = [(label, reason.strip()) for label, _, reason in (entry.partition(":") for entry in calibration.dropped)]
+    rows = [*rejected, *never]
+    table = [Table("Maps that are not in the fit", ("map", "reason"), rows)] if rows else []
+    return Section("Warnings and known limitations", [*checked, *others], table)
+
+
+def every_map(calibration: Calibration) -> Section:
+    """One row per map."""
+    maps, fit = calibration.maps, calibration.fit
+    files = any(maps.file)
+    header = ["map", "kind", "time, s", "residual, nm", "beyond 21 terms, nm", "valid, %"]
+    if files:
+        header += ["file", "SHA-256"]
+    rows = []
+    seconds = (maps.stamp_ns - maps.stamp_ns.min()) * 1e-9
+    for i, label in enumerate(maps.label):
+        left = f"{fit.map_residual[i] * NM:.2f}" if fit.used[i] else "dropped"
+        row = [
+            label,
+            maps.kind[i],
+            f"{seconds[i]:.1f}",
+            left,
+            f"{maps.residual_rms[i] * NM:.2f}",
+            f"{100 * maps.valid_fraction[i]:.1f}",
+        ]
+        if files:
+            row += [PurePath(maps.file[i]).name, maps.sha256[i][:SHA_SHOWN]]
+        rows.append(row)
+    folders = sorted({str(PurePath(name).parent) for name in maps.file if name})
+    where = [f"Map files lay in {', '.join(folders)}."] if folders else []
+    return Section(
+        "Every map",
+        [
+            "Residual: rms sag that the fit leaves. Beyond 21 terms: what the Zernike terms leave of the map itself, "
+            "print-through and noise.",
+            *where,
+        ],
+        [Table("Maps in the order measured", header, rows)],
+    )

@@ -1,0 +1,131 @@
+"""The report in words, part two: influence functions, actuators, residuals, regions, coefficients."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.mirror import rings
+from dm_calibration.influence.quality import GRADE_NAMES
+from dm_calibration.optics.regions import AREA_FRACTIONS, EmptyRegionError
+from dm_calibration.optics.sample_regions import regional_rms
+from dm_calibration.optics.zernike import NAMES, PISTON_TILT
+from dm_calibration.report import figures
+from dm_calibration.report.document import Picture, Section, Table
+from dm_calibration.report.residuals import Residuals
+
+NM = 1e9
+
+
+def influence(calibration: Calibration) -> Section:
+    """The influence functions and the actuators' grades."""
+    fit = calibration.fit
+    ring = rings(calibration.actuator_x, calibration.actuator_y)
+    rows = [
+        (
+            str(k + 1),
+            f"{calibration.actuator_x[k] * 1e3:+.2f}",
+            f"{calibration.actuator_y[k] * 1e3:+.2f}",
+            str(ring[k]),
+            f"{fit.response[k] * NM:.1f}",
+            f"{fit.standard_error[k] * NM:.2f}",
+            GRADE_NAMES[fit.grades[k]],
+        )
+        for k in range(fit.actuators)
+    ]
+    effective = "effective signal" if calibration.memory is not None else "signal"
+    return Section(
+        "Influence functions",
+        [
+            f"Sag per unit {effective} of each actuator, piston and tilt removed, interpolated between the "
+            f"{fit.points.x.size} sampling points. Small circle: the actuator; cross: it stands outside the calibrated "
+            "aperture, in that direction. The response is the rms of such a map. An actuator is weak or dead when its "
+            "response is small beside its ring's median or not well above its standard error.",
+        ],
+        [Table("Actuators", ("actuator", "x, mm", "y, mm", "ring", "response, nm", "± nm", "grade"), rows)],
+        [
+            Picture(
+                "influence", "Influence functions of all actuators on one scale.", figures.influence_sheet(calibration)
+            ),
+            Picture(
+                "responses",
+                "Responses with their standard errors, and where the actuators stand; dashed: calibrated aperture.",
+                figures.response_figure(calibration),
+            ),
+        ],
+    )
+
+
+def residual(calibration: Calibration) -> Section:
+    """Residual of each map."""
+    fit = calibration.fit
+    return Section(
+        "Residuals of the maps",
+        [
+            f"In-sample {fit.in_sample_rms * NM:.2f} nm, held out {fit.held_out_rms * NM:.2f} nm rms sag. Reference "
+            "frames are maps at mid range; the figure of the mirror is followed from one to the next "
+            f"({fit.drift_rms * NM:.2f} nm rms over the run)."
+        ],
+        pictures=[
+            Picture("residuals", "What the fit leaves of each map, over the run.", figures.residual_figure(calibration))
+        ],
+    )
+
+
+def regions(calibration: Calibration, left: Residuals) -> Section:
+    """Residual by region."""
+    title = "Regions"
+    try:
+        regional = regional_rms(left.sag, left.maps.points, labels=left.maps.label)
+    except EmptyRegionError as error:
+        return Section(title, [f"Not told: {error}."])
+    moved = ~left.maps.reference
+    shown, kinds = regional[moved], [kind for kind, each in zip(left.maps.kind, moved, strict=True) if each]
+    weights = calibration.region_weights
+    header = ["area, %", "median, nm", "90th percentile, nm", "largest, nm"] + (["weight"] if weights.size else [])
+    rows = []
+    for k, share in enumerate(AREA_FRACTIONS):
+        column = shown[:, k] * NM
+        row = [f"{share:.0%}", *(f"{value:.2f}" for value in (*np.quantile(column, (0.5, 0.9)), column.max()))]
+        rows.append(row + ([f"{weights[k]:.3f}"] if weights.size else []))
+    weighted = (
+        " The weights are those of Eq. (8), from the variance of the surface control error over the sample surfaces; "
+        "a controller may weight its command by them."
+        if weights.size
+        else ""
+    )
+    return Section(
+        title,
+        [
+            "rms of the residual inside concentric discs of 10 … 100 % of the aperture's area, over all maps but the "
+            f"reference frames, in-sample.{weighted}"
+        ],
+        [Table("Residual by region", header, rows)],
+        [Picture("regions", "Residual inside each disc: one dot per map.", figures.regions_figure(shown, kinds))],
+    )
+
+
+def coefficients(calibration: Calibration, left: Residuals) -> Section:
+    """Residual by Zernike term."""
+    memory = calibration.memory
+    sigma = memory.zernike_sigma if memory is not None else None
+    first = len(PISTON_TILT)
+    rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0)) * NM
+    header = ["term", "in-sample rms, nm"] + (["held-out moves, nm"] if sigma is not None else [])
+    rows = [
+        [NAMES[k], f"{rms[k]:.3f}"] + ([f"{sigma[k] * NM:.3f}"] if sigma is not None else [])
+        for k in range(first, left.maps.terms)
+    ]
+    held = (
+        " Held-out moves are those of the check, predicted by a law that had not seen them; the noise of their maps is "
+        "taken off, so they can lie below the in-sample figure."
+        if sigma is not None
+        else f" Held out, the largest of a map stays below {calibration.fit.held_out_max_zernike * NM:.2f} nm in 95 % "
+        "of the maps."
+    )
+    return Section(
+        "Zernike coefficients",
+        [f"What the fit leaves of each coefficient beyond tilt, rms over the maps.{held}"],
+        [Table("Residual by coefficient", header, rows)],
+        [Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(left, sigma))],
+    )

@@ -1,0 +1,179 @@
+"""Figures of the report: influence functions, residuals, regions, coefficients. Lengths in m; drawn in mm and nm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+from scipy.interpolate import RBFInterpolator
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.maps import KINDS
+from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
+from dm_calibration.optics.regions import AREA_FRACTIONS
+from dm_calibration.optics.sampling import SamplePoints
+from dm_calibration.optics.zernike import PISTON_TILT, TERMS
+from dm_calibration.report.colours import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, VERMILION
+from dm_calibration.report.residuals import Residuals
+
+Floats = NDArray[np.float64]
+
+NM, MM = 1e9, 1e3
+#: Pixels across a small map.
+PIXELS = 61
+#: Small maps in a row.
+COLUMNS = 7
+KIND_COLOURS = dict(zip(KINDS, (GREY, BLUE, GREEN, ORANGE, PURPLE), strict=True))
+
+
+def on_disc(values: Floats, points: SamplePoints, pixels: int = PIXELS) -> Floats:
+    """Interpolate `values` (Q, P) at the points onto square maps (Q, pixels, pixels), NaN outside the unit disc.
+
+    Thin-plate splines through all points; row 0 = bottom.
+    """
+    axis = np.linspace(-1.0, 1.0, pixels)
+    x, y = np.meshgrid(axis, axis)
+    inside = np.hypot(x, y) <= 1.0
+    spline = RBFInterpolator(np.column_stack((points.x, points.y)), values.T, kernel="thin_plate_spline")
+    maps = np.full((len(values), pixels, pixels), np.nan)
+    maps[:, inside] = spline(np.column_stack((x[inside], y[inside]))).T
+    return maps
+
+
+def influence_sheet(calibration: Calibration) -> Figure:
+    """One small map per actuator, all on one scale, with its grade."""
+    fit = calibration.fit
+    maps = on_disc(fit.influence_sag.T, fit.points) * NM
+    radius = calibration.aperture_radius * MM
+    rows = -(-len(maps) // COLUMNS)
+    height = 1.45 * rows + 0.7
+    figure = Figure(figsize=(10.5, height))
+    # Finding a layout for so many axes would take longer than all the rest.
+    edges = {"left": 0.07, "right": 0.87, "bottom": 0.5 / height, "top": 1.0 - 0.25 / height, "hspace": 0.28}
+    grid = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False, gridspec_kw=edges)
+    scale = Normalize(-np.nanmax(np.abs(maps)), np.nanmax(np.abs(maps)))
+    for number, axes in enumerate(grid.flat):
+        if number >= len(maps):
+            axes.set_visible(False)
+            continue
+        extent = (-radius, radius, -radius, radius)
+        image = axes.imshow(maps[number], origin="lower", extent=extent, cmap=DIVERGING, norm=scale)
+        axes.add_patch(Circle((0, 0), radius, fill=False, edgecolor=GREY, linewidth=0.6))
+        # An actuator outside the aperture lies beyond the axes: clipping would hide that it is there.
+        place = np.array([calibration.actuator_x[number], calibration.actuator_y[number]]) * MM
+        distance = max(float(np.hypot(*place)), 1e-12)
+        outside = distance > radius
+        marker = "o" if not outside else "x"
+        x, y = place if not outside else place * radius / distance
+        axes.plot(x, y, marker, color="black", markersize=3, markerfacecolor="none", clip_on=False)
+        grade = int(fit.grades[number])
+        axes.set_title(
+            f"{number + 1}: {GRADE_NAMES[grade]}",
+            fontsize=8,
+            color="black" if grade == GRADE_GOOD else VERMILION,
+            fontweight="normal" if grade == GRADE_GOOD else "bold",
+        )
+        axes.tick_params(labelsize=6.5, labelbottom=number + COLUMNS >= len(maps))
+    figure.supxlabel("x, mm", fontsize=9)
+    figure.supylabel("y, mm", fontsize=9)
+    figure.colorbar(image, cax=figure.add_axes((0.91, 0.3, 0.015, 0.4)), label="sag per unit signal, nm")
+    return figure
+
+
+def response_figure(calibration: Calibration) -> Figure:
+    """Response of each actuator with its standard error, and the layout with the grades."""
+    fit = calibration.fit
+    figure = Figure(figsize=(10.5, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    numbers = np.arange(1, fit.actuators + 1)
+    good = fit.grades == GRADE_GOOD
+    for chosen, colour, label in ((good, BLUE, "good"), (~good, VERMILION, "not good")):
+        if chosen.any():
+            left.bar(numbers[chosen], fit.response[chosen] * NM, color=colour, label=label)
+    left.errorbar(numbers, fit.response * NM, fit.standard_error * NM, fmt="none", ecolor="black", elinewidth=0.8)
+    left.set(xlabel="actuator", ylabel="rms sag of a unit signal, nm")
+    left.legend(fontsize=8)
+    left.grid(axis="y", alpha=0.3)
+    shown = right.scatter(
+        calibration.actuator_x * MM, calibration.actuator_y * MM, c=fit.response * NM, s=170, cmap="cividis"
+    )
+    bad = ~good
+    right.scatter(
+        calibration.actuator_x[bad] * MM, calibration.actuator_y[bad] * MM, s=300, facecolors="none",
+        edgecolors=VERMILION, linewidths=2,
+    )  # fmt: skip
+    middle = 0.5 * (fit.response.min() + fit.response.max())
+    for number, x, y, response in zip(
+        numbers, calibration.actuator_x * MM, calibration.actuator_y * MM, fit.response, strict=True
+    ):
+        colour = "white" if response < middle else "black"
+        right.text(x, y, str(number), fontsize=6.5, ha="center", va="center", color=colour)
+    right.add_patch(Circle((0, 0), calibration.aperture_radius * MM, fill=False, edgecolor=GREY, linestyle="--"))
+    right.set(aspect="equal", xlabel="x, mm", ylabel="y, mm")
+    right.margins(0.12)
+    figure.colorbar(shown, ax=right, label="response, nm")
+    return figure
+
+
+def residual_figure(calibration: Calibration) -> Figure:
+    """Residual of each map over the run by its kind; maps that were dropped are marked."""
+    maps, fit = calibration.maps, calibration.fit
+    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    minutes = (maps.stamp_ns - maps.stamp_ns.min()) / 60e9
+    for kind, colour in KIND_COLOURS.items():
+        chosen = np.array([each == kind for each in maps.kind]) & fit.used
+        if chosen.any():
+            axes.plot(minutes[chosen], fit.map_residual[chosen] * NM, ".", color=colour, label=f"{kind} maps")
+    if not fit.used.all():
+        dropped = minutes[~fit.used]
+        axes.plot(dropped, np.zeros(dropped.size), "x", color=VERMILION, markersize=8, clip_on=False, label="dropped")
+    for value, style, name in ((fit.in_sample_rms, "-", "in-sample rms"), (fit.held_out_rms, "--", "held-out rms")):
+        axes.axhline(value * NM, color="black", linewidth=0.9, linestyle=style, label=f"{name}: {value * NM:.2f} nm")
+    axes.set(xlabel="time since the first map, min", ylabel="rms sag left by the fit, nm", ylim=(0, None))
+    axes.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def regions_figure(regional: Floats, labels: Sequence[str]) -> Figure:
+    """Residual rms inside the ten concentric discs: each map of `regional` (M, 10), median and 90th percentile."""
+    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    area = 100 * np.asarray(AREA_FRACTIONS)
+    for kind in dict.fromkeys(labels):
+        rows = regional[[label == kind for label in labels]]
+        place = area + 4.0 * (np.arange(len(rows))[:, None] / max(len(rows) - 1, 1) - 0.5)
+        axes.plot(place.ravel(), rows.ravel() * NM, ".", color=KIND_COLOURS[kind], markersize=2.5, alpha=0.4)
+        axes.plot([], [], ".", color=KIND_COLOURS[kind], label=f"{kind} maps")
+    axes.plot(area, np.median(regional, axis=0) * NM, "o-", color="black", label="median")
+    axes.plot(area, np.quantile(regional, 0.9, axis=0) * NM, "s--", color="black", label="90th percentile")
+    axes.set(xlabel="area of the region, % of the aperture", ylabel="rms residual, nm", ylim=(0, None))
+    axes.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def coefficients_figure(left: Residuals, memory_sigma: Floats | None) -> Figure:
+    """rms residual of each Zernike coefficient beyond tilt; beside it what held-out moves showed, when known."""
+    figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    first = len(PISTON_TILT)
+    place = np.arange(first, left.coefficients.shape[1])
+    rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0))[first:]
+    share = 0.8 if memory_sigma is None else 0.4
+    axes.bar(place - (0.8 - share) / 2, rms * NM, share, color=BLUE, label="maps of the fit (in-sample)")
+    if memory_sigma is not None:
+        axes.bar(
+            place + 0.2, memory_sigma[first:] * NM, share, color=ORANGE, label="held-out moves, noise of maps removed"
+        )
+    names = [f"$Z_{{{term.n}}}^{{{term.m}}}$" + f"\n{term.kind}" * bool(term.kind) for term in TERMS[first:]]
+    axes.set_xticks(place, names[: len(place)], fontsize=8)
+    axes.set(xlabel="Zernike term (Born & Wolf, peak-normalised)", ylabel="rms error of the coefficient, nm")
+    axes.legend(fontsize=8)
+    axes.grid(axis="y", alpha=0.3)
+    return figure

@@ -1,0 +1,96 @@
+"""The report: all sections in order, as one HTML file and one PDF file."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.quality import GRADE_NAMES
+from dm_calibration.report import content, content_fit, content_memory
+from dm_calibration.report.document import Section, one_html, pdf_pages
+from dm_calibration.report.memory_figures import loop_opening
+from dm_calibration.report.residuals import residuals
+from dm_calibration.whole_file import write_whole
+
+
+class Written(NamedTuple):
+    """The files of a report."""
+
+    html: Path
+    pdf: Path
+
+
+def sections(calibration: Calibration, file: Path | None = None) -> list[Section]:
+    """All sections of the report of `calibration`, which was read from `file`.
+
+    Raises:
+        OSError: `file` cannot be read.
+    """
+    left = residuals(calibration)
+    sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
+    return [
+        content.summary(calibration),
+        content.provenance(calibration, file.name if file is not None else "", sha256),
+        content.cautions(calibration),
+        content_fit.residual(calibration),
+        content_fit.regions(calibration, left),
+        content_fit.coefficients(calibration, left),
+        content_fit.influence(calibration),
+        content_memory.hysteresis(calibration),
+        content_memory.recipes(calibration),
+        content.every_map(calibration),
+    ]
+
+
+def write_report(calibration: Calibration, folder: Path, file: Path | None = None) -> Written:
+    """Write ``<id>.html`` and ``<id>.pdf`` into `folder`; each is there whole or not at all.
+
+    Args:
+        file: that the calibration was read from, for its SHA-256.
+
+    Raises:
+        OSError: `file` cannot be read, or `folder` not written to.
+    """
+    made = sections(calibration, file)
+    title = f"Calibration {calibration.id} of {calibration.mirror_name}, serial {calibration.mirror_serial}"
+    written = Written(folder / f"{calibration.id}.html", folder / f"{calibration.id}.pdf")
+    write_whole(written.html, one_html(title, made).encode())
+    write_whole(written.pdf, pdf_pages(title, made))
+    return written
+
+
+def figures_of(calibration: Calibration) -> dict[str, Any]:
+    """The main figures, for programs."""
+    fit, memory = calibration.fit, calibration.memory
+    names, counts = np.unique([GRADE_NAMES[grade] for grade in fit.grades], return_counts=True)
+    result: dict[str, Any] = {
+        "id": calibration.id,
+        "mirror": calibration.mirror_name,
+        "serial": calibration.mirror_serial,
+        "created_ns": calibration.created_ns,
+        "wavelength_m": calibration.wavelength,
+        "aperture_radius_m": calibration.aperture_radius,
+        "method": fit.method,
+        "maps_used": int(fit.used.sum()),
+        "maps_dropped": calibration.maps_dropped,
+        "in_sample_rms_nm": fit.in_sample_rms * 1e9,
+        "held_out_rms_nm": fit.held_out_rms * 1e9,
+        "held_out_max_zernike_nm": fit.held_out_max_zernike * 1e9,
+        "remeasured_max_zernike_nm": max((r.max_zernike for r in calibration.recipes.recipes), default=np.nan) * 1e9,
+        "condition_number": fit.condition_number,
+        "grades": dict(zip(names.tolist(), counts.tolist(), strict=True)),
+        "limitations": list(calibration.limitations),
+        "memory": None,
+    }
+    if memory is not None:
+        result["memory"] = {
+            "law": memory.name,
+            "held_out_max_zernike_nm": memory.held_out_max_zernike * 1e9,
+            "loop_opening": loop_opening(memory.law),
+            "creep_per_decade": memory.law.creep_rate,
+        }
+    return result

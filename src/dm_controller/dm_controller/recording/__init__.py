@@ -1,0 +1,1 @@
+"""Recordings of a bench session in MCAP, as rosbag2 writes them, and what can be made of them."""

@@ -1,0 +1,85 @@
+"""Message types by name: their Python class, and their definition as text for whoever reads a recording without them.
+
+The text is rosbag2's: the definition, then each type it uses under a line of `=` and a line `MSG: package/Type`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+
+_SEPARATOR = "=" * 80
+_FEEDBACK_MESSAGE = "_FeedbackMessage"
+_PARTS = {"Goal": 0, "Result": 1, "Feedback": 2}
+
+
+class UnknownTypeError(ValueError):
+    """No such message type in this environment; the message names it."""
+
+
+@cache
+def message_class(type_name: str) -> Any:
+    """The class of ``package/msg/Type``, or of ``package/action/Type_FeedbackMessage``.
+
+    Raises:
+        UnknownTypeError: the package or the type is not installed.
+    """
+    try:
+        package, kind, name = type_name.split("/")
+        module = importlib.import_module(f"{package}.{kind}")
+        if kind == "action":
+            action, part = name.rsplit("_", 1)
+            owner = getattr(module, action)
+            return getattr(owner if part in _PARTS else owner.Impl, part)
+        return getattr(module, name)
+    except (ValueError, ImportError, AttributeError) as error:
+        raise UnknownTypeError(f"message type {type_name}: not installed here") from error
+
+
+@cache
+def definition(type_name: str) -> str:
+    """The definition of a message type with all types it uses, in the format `ros2msg`.
+
+    Raises:
+        UnknownTypeError: not installed.
+    """
+    main = _Definition(type_name)
+    done: dict[str, str] = {}
+    waiting = main.used
+    while waiting:
+        name = waiting.pop(0)
+        if name not in done:
+            package, _, stem = name.partition("/")
+            part_of_action = "_" in stem
+            used = _Definition(f"{package}/{'action' if part_of_action else 'msg'}/{stem}")
+            done[f"{package}/action/{stem}" if part_of_action else name] = used.text
+            waiting += used.used
+    return "\n".join([main.text, *(f"{_SEPARATOR}\nMSG: {name}\n{text}" for name, text in done.items())])
+
+
+class _Definition:
+    """The text of one type, and the ``package/Type`` of those it uses."""
+
+    def __init__(self, type_name: str) -> None:
+        package, kind, name = type_name.split("/")
+        cls = message_class(type_name)
+        fields = " ".join(cls.get_fields_and_field_types().values())
+        self.used = list(dict.fromkeys(re.findall(r"[a-z]\w*/\w+", fields)))
+        try:
+            folder = Path(get_package_share_directory(package)) / kind
+            if kind == "msg":
+                self.text = (folder / f"{name}.msg").read_text()
+            elif name.endswith(_FEEDBACK_MESSAGE):
+                action = name.removesuffix(_FEEDBACK_MESSAGE)
+                # With its full name: readers look for a shorter one in different places.
+                self.text = f"unique_identifier_msgs/UUID goal_id\n{package}/action/{action}_Feedback feedback\n"
+            else:
+                action, part = name.rsplit("_", 1)
+                self.text = re.split(r"(?m)^---$", (folder / f"{action}.action").read_text())[_PARTS[part]]
+        except (OSError, PackageNotFoundError) as error:
+            raise UnknownTypeError(f"message type {type_name}: its definition is not installed: {error}") from error
