@@ -12,7 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -100,6 +103,20 @@ def test_fast_clock(start: Start, observer: Observer) -> None:
     # 200 periods of at least 2 ms wall time each, 50 times as fast.
     assert times[-1] - times[0] > 0.9 * 50 * 0.002 * 200
     assert process.stop(signal.SIGTERM) == 0
+    assert "Traceback" not in process.output
+
+
+def test_images_of_the_camera(start: Start, observer: Observer) -> None:
+    images: list[Image] = observer.record(Image, "image_raw", qos_profile_sensor_data)
+    process = start("dm_driver", "virtual_bench", {**SMALL, "camera.rate": 30.0, "camera.width": 160})
+    wait_until(lambda: len(images) > 10, 30, "images")
+    first, last = images[0], images[-1]
+    assert (last.width, last.height, last.encoding, len(last.data)) == (160, 240, "mono8", 160 * 240)
+    stamps = [Time.from_msg(image.header.stamp).nanoseconds for image in images]
+    assert stamps == sorted(set(stamps))
+    assert (stamps[-1] - stamps[0]) * 1e-9 > 0.9 * (len(stamps) - 1) / 30, "no faster than asked for"
+    assert bytes(first.data) != bytes(last.data)
+    assert process.stop() == 0
     assert "Traceback" not in process.output
 
 

@@ -24,6 +24,7 @@ setup(
     entry_points={
         "console_scripts": [
             "focus_controller = dm_controller.focus_controller_node:main",
+            "autofocus = dm_controller.autofocus_node:main",
             "dm = dm_controller.cli:main",
         ],
     },

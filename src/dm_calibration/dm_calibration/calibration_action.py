@@ -18,6 +18,7 @@ from dm_calibration.calibration_parameters import fit_options, procedure_options
 from dm_calibration.calibrator import check_fit, dropped_maps, evaluate
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.mirror import Mirror
+from dm_calibration.memory_forecast import forecast
 from dm_calibration.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure import Outcome, Procedure, Progress
 from dm_runtime.worker import wait_for_clock
@@ -55,6 +56,9 @@ class CalibrateAction:
             wait_for_clock(clock)
             started = clock.now()
             plan = self._planned(handle.request, mirror)
+            self._foretell(handle.request, plan, result)
+            if handle.request.dry_run:
+                return "succeed", result
             self._bench.check_ready()
             self._bench.settle_time = handle.request.settle_time or self._values["settle_time"]
             self._bench.cancelled = lambda: bool(handle.is_cancel_requested)
@@ -99,6 +103,19 @@ class CalibrateAction:
             memory_maps=goal.memory_maps or self._values["memory_maps"],
         )
         return make_plan(PlanKind(goal.plan), mirror, options)
+
+    def _foretell(self, goal: Calibrate.Goal, plan: Plan, result: Calibrate.Result) -> None:
+        """Fill in what is to be expected; the message of a dry run."""
+        expected = forecast(plan, goal.settle_time or self._values["settle_time"], self._desk.in_use)
+        result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
+        if goal.dry_run:
+            maps = sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
+            accuracy = ""
+            if expected.max_zernike > 0.0:
+                accuracy = f", moves then right to {expected.max_zernike * 1e9:.1f} nm (largest coefficient, 95 %)"
+            elif plan.kind is PlanKind.MEMORY:
+                accuracy = ", accuracy not known without an earlier calibration in use"
+            result.message = f"{maps} maps in about {expected.duration:.0f} s{accuracy}; nothing was moved"
 
     def _procedure(
         self, handle: ServerGoalHandle, plan: Plan, mirror: Mirror

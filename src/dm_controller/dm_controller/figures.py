@@ -48,8 +48,14 @@ def draw_map(axes: Axes, values: np.ndarray, info: Any, limit: float, colours: s
     return image
 
 
-def save_sweep_figure(rows: Sequence[dict[str, Any]], path: Path, title: str, mirror: Any) -> Path:
-    """Command, measured map and residual of a sweep, and the residuals against curvature."""
+def save_sweep_figure(
+    rows: Sequence[dict[str, Any]], path: Path, title: str, mirror: Any, without_memory: Sequence[dict[str, Any]] = ()
+) -> Path:
+    """Command, measured map and residual of a sweep, and the residuals against curvature.
+
+    Args:
+        without_memory: the same sweep by an influence function alone, for comparison.
+    """
     positions = _positions(mirror, len(rows[0]["signals"]))
     curvatures = np.array([row["curvature"] for row in rows])
     shown = [rows[int(np.abs(curvatures - wanted).argmin())] for wanted in COLUMNS]
@@ -85,11 +91,19 @@ def save_sweep_figure(rows: Sequence[dict[str, Any]], path: Path, title: str, mi
         curvatures, [r["error"].max_zernike * 1e9 for r in rows], "s-", label="measured, largest coefficient"
     )
     summary.semilogy(curvatures, [r["prediction"].predicted_rms * 1e9 for r in rows], "^--", label="predicted, rms sag")
+    if without_memory:
+        summary.semilogy(
+            [row["curvature"] for row in without_memory],
+            [row["error"].max_zernike * 1e9 for row in without_memory],
+            "x:",
+            color="tab:red",
+            label="largest coefficient, influence function alone",
+        )
     for divisor in (50, 500):
         summary.axhline(WAVELENGTH_NM / divisor, color="grey", linewidth=0.8, linestyle=":")
         summary.annotate(f"λ/{divisor}", (curvatures[0], WAVELENGTH_NM / divisor), fontsize=8, va="bottom")
     summary.set(xlabel="requested curvature, 1/m (concave positive)", ylabel="nm")
-    summary.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    summary.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     summary.margins(y=0.12)
     summary.grid(alpha=0.3)
     figure.savefig(path, dpi=110)

@@ -55,33 +55,59 @@ def invert(
         signals = np.clip(effective, low, high)
         return Inverted(signals, effective - signals)
     wanted = law.position_for(state, effective, ahead)
-    return _pieces(law).solve(state, wanted, low, high)
+    inverted = pieces(law).solve(state, wanted, low, high)
+    limited = inverted.missed != 0.0
+    if not limited.any():
+        return inverted
+    # A limit may lie before the place where the piece begins that the solution would need.
+    missed = np.where(limited, wanted - law.position_at(state, inverted.signals), 0.0)
+    return Inverted(inverted.signals, missed)
 
 
-class _Pieces:
+class Pieces:
     """The polynomials of one law on a rising and on a falling way.
 
     Attributes:
         radius: (R,) half-widths, rising.
         polynomial: (D + 1, 2, R) coefficients by rising power of the sum over the operators 0 .. k that have set in, on
             a falling [0] and on a rising [1] way.
+        single: (D + 1, R) the same of each operator alone, in its own value.
+        order: that sorts the law's operators; None = they are sorted.
+        duhem, duhem_weight, duhem_slope: the Duhem operator, None = none; its weight, and what its value's polynomial
+            adds to the slope.
     """
 
     def __init__(self, law: MemoryLaw) -> None:
         order = np.argsort(law.play_radius, kind="stable")
-        self._order = None if (np.diff(order) == 1).all() else order
+        self.order = None if (np.diff(order) == 1).all() else order
         self.radius, weight = law.play_radius[order], law.play_weight[order]
-        self._single = np.vstack((np.zeros(len(self.radius)), weight.T))
-        self.polynomial = np.zeros((len(self._single), 2, len(self.radius)))
+        self.single = np.vstack((np.zeros(len(self.radius)), weight.T))
+        self.polynomial = np.zeros((len(self.single), 2, len(self.radius)))
         for way, sign in enumerate((-1.0, 1.0)):
             for k, radius in enumerate(self.radius):
                 # What has set in follows the signal at the distance of its half-width.
-                shifted = Polynomial(self._single[:, k])(Polynomial([-sign * radius, 1.0])).coef
+                shifted = Polynomial(self.single[:, k])(Polynomial([-sign * radius, 1.0])).coef
                 self.polynomial[: len(shifted), way, k] = shifted
         self.polynomial = self.polynomial.cumsum(axis=2)
-        self._duhem = DuhemOperator(law.duhem_slope) if law.duhem_slope.size else None
-        self._duhem_weight = law.duhem_weight
-        self._duhem_slope = law.duhem_weight * np.concatenate(([1.0], -law.duhem_slope, [0.0]))
+        self.duhem = DuhemOperator(law.duhem_slope) if law.duhem_slope.size else None
+        self.duhem_weight = law.duhem_weight
+        self.duhem_slope = law.duhem_weight * np.concatenate(([1.0], -law.duhem_slope, [0.0]))
+
+        self.powers = np.arange(1.0, len(self.polynomial))[:, None]
+        self._bends: dict[tuple[float, float], float] = {}
+
+    def bend(self, low: float, high: float) -> float:
+        """Largest second derivative over twice the smallest slope, signals within `low` .. `high`; inf = not known."""
+        if self.duhem is not None:
+            return float("inf")
+        if (low, high) not in self._bends:
+            grid = np.linspace(low, high, 201)[:, None, None]
+            slopes = self.polynomial[1:, None] * self.powers[:, :, None, None]
+            bends = slopes[1:] * self.powers[:-1, :, None, None]
+            second = sum((bend * grid**power for power, bend in enumerate(bends)), np.zeros(1))
+            first = sum(slope * grid**power for power, slope in enumerate(slopes))
+            self._bends[low, high] = float(np.abs(second).max() / (2.0 * np.maximum(first, SLOPE_MIN).min()))
+        return self._bends[low, high]
 
     def solve(self, state: MemoryState, wanted: Floats, low: float, high: float) -> Inverted:
         """Signals for the static effective signals `wanted` (N,)."""
@@ -94,14 +120,14 @@ class _Pieces:
             return self._newton(
                 state, wanted, sign, polynomial, none, start, np.maximum(near, low), np.minimum(far, high)
             )
-        play = state.play if self._order is None else state.play[:, self._order]
-        value = _horner(self._single, play)
+        play = state.play if self.order is None else state.play[:, self.order]
+        value = horner(self.single, play)
         waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)  # operators that have not set in yet
         onset = play + sign[:, None] * self.radius
-        at_onset = _horner(self.polynomial[:, way], onset) + waiting
-        if self._duhem is not None:
+        at_onset = horner(self.polynomial[:, way], onset) + waiting
+        if self.duhem is not None:
             change = onset - state.signals[:, None]
-            at_onset += self._duhem_weight * self._duhem.move(state.fading[:, None], change)
+            at_onset += self.duhem_weight * self.duhem.move(state.fading[:, None], change)
         still = sign[:, None] * (wanted[:, None] - at_onset)
         last = len(self.radius) - 1
         piece = np.maximum(np.count_nonzero(still >= 0.0, axis=1) - 1, 0)
@@ -128,15 +154,15 @@ class _Pieces:
         high: Floats,
     ) -> Inverted:
         """The root between `low` and `high` (N,) of what rises there, or the end that comes nearest to it."""
-        derivative = polynomial[1:] * np.arange(1.0, len(polynomial))[:, None]
+        derivative = polynomial[1:] * self.powers
         gap = wanted
         for _ in range(ROUNDS_MAX):
-            value = _horner(polynomial, signals) + fixed
-            slope = _horner(derivative, signals) if len(derivative) > 1 else derivative[0]
-            if self._duhem is not None:
-                fading = self._duhem.move(state.fading, signals - state.signals)
-                value += self._duhem_weight * fading
-                slope = slope + _horner(self._duhem_slope, sign * fading)
+            value = horner(polynomial, signals) + fixed
+            slope = horner(derivative, signals) if len(derivative) > 1 else derivative[0]
+            if self.duhem is not None:
+                fading = self.duhem.move(state.fading, signals - state.signals)
+                value += self.duhem_weight * fading
+                slope = slope + horner(self.duhem_slope, sign * fading)
             gap = value - wanted
             below = gap < 0.0
             low, high = np.where(below, signals, low), np.where(below, high, signals)
@@ -148,10 +174,10 @@ class _Pieces:
 
 
 #: A law never changes, so what is worked out from it is kept.
-_pieces = lru_cache(maxsize=8)(_Pieces)
+pieces = lru_cache(maxsize=8)(Pieces)
 
 
-def _horner(coefficients: Floats, x: Floats) -> Floats:
+def horner(coefficients: Floats, x: Floats) -> Floats:
     """Polynomials with `coefficients` (D + 1, ...) by rising power, D > 0, at x (...)."""
     total = coefficients[-1] * x + coefficients[-2]
     for coefficient in coefficients[-3::-1]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from dm_msgs.msg import Calibration, ErrorCode, MirrorInfo
 
 from dm_calibration.calibration_messages import recipe_book_from, stamp_ns
+from dm_calibration.memory.law import certain_reach
 from dm_calibration.memory.recipes import RecipeBook
 from dm_controller.conversions import limits_of, memory_figures_of, model_of
 from dm_controller.model import CalibratedMirror
@@ -26,6 +27,7 @@ class MirrorInUse:
     Attributes:
         calibration: as received.
         mirror: its influence function inside the limits.
+        certain: the same inside what is within reach whatever the actuators remember.
         loop: plans moves.
         recipes: may be empty.
         middle: signal of mid range, where a degauss ends.
@@ -35,6 +37,7 @@ class MirrorInUse:
 
     calibration: Calibration
     mirror: CalibratedMirror
+    certain: CalibratedMirror
     loop: OpenLoop
     recipes: RecipeBook
     middle: float
@@ -42,8 +45,8 @@ class MirrorInUse:
     span: float
 
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
-        """See :meth:`CalibratedMirror.reachable_range`."""
-        return self.mirror.reachable_range(target, tolerance)
+        """See :meth:`CalibratedMirror.reachable_range`; within reach from any history."""
+        return self.certain.reachable_range(target, tolerance)
 
     @property
     def conditioned_error(self) -> float:
@@ -90,15 +93,29 @@ def mirror_in_use(calibration: Calibration | None, mirror: MirrorInfo | None, ap
         raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {reason}")
     try:
         slew_rate = mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf
-        calibrated = CalibratedMirror(model_of(calibration), limits_of(mirror))
+        limits = limits_of(mirror)
+        calibrated = CalibratedMirror(model_of(calibration), limits)
         recipes = recipe_book_from(calibration.recipes)
         if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
         loop = OpenLoop(calibrated, memory_figures_of(calibration), slew_rate)
+        certain = calibrated
+        if loop.law.remembers:
+            reach = certain_reach(loop.law, limits.low, limits.high)
+            share = (reach[1] - reach[0]) / (limits.high - limits.low)
+            certain = CalibratedMirror(
+                calibrated.model,
+                replace(
+                    limits,
+                    low=reach[0],
+                    high=reach[1],
+                    neighbour_difference=min(share, 1.0) * limits.neighbour_difference,
+                ),
+            )
     except (ValueError, np.linalg.LinAlgError) as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
     low, high = mirror.signal_min, mirror.signal_max
-    return MirrorInUse(calibration, calibrated, loop, recipes, 0.5 * (low + high), slew_rate, high - low)
+    return MirrorInUse(calibration, calibrated, certain, loop, recipes, 0.5 * (low + high), slew_rate, high - low)
 
 
 def _mismatch(calibration: Calibration, mirror: MirrorInfo, aperture_tolerance: float) -> str | None:

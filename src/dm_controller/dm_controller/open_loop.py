@@ -8,7 +8,9 @@ again, a little later: creep has changed what the same signals do.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from dm_calibration.memory.law import MemoryLaw, MemoryState
 from dm_controller.inverse import invert
 from dm_controller.model import FREE_TERMS, CalibratedMirror, Plan, rms_bounds
+from dm_controller.prepared_inverse import PreparedInverse
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget
 
@@ -26,6 +29,8 @@ DRAWS = 4000
 #: Shortest time after a move at which a calibration sees the surface, s: one map takes about that long. Creep of less
 #: age is extrapolated.
 YOUNGEST_MAP_S = 1.0
+#: Uncertainty of that extrapolation.
+YOUNG_SHARE = 0.1
 #: Part of the expected error beyond which effective signals that a limit denies count, normalised.
 MISSED_MAX = 1e-6
 
@@ -40,19 +45,27 @@ class MemoryFigures:
     unknown_sigma: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Move:
     """A planned move.
 
     Attributes:
-        plan: command and prediction; its signals are what the electronics get.
+        signals: (N,) what the electronics get.
         effective: (N,) effective signals aimed at: what holding the shape means.
         duration: s that the way takes at the slew rate.
+        max_zernike: m, expected largest coefficient error.
     """
 
-    plan: Plan
+    signals: Floats
     effective: Floats
-    duration: float = 0.0
+    duration: float
+    max_zernike: float
+    _predict: Callable[[], Plan]
+
+    @cached_property
+    def plan(self) -> Plan:
+        """Command and prediction, worked out when first asked for: a command need not wait for it."""
+        return self._predict()
 
 
 class OpenLoop:
@@ -71,6 +84,13 @@ class OpenLoop:
         self.law = memory.law if memory is not None else MemoryLaw.linear()
         self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[FREE_TERMS:])
         self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
+        self._prepared: PreparedInverse | None = None
+
+    def prepare(self, state: MemoryState) -> None:
+        """Work out now what plans from exactly this `state`, of a mirror at rest, will need."""
+        limits = self.mirror.limits
+        if self.memory is not None and self.law.remembers:
+            self._prepared = PreparedInverse(self.law, state, limits.low, limits.high)
 
     def plan(
         self,
@@ -103,20 +123,37 @@ class OpenLoop:
         if error is not None:
             planned = replace(planned, max_zernike=min(planned.max_zernike, error), max_zernike_upper=error)
         if self.memory is None:
-            return Move(planned, aim, travel)
+            return Move(planned.signals, aim, travel, planned.max_zernike, lambda: planned)
         if state is None:
             state, known = self.law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
         # A move counts from its last write; older creep goes on during the way.
-        at = self.law.advance(state, time + travel)
-        inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
-        signals, missed = inverted.signals, inverted.missed
-        if not limits.allow_neighbours(signals):
-            signals, missed = self._within_neighbours(signals, at, aim)
-        if np.abs(missed).max() > MISSED_MAX and effective is None:
+        arrival = time + travel
+        signals, missed = self._inverted(state, arrival, aim, ahead)
+        if missed is not None and np.abs(missed).max() > MISSED_MAX and effective is None:
             planned = self.mirror.predict(target, aim - missed)
-        step = aim - missed - self.law.effective(at)  # but for creep, how far the actuators go
-        bounded = self._bounded(planned, signals, known, self._young_creep(step, ahead), error)
-        return Move(bounded, aim, travel)
+
+        def predict() -> Plan:
+            reached = aim if missed is None else aim - missed
+            # But for creep, how far the actuators go.
+            step = reached - self.law.effective(self.law.advance(state, arrival))
+            return self._bounded(planned, signals, known, self._young_creep(step, ahead), error)
+
+        return Move(signals, aim, travel, planned.max_zernike, predict)
+
+    def _inverted(
+        self, state: MemoryState, arrival: float, aim: Floats, ahead: float
+    ) -> tuple[Floats, Floats | None]:
+        """Signals (N,) for the effective signals `aim`, and what limits make them miss; None = nothing."""
+        limits, ready = self.mirror.limits, self._prepared
+        if ready is not None and ready.state is state:
+            found = ready.invert(arrival, aim, ahead)
+            if found is not None and limits.allow_neighbours(found):
+                return found, None
+        at = self.law.advance(state, arrival)
+        inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
+        if limits.allow_neighbours(inverted.signals):
+            return inverted.signals, inverted.missed
+        return self._within_neighbours(inverted.signals, at, aim)
 
     def hold(self, state: MemoryState, time: float, effective: Floats, ahead: float = 0.0) -> Floats:
         """(N,) signals, applied at `time` (s), that keep `effective` (N,) and are right `ahead` s later."""
@@ -138,11 +175,11 @@ class OpenLoop:
         """What extrapolation adds to the largest coefficient error and to the rms sag error of a move, m.
 
         Creep within `ahead` s of a step (N,) follows from the law, which no map younger than YOUNGEST_MAP_S confirms:
-        what it says of the time between is taken to be right to one half.
+        what it says of the time between is taken to be right to YOUNG_SHARE.
         """
         if not 0.0 < ahead < YOUNGEST_MAP_S:
             return 0.0, 0.0
-        share = 0.5 * self.law.creep_rate * math.log10(YOUNGEST_MAP_S / ahead)
+        share = YOUNG_SHARE * self.law.creep_rate * math.log10(YOUNGEST_MAP_S / ahead)
         return share * self._largest(step), share * float(np.linalg.norm(self.mirror.sag_root @ step))
 
     def _bounded(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dm_calibration.calibration_parameters import PARAMETERS as CALIBRATION
 from dm_calibration.interferometer_parameters import PARAMETERS as INTERFEROMETER
-from dm_controller.focus_controller_node import PARAMETERS as FOCUS_CONTROLLER
+from dm_controller.autofocus_parameters import PARAMETERS as AUTOFOCUS
+from dm_controller.focus_parameters import PARAMETERS as FOCUS_CONTROLLER
 from dm_driver.driver_parameters import PARAMETERS as DRIVER
 from dm_driver.virtual.parameters import TABLE as VIRTUAL_BENCH
 from dm_runtime.parameters import as_markdown
@@ -14,6 +15,7 @@ TABLES = {
     "interferometer": INTERFEROMETER,
     "calibration": CALIBRATION,
     "focus_controller": FOCUS_CONTROLLER,
+    "autofocus": AUTOFOCUS,
     "virtual_bench": VIRTUAL_BENCH,
 }
 

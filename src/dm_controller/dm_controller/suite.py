@@ -24,7 +24,10 @@ NODES = (
     ("interferometer", "dm_calibration.interferometer_node"),
     ("calibration", "dm_calibration.calibration_node"),
     ("focus_controller", "dm_controller.focus_controller_node"),
+    ("autofocus", "dm_controller.autofocus_node"),
 )
+#: Those that run only when the configuration has a section for them.
+OPTIONAL = ("virtual_bench", "autofocus")
 
 Config = dict[str, dict[str, Any]]
 
@@ -88,7 +91,7 @@ def own_domain() -> Iterator[int]:
 class Suite:
     """The nodes named in a configuration, each in a process of its own. Use as a context manager.
 
-    The virtual bench runs only when the configuration has a section for it.
+    The virtual bench and the autofocus run only when the configuration has a section for them.
 
     Args:
         config: {node: {parameter: value}}.
@@ -123,7 +126,7 @@ class Suite:
         parameters = self.folder / "config.yaml"
         save_config(self._config, parameters)
         for name, module in NODES:
-            if name in self._nodes and (name != "virtual_bench" or name in self._config):
+            if name in self._nodes and (name not in OPTIONAL or name in self._config):
                 self._start(name, module, parameters)
         return self
 

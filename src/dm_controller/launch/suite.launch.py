@@ -1,9 +1,10 @@
-"""Start the four nodes against hardware: ros2 launch dm_controller suite.launch.py config:=FILE."""
+"""Start the nodes against hardware: ros2 launch dm_controller suite.launch.py config:=FILE [camera:=true]."""
 
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.conditions import IfCondition
 from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -23,6 +24,7 @@ def generate_launch_description():
         [
             DeclareLaunchArgument("config", description="parameter file of all nodes, see config/hardware.yaml"),
             DeclareLaunchArgument("namespace", default_value="", description="namespace; one per mirror"),
+            DeclareLaunchArgument("camera", default_value="false", description="true: start the node autofocus too"),
             SetEnvironmentVariable(
                 "FASTRTPS_DEFAULT_PROFILES_FILE",
                 EnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", default_value=str(profile)),
@@ -38,6 +40,14 @@ def generate_launch_description():
                     output="screen",
                 )
                 for package, executable in NODES
+            ),
+            Node(
+                package="dm_controller",
+                executable="autofocus",
+                namespace=LaunchConfiguration("namespace"),
+                parameters=[LaunchConfiguration("config")],
+                output="screen",
+                condition=IfCondition(LaunchConfiguration("camera")),
             ),
         ]
     )

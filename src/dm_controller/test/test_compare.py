@@ -129,3 +129,21 @@ def test_bad_options_are_refused(fields: dict[str, object], words: str) -> None:
     with pytest.raises(UnknownNameError, match="must be one of"):
         CompareOptions(methods=("SVD",))
     assert LoopOptions().max_maps > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--method", "SVD"], "method = 'SVD': unknown; must be one of pseudo_inverse,"),
+        (["--seed", "1", "--seed", "1"], "name each seed once"),
+        (["--creep", "nan"], "'--creep'"),
+        (["--foreseen", "nan"], "'--foreseen'"),
+        (["--pixels", "10"], "'--pixels'"),
+    ],
+)
+def test_the_command_refuses_before_it_begins(arguments: list[str], words: str) -> None:
+    app = typer.Typer()
+    app.command()(command)
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code != 0
+    assert words in f"{result.output} {result.exception}"

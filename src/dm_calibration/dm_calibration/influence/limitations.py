@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import EXCITATION, MapSet
 from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED, GRADE_WEAK
 from dm_calibration.influence.regression import Design
 
@@ -19,7 +19,10 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
         tilt_known: whether the maps show the mirror's tilt.
         untested: number of maps that the cross-validation could not judge.
     """
-    sentences = ["The model is linear and without memory: hysteresis and creep stay in its error."]
+    if EXCITATION in good.kind:
+        sentences = ["The influence function acts on effective signals; hysteresis and creep are in the memory law."]
+    else:
+        sentences = ["The model is linear and without memory: hysteresis and creep stay in its error."]
     if not tilt_known:
         sentences.append(
             "The maps do not show the mirror's tilt (the interferometer's own is larger); "

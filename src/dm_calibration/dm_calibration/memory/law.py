@@ -107,7 +107,7 @@ class MemoryLaw:
         return DuhemOperator(self.duhem_slope) if self.duhem_slope.size else None
 
     @cached_property
-    def _creep_share(self) -> float:
+    def creep_share(self) -> float:
         """Weight of each creep element."""
         count = len(self.creep_time)
         if count < 2 or not self.creep_rate:
@@ -137,7 +137,7 @@ class MemoryLaw:
         elapsed = time - state.time
         if not elapsed > 0.0:
             return state
-        if not self._creep_share:
+        if not self.creep_share:
             return replace(state, time=time)
         rest = np.exp(-elapsed / self.creep_time)
         crept = state.position[:, None] + (state.crept - state.position[:, None]) * rest
@@ -155,13 +155,13 @@ class MemoryLaw:
 
     def creep(self, state: MemoryState) -> Floats:
         """(N,) the part of the effective signal that changes by itself."""
-        return np.asarray(self._creep_share * state.crept.sum(axis=1))
+        return np.asarray(self.creep_share * state.crept.sum(axis=1))
 
     def position_for(self, state: MemoryState, effective: Floats, ahead: float = 0.0) -> Floats:
         """(N,) static effective signals that, taken at the state's time, become `effective` (N,) `ahead` s later."""
         rest = np.exp(-ahead / self.creep_time)
-        faded = self._creep_share * (state.crept @ rest)
-        return np.asarray((effective - faded) / (1.0 + self._creep_share * float((1.0 - rest).sum())))
+        faded = self.creep_share * (state.crept @ rest)
+        return np.asarray((effective - faded) / (1.0 + self.creep_share * float((1.0 - rest).sum())))
 
     def position_at(self, state: MemoryState, signals: Floats) -> Floats:
         """(N,) static effective signal that a straight move from `state` to `signals` (N,) would lead to."""
@@ -245,3 +245,20 @@ def follow(
         state = law.advance(law.move(state, shape, float(start)), float(when))
         result[row] = law.effective(state)
     return result, state
+
+
+#: Random histories that tell what is always within reach, and time between their moves, s.
+HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
+
+
+def certain_reach(law: MemoryLaw, low: float, high: float) -> tuple[float, float]:
+    """Effective signals that signals of `low` .. `high` reach whatever was before: hysteresis and creep take some away.
+
+    The least of what random histories leave at either end.
+    """
+    rng = np.random.default_rng(0)
+    state = law.demagnetised(HISTORIES, 0.0, 0.5 * (low + high))
+    for _ in range(HISTORY_MOVES):
+        state = law.move(state, rng.uniform(low, high, HISTORIES), state.time + HISTORY_PAUSE_S)
+    reached = [law.effective(law.move(state, np.full(HISTORIES, end), state.time)) for end in (low, high)]
+    return float(reached[0].max()), float(reached[1].min())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -66,8 +67,15 @@ def conic_coefficients(
     """
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius = {radius} m: must be positive")
+    return disc_coefficients(
+        lambda x, y: conic_sag(radius * x, radius * y, curvature, conic_constant, shift)
+    )
+
+
+def disc_coefficients(sag: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
+    """(21,) Born & Wolf coefficients of `sag`, a function of points of the unit disc, by least squares over all of it."""
     x, y, projection = _quadrature()
-    return conic_sag(radius * x, radius * y, curvature, conic_constant, shift) @ projection
+    return sag(x, y) @ projection
 
 
 @cache

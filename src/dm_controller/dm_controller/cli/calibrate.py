@@ -17,11 +17,12 @@ class CalibrationPlan(StrEnum):
     pokes = "pokes"
     surfaces = "surfaces"
     poke_check = "poke-check"
+    memory = "memory"
 
 
 def run_calibration(client: Any, goal: Any) -> Any:
     """Run a Calibrate goal with a progress bar; returns the action's result."""
-    phases = ("degauss", "pokes", "surfaces", "fit", "store")
+    phases = ("degauss", "pokes", "surfaces", "fit", "store", "memory")
     with progress_bar() as progress:
         task = progress.add_task("calibration", total=None)
 
@@ -48,12 +49,22 @@ def show_result(result: Any) -> None:
             f"{nanometres(result.in_sample_rms):.2f} nm rms in-sample, {nanometres(result.held_out_rms):.2f} nm held "
             f"out, condition number {result.condition_number:.1f}"
         )
+    if result.memory_law:
+        console.print(
+            f"memory: {result.memory_law}, moves right to {nanometres(result.memory_held_out_max_zernike):.2f} nm "
+            f"(largest coefficient, 95 %, on moves held out){_foretold(result)}"
+        )
     for entry in result.dropped:
         console.print(f"[yellow]dropped[/] {entry}")
     for entry in result.poke_findings:
         console.print(f"[yellow]poke check[/] {entry}")
     if result.poke_check_passed:
         console.print("poke check: wiring and orientation are as configured")
+
+
+def _foretold(result: Any) -> str:
+    expected = result.expected_max_zernike
+    return f"; expected were {nanometres(expected):.2f} nm" if expected > 0.0 else ""
 
 
 def figures_of(result: Any) -> dict[str, Any]:
@@ -66,6 +77,10 @@ def figures_of(result: Any) -> dict[str, Any]:
         "in_sample_rms_nm": nanometres(result.in_sample_rms),
         "held_out_rms_nm": nanometres(result.held_out_rms),
         "condition_number": result.condition_number,
+        "memory_law": result.memory_law,
+        "memory_held_out_max_zernike_nm": nanometres(result.memory_held_out_max_zernike),
+        "expected_max_zernike_nm": nanometres(result.expected_max_zernike),
+        "expected_seconds": result.expected_duration,
         "poke_findings": list(result.poke_findings),
     }
 
@@ -78,6 +93,18 @@ def calibrate(
     amplitude: Annotated[float, typer.Option(help="Half-swing of a poke, normalised; 0 = configured.")] = 0.0,
     settle: Annotated[float, typer.Option(help="Seconds between command and map; 0 = configured.")] = 0.0,
     maps_per_state: Annotated[int, typer.Option(min=1, help="Maps averaged per state.")] = 1,
+    memory: Annotated[
+        int | None,
+        typer.Option(
+            "--memory",
+            min=60,
+            max=2000,
+            help="Identify hysteresis and creep from so many maps: short for --plan memory.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Tell duration and expected accuracy, move nothing.")
+    ] = False,
     activate: Annotated[bool, typer.Option(help="Use the new calibration at once.")] = True,
     note: Annotated[str, typer.Option(help="Stored with the calibration.")] = "",
     namespace: NamespaceOption = "",
@@ -91,8 +118,12 @@ def calibrate(
 
     from dm_controller.client import DeformableMirrorClient, DeformableMirrorError
 
+    if memory is not None:
+        plan = CalibrationPlan.memory
     goal = Calibrate.Goal(
         plan=list(CalibrationPlan).index(plan),
+        memory_maps=memory or 0,
+        dry_run=dry_run,
         surfaces=[name.strip() for name in surfaces.split(",") if name.strip()],
         poke_amplitude=amplitude,
         settle_time=settle,
@@ -107,5 +138,8 @@ def calibrate(
             if error.response is not None:
                 show_result(error.response)
             raise
-    show_result(result)
+    if dry_run:
+        console.print(result.message)
+    else:
+        show_result(result)
     write_json(json, {"calibration": figures_of(result)})

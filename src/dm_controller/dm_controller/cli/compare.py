@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -13,12 +14,14 @@ from dm_controller.cli.output import JsonOption, as_wavelengths, console, nanome
 
 
 class Plant(StrEnum):
-    """Hysteresis laws of the twin."""
+    """Hysteresis laws of the twin; `all` = all that remember, for the ablation."""
 
     none = "none"
     prandtl_ishlinskii = "prandtl_ishlinskii"
     preisach = "preisach"
     bouc_wen = "bouc_wen"
+    mixed = "mixed"
+    all = "all"
 
 
 def figures_of(comparison: Any) -> dict[str, Any]:
@@ -93,12 +96,23 @@ def compare(
         int, typer.Option(min=1, help="Maps that a closed loop may take, each followed by a correction.")
     ] = 3,
     pixels: Annotated[int, typer.Option(min=64, max=2048, help="Camera of the twin, pixels x pixels.")] = 236,
+    history: Annotated[
+        bool, typer.Option("--history", help="What each part of the memory brings: hysteresis, creep, recipes.")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="With --history: fewer maps and requests.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Compare all methods on the virtual bench: spheres from -0.05 to +0.05 1/m in random order.
 
     Runs in process, without nodes. Errors are those of the true surface, which only a twin knows.
+    With --history it is models that are compared, in open loop: any order, dwell times from 0.1 s to 10 min, tracked
+    from the calibration on, after a degauss and after a power cycle.
     """
+    if history:
+        _compare_history(plant, tuple(seed or (1,)), creep, pixels, quick, json)
+        return
+    if plant is Plant.all:
+        raise typer.BadParameter("all: only with --history", param_hint="--plant")
     from dm_controller.experiments.compare import CompareOptions, total_steps
     from dm_controller.experiments.compare import compare as run
     from dm_controller.experiments.twin_bench import TwinConfig
@@ -128,5 +142,29 @@ def compare(
         "max_maps": max_maps,
         "tolerance_nm": nanometres(options.loop.tolerance),
     } | figures_of(comparison)
+    write_json(json, figures | {"seconds": time.monotonic() - started})
+    console.print(f"done in {time.monotonic() - started:.0f} s")
+
+
+def _compare_history(
+    plant: Plant, seeds: tuple[int, ...], creep: float, pixels: int, quick: bool, json: Path | None
+) -> None:
+    from dm_controller.cli import compare_history
+    from dm_controller.experiments.ablation import PLANTS
+    from dm_controller.experiments.twin_bench import TwinConfig
+
+    if plant is Plant.none:
+        raise typer.BadParameter("none: a twin without memory has no history", param_hint="--plant")
+    started = time.monotonic()
+    plants = PLANTS if plant is Plant.all else (plant.value,)
+    result = compare_history.run(plants, seeds, TwinConfig(creep=creep, pixels=pixels), quick)
+    compare_history.show(result)
+    figures = {
+        "plant": plant.value,
+        "seeds": list(seeds),
+        "creep_per_decade": creep,
+        "ablation": compare_history.rows_of(result),
+        "identified": compare_history.identified_of(result),
+    }
     write_json(json, figures | {"seconds": time.monotonic() - started})
     console.print(f"done in {time.monotonic() - started:.0f} s")

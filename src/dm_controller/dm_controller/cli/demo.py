@@ -67,6 +67,7 @@ def bench_config(folder: Path, law: str, creep: float, seed: int, speed: float) 
         "output_folder": str(folder / "maps"),
     }
     config["pdm_driver"]["electronics.port"] = tcp
+    config["pdm_driver"]["state_folder"] = str(folder / "driver")
     command = [str(trigger) if part == "12343" else part for part in config["interferometer"]["trigger_command"]]
     config["interferometer"] |= {"watch_folder": str(folder / "maps"), "trigger_command": command}
     config["calibration"] |= {"calibration_folder": str(folder / "calibrations"), "load_on_start": ""}
@@ -150,11 +151,11 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
     return rows
 
 
-def show_sweep(rows: list[dict[str, Any]], fitting_limit: float) -> None:
+def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> None:
     """Print the table: predicted, re-measured, limit."""
     from rich.table import Table
 
-    table = Table(title="open-loop focus: predicted before the move, re-measured after it")
+    table = Table(title=f"open-loop focus, {how}: predicted before the move, re-measured after it")
     for heading in (
         "curvature 1/m",
         "dioptre",
@@ -183,6 +184,35 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float) -> None:
     )
 
 
+def remember(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str, Any]]]:
+    """Identify hysteresis and creep, wipe the memory, sweep again; returns the result of the run and the rows."""
+    from dm_msgs.action import Calibrate
+
+    from dm_controller.cli.calibrate import run_calibration, show_result
+
+    goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_MEMORY, memory_maps=maps, activate=True, note="demo, memory")
+    result = run_calibration(client, goal)
+    show_result(result)
+    if not client.wait(lambda: client.capabilities.calibration_id == result.id):
+        raise RuntimeError("the focus controller did not take the new calibration")
+    client.degauss()
+    return result, sweep(client, settle)
+
+
+def rows_for_json(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The figures of a sweep."""
+    return [
+        {
+            "curvature": row["curvature"],
+            "predicted_rms_nm": nanometres(row["prediction"].predicted_rms),
+            "measured_rms_nm": nanometres(row["error"].rms),
+            "max_zernike_nm": nanometres(row["error"].max_zernike),
+            "saturated": row["prediction"].saturated,
+        }
+        for row in rows
+    ]
+
+
 def demo(
     hysteresis: Annotated[
         Hysteresis, typer.Option(help="Law of the twin's actuators; `off` = ideal ones, without creep too.")
@@ -192,12 +222,23 @@ def demo(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the twin.")] = 1,
     speed: Annotated[float, typer.Option(min=0.0, help="How much faster than real time; 0 = real time.")] = 20.0,
+    memory_maps: Annotated[
+        int, typer.Option(min=0, help="Maps to identify hysteresis and creep from; 0 = leave that out.")
+    ] = 200,
     map_file: Annotated[Path | None, typer.Option("--map", help="A real ZYGO file to ingest first.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for logs, calibration and picture.")] = Path("runs/demo"),
     keep_maps: Annotated[bool, typer.Option(help="Keep the map files (about 4 MB each).")] = False,
+    camera: Annotated[
+        bool, typer.Option("--camera", help="Autofocus a virtual camera behind the mirror on three objects instead.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Calibrate a virtual PDM30-37 through the real nodes, wire protocol and file formats, then focus it."""
+    if camera:
+        from dm_controller.cli.demo_camera import demo_camera
+
+        demo_camera(hysteresis, creep, seed, speed, out, json)
+        return
     from dm_msgs.action import Calibrate
 
     from dm_controller.cli.calibrate import figures_of, run_calibration, show_result
@@ -235,27 +276,26 @@ def demo(
                 console.print(f"reachable: {client.capabilities.message}")
                 mirror = client.mirror_info
                 fitting_limit = best_possible(client.latest("calibration"), mirror)
-                rows = sweep(client, settle=float(config["calibration"]["settle_time"]))
+                settle = float(config["calibration"]["settle_time"])
+                rows, without_memory = sweep(client, settle), []
+                if memory_maps and (hysteresis is not Hysteresis.off or actual_creep):
+                    show_sweep(rows, fitting_limit, "influence function alone")
+                    without_memory = rows
+                    remembering, rows = remember(client, memory_maps, settle)
+                    figures["memory"] = figures_of(remembering)
+                    figures["focus_without_memory"] = rows_for_json(without_memory)
             except Exception:
                 suite.check()  # a node that died explains more than the request that failed
                 raise
-    show_sweep(rows, fitting_limit)
-    picture = save_sweep_figure(rows, folder / "demo.png", f"PDM30-37 twin, hysteresis: {hysteresis.value}", mirror)
+    show_sweep(rows, fitting_limit, "hysteresis and creep inverted" if without_memory else "influence function alone")
+    title = f"PDM30-37 twin, hysteresis: {hysteresis.value}"
+    picture = save_sweep_figure(rows, folder / "demo.png", title, mirror, without_memory)
     console.print(f"picture: {os.path.relpath(picture)}")
     if not keep_maps:
         shutil.rmtree(folder / "maps")
     figures |= {
         "calibration": figures_of(result) | {"seconds": wall_time, "bench_seconds": result.duration},
-        "focus": [
-            {
-                "curvature": row["curvature"],
-                "predicted_rms_nm": nanometres(row["prediction"].predicted_rms),
-                "measured_rms_nm": nanometres(row["error"].rms),
-                "max_zernike_nm": nanometres(row["error"].max_zernike),
-                "saturated": row["prediction"].saturated,
-            }
-            for row in rows
-        ],
+        "focus": rows_for_json(rows),
         "fitting_limit_nm": nanometres(fitting_limit),
         "seconds": time.monotonic() - started,
     }

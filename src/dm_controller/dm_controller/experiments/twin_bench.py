@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.sampling import edge_clustered_points, sample_map
 from dm_calibration.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure import Measurement, Procedure, ProcedureOptions, Progress
+from dm_controller.experiments.twin_config import TwinConfig
 from dm_controller.model import InfluenceModel
 from dm_controller.solvers.bounded import Limits
 from dm_driver.degauss import degauss_waypoints
@@ -40,45 +40,8 @@ Floats = NDArray[np.float64]
 
 #: Pixels of the instrument that speck counts are stated for.
 FULL_CAMERA = InterferometerConfig().pixels
-
-
-@dataclass(frozen=True)
-class TwinConfig:
-    """Which twin, and how it is operated.
-
-    Attributes:
-        law: hysteresis law: none, prandtl_ishlinskii, preisach or bouc_wen.
-        seed: of gains, figure and noise.
-        hysteresis: loop opening as a share of the stroke.
-        creep: per decade of time.
-        pixels: the camera has pixels x pixels; a small one is quicker, its terms hardly noisier, for the low-order
-            noise of an interferometer does not average out.
-        samples: sampling points.
-        settle_time: between command and map, s.
-        exposure: one map takes this long, s.
-        degauss_steps: half-swings of a degauss.
-        neighbour_difference: largest difference between neighbours, normalised.
-    """
-
-    law: str = "prandtl_ishlinskii"
-    seed: int = 1
-    hysteresis: float = 0.10
-    creep: float = 0.01
-    pixels: int = 236
-    samples: int = 500
-    settle_time: float = 0.5
-    exposure: float = 0.5
-    degauss_steps: int = 100
-    neighbour_difference: float = 2.0
-
-    def __post_init__(self) -> None:
-        if self.pixels < 64:
-            raise ValueError(f"pixels = {self.pixels}: must be at least 64, or the terms cannot be told apart well")
-        for name in ("settle_time", "exposure"):
-            if not getattr(self, name) >= 0.0:
-                raise ValueError(f"{name} = {getattr(self, name)} s: must not be negative")
-        if self.degauss_steps < 1:
-            raise ValueError(f"degauss_steps = {self.degauss_steps}: must be at least 1")
+#: Shortest time between two reports of the driver during a degauss, s.
+REPORT_INTERVAL_S = 0.02
 
 
 class TwinBench:
@@ -92,6 +55,7 @@ class TwinBench:
         limits: what solvers are told of it.
         time: s since the start.
         maps: maps taken so far.
+        reports: what the driver would have reported after each move, from the first power-on.
     """
 
     def __init__(self, config: TwinConfig | None = None) -> None:
@@ -129,9 +93,10 @@ class TwinBench:
         self._written: Floats = self._drive.signals()
         self._turns = self._degausses = 0
         self._turned_at: Floats | None = None
-        self._moved = 0.0
-        self.time = 0.0
+        self.time = self._moved = 0.0
         self.maps = 0
+        self.reports: list[Applied] = []
+        self._report()
         self.mirror = Mirror(
             "PDM30-37",
             f"twin-{config.seed}",
@@ -150,6 +115,7 @@ class TwinBench:
         other._noise = copy.deepcopy(self._noise)
         other._interferometer = self._interferometer.with_noise(other._noise)
         other._fitter = None
+        other.reports = list(self.reports)
         return other
 
     # --- dm_calibration.procedure.Bench ---
@@ -158,9 +124,15 @@ class TwinBench:
         """Wipe the hysteresis memory as the driver does, and end at mid range."""
         rest = self.mirror.rest
         points = degauss_waypoints(len(rest), float(rest[0]), 1.0, self.config.degauss_steps, rest)
-        self._write(list(self._limiter.path(self._written, points)))
+        told = -REPORT_INTERVAL_S
+        for shape in list(self._limiter.path(self._written, points)):
+            self._write([shape])
+            if self.time - told >= REPORT_INTERVAL_S:
+                told = self.time
+                self._report(known=False)
         self._turns, self._degausses = self._turns + 1, self._degausses + 1
-        self._turned_at, self._moved = self._written, self.time
+        self._turned_at = self._drive.signals()
+        self._report()
 
     def apply(self, signals: Floats) -> Floats:
         """Ramp to `signals` (N,) by the driver's limiter, through the codes of the DAC; returns what was written.
@@ -172,7 +144,7 @@ class TwinBench:
         if not np.array_equal(target, self._written):
             self._turns, self._turned_at = self._turns + 1, self._drive.signals()
         self._write(list(self._limiter.ramp(self._written, target)))
-        self._moved = self.time
+        self._report()
         return self._drive.signals()
 
     def power_cycle(self, off: float) -> None:
@@ -182,18 +154,20 @@ class TwinBench:
         self._piezo.apply(self._written, self.time)
         self.time += off
         self._turns = self._degausses = 0
-        self._turned_at, self._moved = None, self.time
+        self._turned_at = None
+        self._report()
 
-    def report(self) -> Applied:
-        """What the driver would report now."""
-        return Applied(
-            self._moved, self._drive.signals(), self._turns, self._turned_at, self._degausses, self._degausses > 0
+    def _report(self, known: bool = True) -> None:
+        known = known and self._degausses > 0
+        self.reports.append(
+            Applied(self.time, self._drive.signals(), self._turns, self._turned_at, self._degausses, known)
         )
 
     def _write(self, shapes: list[Floats]) -> None:
         for shape in shapes:
             self._drive.take_edac40(EdacFrame(EDAC40_VALUE, self._channels, self._scale.codes(shape)))
             self._piezo.apply(self._drive.signals(), self.time)
+            self._moved = self.time
             self.time += self._limiter.pause_after(self._written, shape)
             self._written = shape
 
@@ -245,6 +219,7 @@ class TwinBench:
             coefficients=fit.coefficients,
             sigma=fit.sigma,
             stamp_ns=round(self.time * 1e9),
+            moved_ns=round(self._moved * 1e9),
             residual_rms=fit.residual_rms,
             valid_fraction=fit.valid_fraction,
             radius=aperture.radius_px * self.pitch,
@@ -322,3 +297,6 @@ def influence_model(fit: InfluenceFit, aperture_radius: float) -> InfluenceModel
         held_out_rms=fit.held_out_rms,
         held_out_max_zernike=fit.held_out_max_zernike,
     )
+
+
+__all__ = ["Floats", "TwinBench", "TwinConfig", "influence_model", "plan_steps"]

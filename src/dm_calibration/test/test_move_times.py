@@ -1,0 +1,64 @@
+"""When the mirror moved between two maps: creep depends on it, and not every file tells it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.memory.features import crept, play_features
+from dm_calibration.memory.law import CREEP_TIMES, MemoryLaw, certain_reach, follow
+from dm_calibration.optics.sampling import edge_clustered_points
+
+RATE = 0.02
+LAW = MemoryLaw(np.zeros(1), np.ones((1, 1)), np.zeros(0), 0.0, RATE, CREEP_TIMES)
+SIGNALS = np.array([[0.5], [-0.5], [0.8], [0.8]])
+TIME = np.array([1.0, 4.0, 9.0, 60.0])
+MOVED = np.array([0.2, 3.5, 4.0, 9.0])
+
+
+@pytest.mark.parametrize("moved", [None, MOVED])
+def test_features_and_law_creep_alike(moved: np.ndarray | None) -> None:
+    values = play_features(SIGNALS, np.zeros(1), 1)
+    effective, _ = follow(LAW, LAW.demagnetised(1, 0.0), SIGNALS, TIME, moved)
+    assert effective == pytest.approx((values + RATE * crept(values, TIME, 0.0, moved))[:, 0], abs=1e-12)
+
+
+def test_a_later_move_has_crept_less() -> None:
+    rested = LAW.demagnetised(1, 0.0)
+    at_once = follow(LAW, rested, SIGNALS[:1], TIME[:1])[0]
+    late = follow(LAW, rested, SIGNALS[:1], TIME[:1], np.array([0.9]))[0]
+    # From 1 s to 0.1 s after a step of 0.5: one decade less.
+    assert (at_once - late)[0, 0] == pytest.approx(RATE * 0.5, rel=0.2)
+
+
+def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
+    points = edge_clustered_points(30)
+    record = MapRecord(
+        "a", "excitation", 0, np.zeros(2), np.zeros(2), 10**9, np.zeros(21), np.zeros(21), np.zeros(30), 0.0, 1.0
+    )
+    times = [
+        (1, 0),
+        (3, 2),
+        (5, 0),
+        (7, 1),
+        (9, 10),
+    ]  # s of map and move: told, not told, before the last map, after it
+    records = [
+        replace(record, label=str(k), stamp_ns=stamp * 10**9, moved_ns=moved * 10**9)
+        for k, (stamp, moved) in enumerate(times)
+    ]
+    assert MapSet.from_records(records, points).moved_s() == pytest.approx([0.0, 1.0, 2.0, 4.0, 6.0])
+
+
+def test_what_is_certainly_within_reach_leaves_room_for_hysteresis_and_creep() -> None:
+    assert certain_reach(MemoryLaw.linear(), -1.0, 0.5) == pytest.approx((-1.0, 0.5))
+    low, high = certain_reach(LAW, -1.0, 1.0)
+    assert -1.0 < low < -0.85 and 0.85 < high < 1.0
+    rng = np.random.default_rng(7)
+    state = LAW.demagnetised(50, 0.0)
+    for _ in range(20):
+        state = LAW.move(state, rng.uniform(-1.0, 1.0, 50), state.time + 600.0)
+    assert LAW.effective(LAW.move(state, np.ones(50), state.time)).min() > high - 0.01

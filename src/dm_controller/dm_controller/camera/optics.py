@@ -1,0 +1,187 @@
+"""Thin optics of a camera behind a deformable mirror: object distance, dioptre and curvature, each from the others.
+
+The path: object, an afocal relay (or none), mirror, lens, sensor. Vergences are 1 / distance in dioptre. An object at
+distance s in front of the entrance pupil arrives with the vergence -1/s, which a relay that widens the beam m times
+makes -1/(m^2 s). A mirror of curvature c adds 2 c k: k = 1 at normal incidence; at the angle of incidence i a sphere
+has the powers 2 c / cos i and 2 c cos i in its two planes, and k is their mean, (1/cos i + cos i) / 2. What then
+focuses on the sensor is fixed by the lens: an object at vergence -V at the mirror, V the rest vergence, is sharp while
+the mirror is flat. Hence an object is in focus when
+
+    1/s = m^2 (2 c k + V),
+
+linear in c. A lens of focal length f whose sensor stands a distance b behind it, at a distance d behind the mirror,
+focuses on the vergence -N with N = 1/f - 1/b at itself, and on V = N / (1 - d N) at the mirror (the vergence v becomes
+v / (1 - d v) over the path d).
+
+Conventions: distances of objects in m from the camera's reference point; dioptre = 1 / distance, 0 = infinity, as in
+libcamera (`LensPosition`) and Android (`LENS_FOCUS_DISTANCE`); positive curvature = concave; mirror power = 2 x
+curvature. Source: Born & Wolf, Principles of Optics, 7th ed., sections 4.4 and 4.6 (oblique powers by Coddington).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+class OpticsError(ValueError):
+    """A distance, dioptre or optical parameter outside its range; the message names field, value and range."""
+
+
+@dataclass(frozen=True)
+class FocusOptics:
+    """Where the camera focuses for a curvature of the mirror.
+
+    Attributes:
+        rest_dioptre: V, vergence at the mirror that is in focus while the mirror is flat [1/m].
+        relay_magnification: m, diameter of the beam on the mirror / diameter of the entrance pupil.
+        incidence: angle of incidence on the mirror [rad], 0 <= incidence < pi/2.
+        pupil_offset: how far the entrance pupil lies behind the point that object distances count from [m].
+
+    Raises:
+        OpticsError: a value that is not finite or outside its range.
+    """
+
+    rest_dioptre: float = 0.0
+    relay_magnification: float = 1.0
+    incidence: float = 0.0
+    pupil_offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("rest_dioptre", "pupil_offset"):
+            if not math.isfinite(getattr(self, name)):
+                raise OpticsError(f"{name} = {getattr(self, name)}: must be finite")
+        if not (math.isfinite(self.relay_magnification) and self.relay_magnification > 0):
+            raise OpticsError(f"relay_magnification = {self.relay_magnification}: must be above 0")
+        if not 0 <= self.incidence < math.pi / 2:
+            raise OpticsError(f"incidence = {self.incidence} rad: must be from 0 to below pi/2")
+
+    @classmethod
+    def from_rest_distance(
+        cls,
+        rest_distance: float,
+        relay_magnification: float = 1.0,
+        incidence: float = 0.0,
+        pupil_offset: float = 0.0,
+    ) -> FocusOptics:
+        """The optics of a camera that is in focus at `rest_distance` (m, 0 or inf = infinity) while the mirror is flat.
+
+        Raises:
+            OpticsError: see `pupil_dioptre` and the class.
+        """
+        blank = cls(0.0, relay_magnification, incidence, pupil_offset)
+        rest = blank._pupil_dioptre(dioptre_of(rest_distance, "rest_distance"))
+        return cls(rest / relay_magnification**2, relay_magnification, incidence, pupil_offset)
+
+    def curvature_for(self, dioptre: float) -> float:
+        """Curvature [1/m] that focuses on the dioptre 1 / distance [1/m]; below 0 = beyond infinity.
+
+        Raises:
+            OpticsError: not finite, or an object inside the camera (`pupil_offset` < 0).
+        """
+        if not math.isfinite(dioptre):
+            raise OpticsError(f"dioptre = {dioptre}: must be finite")
+        vergence = self._pupil_dioptre(dioptre) / self.relay_magnification**2
+        return (vergence - self.rest_dioptre) / (2 * self._oblique)
+
+    def dioptre_for(self, curvature: float) -> float:
+        """Dioptre 1 / distance [1/m] in focus at a curvature [1/m]; below 0 = beyond infinity, NaN = inside the camera.
+
+        NaN means: even an object at the reference point lies farther than the focus (`pupil_offset` > 0).
+
+        Raises:
+            OpticsError: the curvature is not finite.
+        """
+        if not math.isfinite(curvature):
+            raise OpticsError(f"curvature = {curvature} 1/m: must be finite")
+        at_pupil = self.relay_magnification**2 * (2 * curvature * self._oblique + self.rest_dioptre)
+        rest = 1 - at_pupil * self.pupil_offset
+        return at_pupil / rest if rest > 0 else math.nan
+
+    def curvature_for_distance(self, distance: float) -> float:
+        """Curvature [1/m] that focuses on an object at `distance` (m, 0 or inf = infinity).
+
+        Raises:
+            OpticsError: negative or NaN distance, or an object inside the camera.
+        """
+        return self.curvature_for(dioptre_of(distance))
+
+    def distance_for(self, curvature: float) -> float:
+        """Distance [m] in focus at a curvature [1/m]; inf = infinity or beyond, NaN as in `dioptre_for`."""
+        return distance_of(self.dioptre_for(curvature))
+
+    @property
+    def _oblique(self) -> float:
+        return (1 / math.cos(self.incidence) + math.cos(self.incidence)) / 2
+
+    def _pupil_dioptre(self, dioptre: float) -> float:
+        """1 / (distance + pupil_offset) from 1 / distance."""
+        scale = 1 + dioptre * self.pupil_offset
+        if scale <= 0:
+            raise OpticsError(
+                f"dioptre = {dioptre:g} 1/m: the object would lie inside the camera; with a pupil offset of "
+                f"{self.pupil_offset:g} m it must be {'below' if self.pupil_offset < 0 else 'above'} "
+                f"{-1 / self.pupil_offset:g} 1/m"
+            )
+        return dioptre / scale
+
+
+def dioptre_of(distance: float, name: str = "distance") -> float:
+    """1 / distance; a distance [m] of 0 or inf means infinity, dioptre 0.
+
+    Raises:
+        OpticsError: negative or NaN.
+    """
+    if math.isnan(distance) or distance < 0:
+        raise OpticsError(f"{name} = {distance} m: must be above 0, or 0 or inf for infinity")
+    return 1 / distance if distance > 0 and math.isfinite(distance) else 0.0
+
+
+def distance_of(dioptre: float) -> float:
+    """1 / dioptre [m]; inf from 0 on down (infinity and beyond), NaN stays."""
+    return math.nan if math.isnan(dioptre) else 1 / dioptre if dioptre > 0 else math.inf
+
+
+def rest_dioptre_of_lens(focal_length: float, sensor_distance: float, mirror_distance: float = 0.0) -> float:
+    """Rest vergence V [1/m] at the mirror of a lens and its sensor: the closed form at the head of this module.
+
+    Args:
+        focal_length: of the lens, f [m], above 0.
+        sensor_distance: from lens to sensor, b [m], above 0; equal to f = the lens stands at infinity.
+        mirror_distance: from mirror to lens, d [m], 0 or more.
+
+    Raises:
+        OpticsError: a value outside its range, or a lens that focuses between itself and the mirror.
+    """
+    if not (math.isfinite(focal_length) and focal_length > 0):
+        raise OpticsError(f"focal_length = {focal_length} m: must be above 0")
+    if not (math.isfinite(sensor_distance) and sensor_distance > 0):
+        raise OpticsError(f"sensor_distance = {sensor_distance} m: must be above 0")
+    if not (math.isfinite(mirror_distance) and mirror_distance >= 0):
+        raise OpticsError(f"mirror_distance = {mirror_distance} m: must be 0 or more")
+    at_lens = 1 / focal_length - 1 / sensor_distance
+    if mirror_distance * at_lens >= 1:
+        raise OpticsError(
+            f"sensor_distance = {sensor_distance:g} m: the lens focuses {1 / at_lens:g} m in front of itself, "
+            f"between itself and the mirror {mirror_distance:g} m away"
+        )
+    return at_lens / (1 - mirror_distance * at_lens)
+
+
+def depth_of_focus(aperture_radius: float, wavelength: float = 550e-9) -> float:
+    """Curvature [1/m] off the best focus at which the wavefront is a quarter wave off at the edge: lambda / (4 a^2).
+
+    The wavefront of the curvature error e is e r^2 (twice the sag e r^2 / 2); Rayleigh's criterion (Born & Wolf,
+    section 9.3) sets it to lambda / 4 at the edge a of the aperture.
+
+    Args:
+        aperture_radius: a of the beam on the mirror [m], above 0.
+        wavelength: [m], above 0.
+
+    Raises:
+        OpticsError: a value outside its range.
+    """
+    for name, value in (("aperture_radius", aperture_radius), ("wavelength", wavelength)):
+        if not (math.isfinite(value) and value > 0):
+            raise OpticsError(f"{name} = {value} m: must be above 0")
+    return wavelength / (4 * aperture_radius**2)

@@ -1,0 +1,245 @@
+"""Search of the sharpest focus: a state machine that is fed sharpness and says where to look next.
+
+It knows nothing of cameras, mirrors or time. Whoever drives it goes to `step.curvature`, takes an image there when
+`step.measured` says so, and calls `feed`.
+
+Coarse to fine (Krotkov 1987; He, Zhou and Hong, Comput. Graph. 27 (2003) 999): a sweep over the whole range finds the
+hill, sweeps over two steps of the one before climb it, a parabola through the best points of the last gives its top.
+Every sweep, and the final move to the top, first goes to the same turning point below: by default the low end of the
+range. Hysteresis forgets what lies between two turning points once it is passed again, so that all of them rise on the
+same branch. Without that the hill that a long sweep saw is not where a short one looks for it. A sweep that sees the
+hill rise beyond its own end is repeated around that end.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+
+#: Standard deviations of noise that the top of a hill must stand above the median of its sweep.
+SIGNIFICANCE = 6.0
+#: Points from which on noise can be told from a hill.
+TELLING = 11
+#: Sweeps that may be repeated around their own end, per search.
+MOST_SHIFTS = 8
+#: Share of the range that is given up where the mirror refuses its end, and how often.
+RETREAT = 0.03
+MOST_REFUSALS = 12
+
+
+class Phase(IntEnum):
+    """The same numbers as in dm_msgs/AutofocusState."""
+
+    IDLE = 0
+    COARSE = 1
+    FINE = 2
+    TRACK = 3
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where to go [1/m]; `measured` False: only pass through, no image is needed."""
+
+    curvature: float
+    measured: bool = True
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """How to search.
+
+    Attributes:
+        low, high: range of curvatures [1/m], low < high.
+        tolerance: depth of focus: steps are not made finer than this [1/m], above 0.
+        coarse_points: positions of the first sweep, at least 4.
+        fine_points: positions of each later sweep, at least 5.
+        approach: how far below its first position a sweep begins [1/m], 0 or more; never below `low`; inf = at `low`.
+        least_contrast: relative rise of the sharpest coarse image over the dullest below which there is no hill, 0..1.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    low: float
+    high: float
+    tolerance: float
+    coarse_points: int = 11
+    fine_points: int = 7
+    approach: float = math.inf
+    least_contrast: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise ValueError(f"range of curvatures = {self.low} to {self.high} 1/m: must be finite and rising")
+        if not (math.isfinite(self.tolerance) and self.tolerance > 0):
+            raise ValueError(f"tolerance = {self.tolerance} 1/m: must be above 0")
+        if self.coarse_points < 4:
+            raise ValueError(f"coarse_points = {self.coarse_points}: must be at least 4")
+        if self.fine_points < 5:
+            raise ValueError(f"fine_points = {self.fine_points}: must be at least 5")
+        if not self.approach >= 0:
+            raise ValueError(f"approach = {self.approach} 1/m: must be 0 or more")
+        if not 0 <= self.least_contrast < 1:
+            raise ValueError(f"least_contrast = {self.least_contrast}: must be from 0 to below 1")
+
+    @property
+    def steps(self) -> int:
+        """Measured positions of a search that need not shift a sweep; each shift is one sweep more."""
+        spacing = (self.high - self.low) / (self.coarse_points - 1)
+        sweeps = 0
+        while spacing > self.tolerance:
+            spacing *= 2 / (self.fine_points - 1)
+            sweeps += 1
+        return self.coarse_points + max(sweeps, 1) * self.fine_points
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Where the image is sharpest.
+
+    Attributes:
+        curvature: [1/m].
+        sharpness: the largest seen in the last sweep.
+        at_limit: the top lies at an end of the range: a sharper focus may lie beyond.
+    """
+
+    curvature: float
+    sharpness: float
+    at_limit: bool
+
+
+class PeakSearch:
+    """One search from beginning to end.
+
+    Attributes:
+        step: where to look next; after the end, the curvature to stand at.
+        config: as given, the range as far as it was not refused.
+        phase: COARSE or FINE.
+        done: nothing more is to be fed.
+        peak: what was found; None while it runs, and at its end when there was no hill.
+        measured: positions measured so far.
+    """
+
+    def __init__(self, config: SearchConfig) -> None:
+        self.config = config
+        self.phase = Phase.COARSE
+        self.done = False
+        self.peak: Peak | None = None
+        self.measured = 0
+        self.step: Step
+        self._positions: np.ndarray
+        self._shifts = self._refusals = 0
+        self._begin(config.low, config.high, config.coarse_points)
+
+    def feed(self, sharpness: float | None) -> None:
+        """Report the sharpness at `step`; None when it was not to be measured.
+
+        Raises:
+            ValueError: no finite number where one is needed, or the search is done.
+        """
+        if self.done:
+            raise ValueError("sharpness: the search is done, it takes no more")
+        if not self.step.measured:
+            if self.phase is Phase.FINE and self.peak is not None:
+                self.step, self.done = Step(self.peak.curvature), True
+            else:
+                self.step = Step(float(self._positions[0]))
+            return
+        if sharpness is None or not math.isfinite(sharpness):
+            raise ValueError(f"sharpness = {sharpness}: must be a finite number")
+        self._seen.append(sharpness)
+        self.measured += 1
+        if len(self._seen) < len(self._positions):
+            self.step = Step(float(self._positions[len(self._seen)]))
+        else:
+            self._judge(np.array(self._seen))
+
+    def refuse(self) -> None:
+        """Report that the mirror cannot take `step`: the range ends before it. At most MOST_REFUSALS times.
+
+        Raises:
+            ValueError: refused too often, or hardly anything of the range is left.
+        """
+        self._refusals += 1
+        config, seen = self.config, len(self._seen)
+        if self._refusals > MOST_REFUSALS:
+            raise ValueError(f"range = {config.low:+.4f} to {config.high:+.4f} 1/m: the mirror refuses too much of it")
+        if self.step.measured and self.phase is Phase.COARSE and seen >= 4:
+            self.config = replace(config, high=float(self._positions[seen - 1]))
+            self._positions = self._positions[:seen]
+            self._judge(np.array(self._seen))
+            return
+        give_up = RETREAT * (config.high - config.low)
+        middle = (config.low + config.high) / 2
+        if self.step.curvature < middle:
+            self.config = replace(config, low=config.low + give_up)
+        else:
+            self.config = replace(config, high=config.high - give_up)
+        low, high = max(float(self._positions[0]), self.config.low), min(float(self._positions[-1]), self.config.high)
+        if self.done or high - low < 2 * config.tolerance:
+            raise ValueError(f"range = {low:+.4f} to {high:+.4f} 1/m: too little of it is left")
+        self.peak = None
+        self._begin(low, high, len(self._positions))
+
+    def _begin(self, low: float, high: float, points: int) -> None:
+        self._positions = np.linspace(low, high, points)
+        self._seen: list[float] = []
+        self._run_up = max(low - self.config.approach, self.config.low)
+        self.step = Step(self._run_up, measured=False)
+
+    def _judge(self, seen: np.ndarray) -> None:
+        """A sweep is complete: end, or narrow down."""
+        best = int(seen.argmax())
+        spacing = float(self._positions[1] - self._positions[0])
+        if self.phase is Phase.COARSE and not _is_hill(seen, self.config.least_contrast):
+            self.done, self.step = True, Step(float(self._positions[-1]))
+        elif self.phase is Phase.FINE and self._rises_beyond(best) and self._shifts < MOST_SHIFTS:
+            self._shifts += 1
+            self._around(float(self._positions[best]), float(np.ptp(self._positions)) / 2)
+        elif self.phase is Phase.FINE and spacing <= self.config.tolerance:
+            top = _vertex(self._positions, seen)
+            near_end = min(top - self.config.low, self.config.high - top) < spacing / 2
+            self.peak = Peak(top, float(seen[best]), near_end)
+            self.step = Step(self._run_up, measured=False)
+        else:
+            self.phase = Phase.FINE
+            self._around(float(self._positions[best]), spacing)
+
+    def _rises_beyond(self, best: int) -> bool:
+        """Whether the largest value stands at an end of the sweep that is no end of the range."""
+        first, last = self._positions[0], self._positions[-1]
+        return (best == 0 and first > self.config.low) or (best == len(self._positions) - 1 and last < self.config.high)
+
+    def _around(self, centre: float, reach: float) -> None:
+        low, high = max(centre - reach, self.config.low), min(centre + reach, self.config.high)
+        self._begin(low, high, self.config.fine_points)
+
+
+def _is_hill(seen: np.ndarray, least_contrast: float) -> bool:
+    """Whether a sweep rises by the least contrast, and by more than noise does.
+
+    The noise is told from the second differences: those of a hill are small, or large at a few points only, which the
+    median passes over. The top of n points of white noise lies some two standard deviations above their median. Of
+    fewer than TELLING points a hill may take most, and only the contrast counts.
+    """
+    top = float(seen.max())
+    rise = top - float(np.median(seen))
+    bends = np.abs(np.diff(seen, 2))
+    noise = float(np.median(bends)) / (0.6745 * math.sqrt(6))
+    significant = len(seen) < TELLING or rise > SIGNIFICANCE * noise
+    return float(np.ptp(seen)) > least_contrast * abs(top) and significant
+
+
+def _vertex(positions: np.ndarray, values: np.ndarray) -> float:
+    """Top of the parabola through the five points around the largest value, inside them; that value's place if none."""
+    best = int(values.argmax())
+    first = min(max(best - 2, 0), len(values) - 5)
+    x = positions[first : first + 5] - positions[best]
+    scale = float(np.ptp(x))
+    square, slope, _constant = np.polyfit(x / scale, values[first : first + 5], 2)
+    if square >= 0:
+        return float(positions[best])
+    return float(positions[best] + np.clip(-slope / (2 * square) * scale, x[0], x[-1]))

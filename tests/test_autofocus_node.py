@@ -1,0 +1,249 @@
+"""Node `autofocus` as a process over DDS; the test plays controller, driver and a camera that blurs with the focus."""
+
+from __future__ import annotations
+
+import array
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from dm_msgs.action import Autofocus
+from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
+from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
+from rclpy.qos import qos_profile_sensor_data
+from scipy.ndimage import gaussian_filter
+from sensor_msgs.msg import Image
+
+from dm_controller.camera.optics import FocusOptics
+from dm_runtime import qos
+from support import NodeProcess, Observer, wait_until
+
+REST_DISTANCE = 10.0
+OPTICS = FocusOptics.from_rest_distance(REST_DISTANCE)
+LOW, HIGH, RADIUS = -0.05, 0.05, 0.011
+#: How long the played mirror moves [s]; its images meanwhile are sharper than any settled one.
+MOVE_TIME = 0.03
+PARAMETERS = {
+    "optics.rest_distance": REST_DISTANCE,
+    "region": [0.0, 0.0, 1.0, 1.0],
+    "settle_time": 0.0,
+    "move_timeout": 3.0,
+}
+
+
+class Bench:
+    """Controller, driver and camera. The scene is one textured plane, in focus at `object_curvature`."""
+
+    def __init__(self, observer: Observer, object_curvature: float, rate: float = 100.0) -> None:
+        self.node = observer.node
+        self.object_curvature = object_curvature
+        self.refuse_beyond = HIGH
+        self.requests: list[FocusRequest] = []
+        self.texture = 100 + 40 * np.random.default_rng(5).standard_normal((48, 64))
+        self._lock = threading.Lock()
+        self._noise = np.random.default_rng(6)
+        self._curvature = 0.0
+        self._stands_at = 0.0
+        self._pending: FocusState | None = None
+        self._image = self.node.create_publisher(Image, "image_raw", qos_profile_sensor_data)
+        self._state = self.node.create_publisher(FocusState, "focus_state", qos.STATE)
+        self._driver = self.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+        self._capabilities = self.node.create_publisher(Capabilities, "capabilities", qos.LATCHED)
+        self.request = self.node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
+        self.node.create_subscription(FocusRequest, "focus_request", self._on_request, qos.COMMAND)
+        self.node.create_service(SetFocus, "set_focus", self._on_set_focus)
+        self.states: list[AutofocusState] = observer.record(AutofocusState, "autofocus_state", qos.STATE)
+        self._stop = threading.Event()
+        self._camera = threading.Thread(target=self._film, args=(1 / rate,), daemon=True)
+
+    def __enter__(self) -> Bench:
+        capabilities = Capabilities(
+            quality=Capabilities.CALIBRATED, curvature_min=LOW, curvature_max=HIGH, aperture_radius=RADIUS
+        )
+        self._capabilities.publish(capabilities)
+        self._camera.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._stop.set()
+        self._camera.join()
+
+    def _judge(self, request: FocusRequest) -> FocusState:
+        state = FocusState(curvature=request.curvature, signals=[request.curvature] * 3)
+        state.applied = abs(request.curvature) <= self.refuse_beyond
+        state.header.stamp = self.node.get_clock().now().to_msg()
+        if not state.applied:
+            state.error_code, state.message = ErrorCode.UNREACHABLE, "curvature: beyond the played range"
+        return state
+
+    def _on_request(self, request: FocusRequest) -> None:
+        self.requests.append(request)
+        state = self._judge(request)
+        if state.applied:
+            with self._lock:
+                self._curvature, self._pending = request.curvature, state
+                self._stands_at = time.monotonic() + MOVE_TIME
+        self._state.publish(state)
+
+    def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
+        response.state = self._judge(request.request)
+        response.error_code, response.message = response.state.error_code, response.state.message
+        return response
+
+    def _film(self, period: float) -> None:
+        while not self._stop.wait(period):
+            with self._lock:
+                exposed = self.node.get_clock().now().to_msg()
+                moving = time.monotonic() < self._stands_at
+                off = 0.0 if moving else abs(self._curvature - self.object_curvature)
+                if self._pending is not None and not moving:
+                    report = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE, requested=self._pending.signals)
+                    report.header.stamp, self._pending = exposed, None
+                    self._driver.publish(report)
+            blurred = gaussian_filter(self.texture, 0.6 + 400 * off, mode="wrap") * (4.0 if moving else 1.0)
+            blurred += self._noise.standard_normal(blurred.shape)
+            self._publish_image(np.clip(blurred, 0, 255).astype(np.uint8), exposed)
+
+    def _publish_image(self, pixels: np.ndarray, exposed: Any) -> None:
+        height, width = pixels.shape
+        message = Image(height=height, width=width, encoding="mono8", step=width)
+        message.header.stamp = exposed
+        message.data = array.array("B", pixels.tobytes())
+        self._image.publish(message)
+
+
+Start = Callable[..., NodeProcess]
+
+
+@pytest.fixture
+def bench(start: Start, observer: Observer) -> Iterator[Bench]:
+    with Bench(observer, object_curvature=0.0173) as played:
+        start("dm_controller", "autofocus", PARAMETERS)
+        wait_until(lambda: played.states, 20, "the first figure of an image")
+        yield played
+
+
+def test_the_sharpest_focus_is_found_and_told_as_distance(bench: Bench, observer: Observer) -> None:
+    feedback: list[Any] = []
+    goal = Autofocus.Goal()
+    _handle, result = observer.send_goal(Autofocus, "autofocus", goal, lambda m: feedback.append(m.feedback))
+    wait_until(result.done, 60, "the end of the search")
+    found = result.result().result
+    assert found.error_code == ErrorCode.OK, found.message
+    assert found.curvature == pytest.approx(0.0173, abs=0.0012)
+    assert found.distance == pytest.approx(OPTICS.distance_for(found.curvature))
+    assert found.images == len(feedback)
+    assert bench.requests[-1].curvature == found.curvature
+    assert {item.phase for item in feedback} == {AutofocusState.PHASE_COARSE, AutofocusState.PHASE_FINE}
+
+
+def test_what_the_controller_refuses_is_left_out(bench: Bench, observer: Observer) -> None:
+    bench.refuse_beyond = 0.043
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.OK, found.message
+    assert found.curvature == pytest.approx(0.0173, abs=0.0012)
+
+
+def test_a_scene_without_texture_ends_without_a_focus(bench: Bench, observer: Observer) -> None:
+    bench.texture[:] = 100.0
+    bench.request.publish(FocusRequest(curvature=0.004))
+    wait_until(lambda: bench.states[-1].curvature == 0.004, what="the focus that was there before")
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.NOT_CONVERGED
+    assert bench.requests[-1].curvature == 0.004, "back where it was"
+
+
+def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(bench: Bench, observer: Observer) -> None:
+    handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
+    wait_until(lambda: bench.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    bench.object_curvature = -0.03
+    wait_until(lambda: bench.states[-1].phase == AutofocusState.PHASE_COARSE, 20, "a new search")
+
+    def on_it() -> bool:
+        last = bench.states[-1]
+        return last.phase == AutofocusState.PHASE_TRACK and abs(last.curvature + 0.03) < 0.002
+
+    wait_until(on_it, 60, "tracking of the moved object")
+    handle.cancel_goal_async()
+    wait_until(result.done, what="the end after cancel")
+    assert result.result().status == GoalStatus.STATUS_CANCELED
+    assert result.result().result.curvature == pytest.approx(-0.03, abs=0.002)
+
+
+def test_another_node_that_moves_the_mirror_ends_the_search(bench: Bench, observer: Observer) -> None:
+    _handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal())
+    wait_until(lambda: len(bench.requests) > 5, what="the search to be under way")
+    while not result.done():
+        bench.request.publish(FocusRequest(curvature=0.0421))
+        time.sleep(0.02)
+    found = result.result().result
+    assert found.error_code == ErrorCode.PREEMPTED
+    assert "+0.0421" in found.message
+
+
+def test_focus_by_distance_and_by_dioptre(bench: Bench, observer: Observer) -> None:
+    def ask(**fields: float) -> SetFocusDistance.Response:
+        return observer.call(SetFocusDistance, "set_focus_distance", SetFocusDistance.Request(**fields))
+
+    near = ask(distance=7.0)
+    assert near.error_code == ErrorCode.OK, near.message
+    assert near.curvature == pytest.approx((1 / 7 - 1 / 10) / 2)
+    assert near.power == pytest.approx(2 * near.curvature)
+    assert near.state.applied
+    assert ask(dioptre=1 / 7).curvature == pytest.approx(near.curvature)
+    assert ask().curvature == pytest.approx(-1 / 20), "infinity"
+    both = ask(distance=7.0, dioptre=0.1)
+    assert (both.error_code, both.state.applied) == (ErrorCode.INVALID_ARGUMENT, False)
+    too_near = ask(distance=2.0)
+    assert too_near.error_code == ErrorCode.UNREACHABLE
+    assert "from 5.00 m to infinity" in too_near.message
+    assert ask(distance=-1.0).error_code == ErrorCode.OUT_OF_RANGE
+
+
+def test_the_focus_range_comes_from_the_capabilities(bench: Bench, observer: Observer) -> None:
+    answer = observer.call(GetFocusRange, "get_focus_range")
+    assert answer.error_code == ErrorCode.OK
+    assert answer.distance_near == pytest.approx(5.0)
+    assert math.isinf(answer.distance_far)
+    assert (answer.dioptre_min, answer.dioptre_max) == (pytest.approx(0.0, abs=1e-12), pytest.approx(0.2))
+    assert answer.curvature_tolerance == pytest.approx(550e-9 / (4 * RADIUS**2))
+
+
+def test_without_controller_and_camera_the_reason_is_told(start: Start, observer: Observer) -> None:
+    start("dm_controller", "autofocus", PARAMETERS)
+    answer = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert answer.error_code == ErrorCode.TIMEOUT
+    assert "focus_controller" in answer.message
+
+
+def test_a_senseless_region_ends_with_the_reason(start: Start) -> None:
+    process = start("dm_controller", "autofocus", {"region": [0.5, 0.0, 0.9, 1.0]})
+    assert process.process.wait(30) == 1
+    assert "region = [0.5, 0.0, 0.9, 1.0]" in process.output
+
+
+def test_the_example_of_the_documentation_runs(bench: Bench, domain: int) -> None:
+    root = Path(__file__).resolve().parents[1]
+    example = (root / "examples" / "camera_focus.py").read_text()
+    code = example[example.index("from dm_controller") :]
+    page = (root / "docs" / "camera.md").read_text()
+    assert all(line in page for line in code.splitlines())
+    done = subprocess.run(
+        [sys.executable, str(root / "examples" / "camera_focus.py")],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"sharpest at {OPTICS.distance_for(0.0173):.1f}" in done.stdout
