@@ -6,7 +6,7 @@ It knows no ROS: what moves the mirror and what measures it are callables.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -237,9 +237,29 @@ class Procedure:
             except MeasurementError as error:
                 self.outcome.dropped.append(f"{label}: {error}")
                 failure = error
+        if not taken:
+            self._note_unseen(step, number, applied)
         self._failures = 0 if taken else self._failures + 1
         if self._failures >= self._options.failures_max:
             raise BenchError(failure.code, f"{self._failures} states in a row gave no map; the last: {failure}")
+
+    def _note_unseen(self, step: Step, number: int, applied: Floats) -> None:
+        """Keep a command without a map where the actuators' memory is to be identified: they remember it all the same.
+
+        Its time is not known; it counts as right after the map before.
+        """
+        records = self.outcome.records
+        if step.kind not in (StepKind.EXCITATION, StepKind.CHECK) or not records:
+            return
+        nothing = np.full_like(records[-1].coefficients, np.nan)
+        assert step.signals is not None
+        records.append(
+            replace(
+                records[-1], label=step.label, kind=step.kind.value, step=number, signals=step.signals,
+                applied=applied, coefficients=nothing, sigma=nothing, sag=np.full_like(records[-1].sag, np.nan),
+                residual_rms=np.nan, valid_fraction=0.0, file="", sha256="", nominal=None, moved_ns=0,
+            )
+        )  # fmt: skip
 
     def _record(self, label: str, step: Step, number: int, applied: Floats) -> MapRecord:
         for attempt in range(self._options.measure_retries + 1):

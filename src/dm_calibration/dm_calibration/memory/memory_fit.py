@@ -18,6 +18,9 @@ from dm_calibration.optics.zernike import TERM_RMS
 
 Floats = NDArray[np.float64]
 
+#: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
+#: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.
+OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
 #: Draws for quantiles of the largest of many correlated errors.
 DRAWS = 4000
 #: Moves of the random histories that tell what not knowing the history means.
@@ -68,7 +71,7 @@ def fit_memory(
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
     run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s())
     test = np.array([kind == CHECK for kind in maps.kind])
-    found = identify(run, test, candidates, progress=progress)
+    found, run = _without_outliers(run, test, candidates, progress)
     covariance = _error_covariance(found, run, maps.terms)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
@@ -79,8 +82,31 @@ def fit_memory(
         held_out_max_zernike=float(np.quantile(np.abs(draws).max(axis=1), 0.95)),
         unknown_sigma=unknown_history_sigma(found.fit.law),
         maps=int(run.responses.usable.sum()),
-        remarks=_remarks(found),
+        remarks=(*_remarks(found), *_left_out(maps, run)),
     )
+
+
+def _without_outliers(
+    run: Run, test: NDArray[np.bool_], candidates: Sequence[Candidate], progress: Callable[[str], None]
+) -> tuple[Identification, Run]:
+    """The law of the maps that one law explains, and the run with those alone counting; the commands all stay."""
+    for _ in range(OUTLIER_ROUNDS):
+        found = identify(run, test, candidates, progress=progress)
+        size = np.linalg.norm(found.fit.residual, axis=1)
+        usable = run.responses.usable
+        outlier = usable & (size > OUTLIER * np.median(size[usable]))
+        if not outlier.any() or outlier.sum() > OUTLIERS_MAX * usable.sum():
+            break
+        run = replace(run, responses=replace(run.responses, usable=usable & ~outlier))
+    return found, run
+
+
+def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
+    labels = [label for label, usable in zip(maps.label, run.responses.usable, strict=True) if not usable]
+    if not labels:
+        return ()
+    more = f" and {len(labels) - 5} more" if len(labels) > 5 else ""
+    return (f"Memory: {len(labels)} maps say nothing of the law or contradict it: {', '.join(labels[:5])}{more}.",)
 
 
 def effective_maps(maps: MapSet, law: MemoryLaw) -> MapSet:
