@@ -6,14 +6,22 @@ import sys
 
 import typer
 
+from dm_controller.cli.bench import bench
 from dm_controller.cli.calibrate import calibrate
+from dm_controller.cli.check import check as check_calibration
 from dm_controller.cli.checks import check
 from dm_controller.cli.compare import compare
+from dm_controller.cli.console import console
 from dm_controller.cli.demo import demo
 from dm_controller.cli.doctor import doctor
 from dm_controller.cli.focus import focus
 from dm_controller.cli.output import fail
 from dm_controller.cli.paper import paper
+from dm_controller.cli.recipes import recipes
+from dm_controller.cli.record import record
+from dm_controller.cli.replay import replay
+from dm_controller.cli.report import report
+from dm_controller.cli.torture import torture
 from dm_controller.cli.up import up
 
 app = typer.Typer(
@@ -24,8 +32,24 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-for command in (demo, up, calibrate, focus, compare, paper, doctor):
+for command in (
+    demo,
+    up,
+    calibrate,
+    recipes,
+    report,
+    focus,
+    console,
+    compare,
+    paper,
+    bench,
+    record,
+    replay,
+    torture,
+    doctor,
+):
     app.command()(command)
+app.command(name="check")(check_calibration)
 app.command(name="test", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(check)
 
 

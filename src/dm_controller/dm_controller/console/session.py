@@ -1,0 +1,136 @@
+"""What all open pages of one console share: the operation under way, its progress, and everything that went wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from dm_controller.console.loops import Loop
+from dm_controller.console.ros_side import RefusedError, RosSide, Snapshot
+
+#: Failures that are kept until somebody dismisses them.
+FAILURES_KEPT = 50
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Something that was refused or went wrong."""
+
+    number: int
+    clock: str
+    title: str
+    sentence: str
+
+
+@dataclass
+class Progress:
+    """How far the operation under way is.
+
+    Attributes:
+        title: of the operation, "" = none is under way.
+        step, steps: i of n; steps 0 = not known.
+        words: what it does now.
+        can_cancel: whether it can be cancelled.
+    """
+
+    title: str = ""
+    step: int = 0
+    steps: int = 0
+    words: str = ""
+    can_cancel: bool = False
+
+
+@dataclass
+class Session:
+    """One console.
+
+    Attributes:
+        outcome: the last success, in words.
+        residuals_nm: 21-term residual of every map of the last run.
+        chosen: number of the actuator that is looked at.
+        base: signals to go back to when a poke is released; None = nothing is poked.
+        poked: signals of the last poke.
+        loops: {actuator: measured loop}.
+    """
+
+    ros: RosSide
+    failures: list[Failure] = field(default_factory=list)
+    progress: Progress = field(default_factory=Progress)
+    outcome: str = ""
+    residuals_nm: list[float] = field(default_factory=list)
+    chosen: int = 1
+    base: list[float] | None = None
+    poked: list[float] = field(default_factory=list)
+    loops: dict[int, Loop] = field(default_factory=dict)
+    _numbers: Any = field(default_factory=lambda: itertools.count(1))
+    _cancel: Callable[[], Awaitable[None]] | None = None
+    _task: asyncio.Task[None] | None = None
+    cancelled: bool = False
+
+    def snapshot(self) -> Snapshot:
+        """What is known of the bench now."""
+        return self.ros.snapshot()
+
+    @property
+    def running(self) -> str:
+        """Title of the operation under way, "" = none."""
+        return self.progress.title
+
+    def fail(self, title: str, sentence: str) -> None:
+        """Show a sentence until it is dismissed."""
+        self.failures.append(Failure(next(self._numbers), time.strftime("%H:%M:%S"), title, sentence))
+        del self.failures[:-FAILURES_KEPT]
+
+    def dismiss(self, number: int) -> None:
+        """Take a failure off the pages."""
+        self.failures[:] = [failure for failure in self.failures if failure.number != number]
+
+    def begin(
+        self,
+        title: str,
+        work: Callable[[], Awaitable[str]],
+        cancel: Callable[[], Awaitable[None]] | None = None,
+    ) -> None:
+        """Start an operation; when another is under way, say so instead.
+
+        Args:
+            work: returns its outcome in words; raises RefusedError or ValueError with the sentence to show.
+            cancel: how to stop it; None = it cannot be.
+        """
+        if self.running:
+            self.fail(title, f"not begun: {self.running} is under way")
+            return
+        self.progress = Progress(title, can_cancel=cancel is not None)
+        self._cancel, self.cancelled, self.outcome = cancel, False, ""
+        self._task = asyncio.get_running_loop().create_task(self._follow(title, work))
+
+    async def _follow(self, title: str, work: Callable[[], Awaitable[str]]) -> None:
+        try:
+            self.outcome = f"{title}: {await work()}"
+        except (RefusedError, ValueError) as error:
+            self.fail(title, str(error))
+        except Exception as error:  # a defect of the console must be seen, too
+            self.fail(title, f"{type(error).__name__}: {error}")
+            raise
+        finally:
+            self.progress = Progress()
+
+    async def cancel(self) -> None:
+        """Ask the operation under way to stop."""
+        if self._cancel is not None and self.running:
+            self.cancelled = True
+            self.progress.words = "cancelling"
+            await self._cancel()
+
+    async def between_steps(self) -> None:
+        """How work that looks at `cancelled` between its steps is cancelled."""
+
+    async def end(self) -> None:
+        """Cancel what is under way and wait for its end, for a shutdown in order."""
+        await self.cancel()
+        if self._task is not None and not self._task.done():
+            await asyncio.wait([self._task], timeout=10.0)
