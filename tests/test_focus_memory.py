@@ -118,9 +118,7 @@ def test_a_restarted_controller_knows_no_history(observer: Observer, start: Star
 
 
 @pytest.mark.parametrize("other_law", [False, True])
-def test_the_history_stays_known_under_a_new_calibration(
-    observer: Observer, start: Start, other_law: bool
-) -> None:
+def test_the_history_stays_known_under_a_new_calibration(observer: Observer, start: Start, other_law: bool) -> None:
     bench = make(observer, start)
     degauss(bench)
     law = make_law(creep_rate=0.02) if other_law else bench.law

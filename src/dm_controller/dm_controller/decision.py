@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from dm_msgs.msg import ErrorCode, FocusRequest
@@ -26,7 +27,6 @@ class Decision:
     Attributes:
         target: the wanted surface.
         move: command, prediction and what to hold.
-        reachable: 1/m, for this conic constant and these added terms.
         mode: FocusRequest.MODE_DIRECT or MODE_CONDITIONED.
         condition: half-swings of the degauss to begin with, 0 = as the driver does; None = go at once.
         duration: s until the shape stands.
@@ -35,11 +35,16 @@ class Decision:
 
     target: FocusTarget
     move: Move
-    reachable: tuple[float, float]
     mode: int
     condition: int | None
     duration: float
     look: Look
+    _find_range: Callable[[], tuple[float, float]]
+
+    @cached_property
+    def reachable(self) -> tuple[float, float]:
+        """1/m, for this conic constant and these added terms; found when first asked for."""
+        return self._find_range()
 
 
 @dataclass(frozen=True)
@@ -78,11 +83,10 @@ def decide(request: FocusRequest, situation: Situation, values: Mapping[str, Any
     budget = _budget(request, values)
     try:
         target = target_of(request)
-        reachable = use.reachable_range(target, values["reachable_tolerance"])
         steps = condition_steps(use, values["condition.degauss_steps"])
         if situation.conditioned is not None:
             steps = situation.conditioned
-        options = _Options(situation, target, reachable, steps, values["settle_time"])
+        options = _Options(situation, target, values["reachable_tolerance"], steps, values["settle_time"])
         if request.mode == FocusRequest.MODE_DIRECT:
             return options.direct()
         if request.mode == FocusRequest.MODE_CONDITIONED:
@@ -111,7 +115,7 @@ class _Options:
 
     situation: Situation
     target: FocusTarget
-    reachable: tuple[float, float]
+    tolerance: float
     steps: int
     settle: float
 
@@ -122,9 +126,11 @@ class _Options:
             return self._decision(FocusRequest.MODE_DIRECT, None)
         look, loop = situation.look, situation.use.loop
         move = loop.plan(self.target, look.state, situation.now, look.known, ahead=self.settle)
-        return Decision(
-            self.target, move, self.reachable, FocusRequest.MODE_DIRECT, None, move.duration + self.settle, look
-        )
+        duration = move.duration + self.settle
+        return Decision(self.target, move, FocusRequest.MODE_DIRECT, None, duration, look, self._range)
+
+    def _range(self) -> tuple[float, float]:
+        return self.situation.use.reachable_range(self.target, self.tolerance)
 
     def conditioned(self) -> Decision:
         """A degauss, then the recipe.
@@ -189,4 +195,4 @@ class _Options:
             error=recipe.error if recipe is not None else None,
         )
         duration = wait + move.duration + self.settle
-        return Decision(self.target, move, self.reachable, mode, condition, duration, look)
+        return Decision(self.target, move, mode, condition, duration, look, self._range)

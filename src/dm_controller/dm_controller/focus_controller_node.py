@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import threading
-from typing import Any
+import time
+from typing import Any, NamedTuple
 
 import numpy as np
 from dm_msgs.msg import (
@@ -18,9 +19,10 @@ from dm_msgs.msg import (
     MirrorInfo,
 )
 from dm_msgs.srv import Flatten, SetFocus
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_calibration.calibration_messages import stamp_ns
+from dm_calibration.calibration_messages import stamp_ns, time_message
 from dm_controller.capabilities import capabilities_message, settling_time
 from dm_controller.conditioning import Conditioner, Waiting
 from dm_controller.converge_action import ConvergeAction
@@ -40,6 +42,26 @@ from dm_controller.target import FocusTarget
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
 from dm_runtime.parameters import declare
+
+#: Time after a command until `focus_state` tells of it, s. Whoever waits for the command wakes up meanwhile: it may
+#: have to on this very core (measured: 0.2 ms sooner).
+TELL_S = 1e-3
+
+
+class Outcome(NamedTuple):
+    """What came of a request.
+
+    Attributes:
+        decision: None = refused before there was one.
+        stamp: of the command that went out; None = none did.
+        waiting: for the mirror to be conditioned.
+        refusal: None = not refused.
+    """
+
+    decision: Decision | None = None
+    stamp: Any = None
+    waiting: Waiting | None = None
+    refusal: Refusal | None = None
 
 
 class FocusControllerNode(Node):
@@ -84,11 +106,15 @@ class FocusControllerNode(Node):
         self.create_service(SetFocus, "set_focus", self._on_set_focus)
         self.create_service(Flatten, "flatten", self._on_flatten)
         self.create_timer(self._values["hold.period"], self._correct_held_shape)
+        self._untold: tuple[FocusRequest, Outcome] | None = None
+        self._teller = self.create_timer(TELL_S, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         self._publish_capabilities()
 
     def _now_ns(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
+        """ROS time; without a simulator it is the system's, which costs a tenth."""
+        clock = self.get_clock()
+        return int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
 
     def _now(self) -> float:
         """ROS time, s."""
@@ -143,20 +169,23 @@ class FocusControllerNode(Node):
             self._hold.end("the driver is not active")
         elif self._hold.active:
             self._hold.driver_requested(np.array(message.requested, dtype=np.float64), self._now())
+        self._watch.prepare(self._use.loop if self._use is not None else None)
         learnt = self._latency.observe(message)
         if learnt or self._told != (message.driver_state, self._watch.unknown):
             self._publish_capabilities()
 
     # --- judging and carrying out requests ---
 
-    def _decide(self, request: FocusRequest, conditioned: int | None = None) -> Decision:
+    def _decide(self, request: FocusRequest, conditioned: int | None = None, now_ns: int | None = None) -> Decision:
         """Judge a request, `conditioned` by a degauss of so many half-swings that has just ended. Raises Refusal."""
+        if now_ns is None:
+            now_ns = self._now_ns()
         if conditioned is None:
-            check_age(stamp_ns(request.header.stamp), self._now_ns(), self._values["request_age"])
+            check_age(stamp_ns(request.header.stamp), now_ns, self._values["request_age"])
         use = self._use
         if use is None:
             raise self._not_calibrated
-        now, wait = self._now(), 0.0
+        now, wait = 1e-9 * now_ns, 0.0
         if conditioned is None and self._conditioner.busy:
             conditioned, wait = self._conditioner.steps, self._conditioner.remaining(use.slew_rate, use.span)
         look = self._watch.look(now, use.slew_rate)
@@ -177,80 +206,101 @@ class FocusControllerNode(Node):
         Where the mirror is conditioned first, the command follows later, and what waits for it is returned too.
         """
         with self._turn:
-            self._counts["requests"] += 1
-            state = state_of(request)
-            waiting = None
-            try:
-                decision = self._judge(request, state)
-                if not dry_run:
-                    self._check_free()
-                    if decision.condition is None and not self._conditioner.busy:
-                        self._go(state, decision)
-                    else:
-                        waiting = self._condition(request, state, decision)
-            except Refusal as refusal:
-                return self._refuse(request, refusal, state, publish=not dry_run), None
-            if not state.applied:
-                state.header.stamp = self.get_clock().now().to_msg()
+            outcome = self._attempt(request, dry_run)
+            state = self._state_after(request, outcome)
             if not dry_run:
                 self._focus_state.publish(state)
-            return state, waiting
+            return state, outcome.waiting
 
     def _carry_out_conditioned(self, request: FocusRequest, steps: int) -> FocusState:
         """Carry out a request that waited for a degauss of `steps` half-swings. Publishes the state."""
-        state = state_of(request)
-        try:
-            decision = self._judge(request, state, steps)
-            self._check_free()
-            self._go(state, decision)
-        except Refusal as refusal:
-            return self._refuse(request, refusal, state)
+        state = self._state_after(request, self._attempt(request, conditioned=steps))
         self._focus_state.publish(state)
         return state
 
-    def _judge(self, request: FocusRequest, state: FocusState, conditioned: int | None = None) -> Decision:
-        decision = self._decide(request, conditioned)
+    def _attempt(self, request: FocusRequest, dry_run: bool = False, conditioned: int | None = None) -> Outcome:
+        """Judge a request, and send its command or have the mirror conditioned for it. Nothing is published of it.
+
+        The command goes out before anything is worked out that only the state tells.
+        """
+        if self._untold is not None:
+            self._tell()
+        if conditioned is None:
+            self._counts["requests"] += 1
+        decision = stamp = waiting = refused = None
+        now_ns = self._now_ns()
+        try:
+            decision = self._decide(request, conditioned, now_ns)
+            check_reachable(decision, self._values["reachable_tolerance"])
+            if not dry_run:
+                self._check_free()
+                if conditioned is not None or (decision.condition is None and not self._conditioner.busy):
+                    stamp = self._go(decision, now_ns)
+                else:
+                    waiting = self._condition(request, decision)
+        except Refusal as refusal:
+            refused = refusal
+        return Outcome(decision, stamp, waiting, refused)
+
+    def _state_after(self, request: FocusRequest, outcome: Outcome) -> FocusState:
+        """What came of a request."""
+        decision, refusal = outcome.decision, outcome.refusal
+        state = state_of(request) if decision is None else self._state_of(request, decision, outcome.stamp)
+        if outcome.waiting is not None and decision is not None:
+            remark = f"the mirror is degaussed first; the shape stands in about {decision.duration:.1f} s"
+            state.message = "; ".join(filter(None, (remark, state.message)))
+        if refusal is not None:
+            self._counts["refused"] += 1
+            state.error_code, state.message = refusal.error_code, str(refusal)
+            state.header.stamp = time_message(self._now_ns())
+            self.get_logger().warning(f"refused: {refusal}", throttle_duration_sec=1.0)
+        return state
+
+    def _tell(self) -> None:
+        """Publish the state that waits to be told, if there is one."""
+        with self._turn:
+            self._teller.cancel()
+            untold, self._untold = self._untold, None
+            if untold is not None:
+                self._focus_state.publish(self._state_after(*untold))
+
+    def _state_of(self, request: FocusRequest, decision: Decision, stamp: Any) -> FocusState:
+        """What is told of a request that was judged; `stamp` of its command, None = there is none."""
         use = self._use
         assert use is not None
+        state = state_of(request)
         self._use_forecast()
         forecast = self._forecast.forecast(decision.target.curvature, decision.move.plan.rms)
         fill_state(state, use.calibration.id, decision, forecast)
         state.creep_held = self._hold.would_keep(use.loop.law)
         state.message = self._remarks(use, decision.look.unknown)
-        check_reachable(decision, self._values["reachable_tolerance"])
-        return decision
+        state.applied = stamp is not None
+        state.header.stamp = stamp or time_message(self._now_ns())
+        return state
 
-    def _go(self, state: FocusState, decision: Decision) -> None:
-        """Send the command of `decision` and hold its shape from now on."""
+    def _go(self, decision: Decision, now_ns: int) -> Any:
+        """Send the command of `decision`, made at `now_ns`, and hold its shape from now on; returns its stamp."""
         assert self._use is not None
-        signals = decision.move.plan.signals
-        state.header.stamp = self._send(signals)
-        state.applied = True
-        self._hold.begin(self._use.loop, decision.move.effective, signals, self._now(), decision.look.known)
+        move = decision.move
+        stamp = self._send(move.signals, now_ns)
+        self._hold.begin(self._use.loop, move.effective, move.signals, 1e-9 * now_ns, decision.look.known)
+        return stamp
 
-    def _condition(self, request: FocusRequest, state: FocusState, decision: Decision) -> Waiting:
+    def _condition(self, request: FocusRequest, decision: Decision) -> Waiting:
         """Have the mirror degaussed before `request` is carried out."""
         self._conditioner.check_service()
         self._hold.end("the mirror is conditioned")
-        remark = f"the mirror is degaussed first; the shape stands in about {decision.duration:.1f} s"
-        state.message = "; ".join(filter(None, (remark, state.message)))
         return self._conditioner.submit(request, decision.condition or 0)
 
-    def _refuse(
-        self, request: FocusRequest, refusal: Refusal, state: FocusState | None = None, publish: bool = True
-    ) -> FocusState:
-        state = state or state_of(request)
-        self._counts["refused"] += 1
-        state.error_code, state.message = refusal.error_code, str(refusal)
-        state.header.stamp = self.get_clock().now().to_msg()
-        self.get_logger().warning(f"refused: {refusal}", throttle_duration_sec=1.0)
-        if publish:
-            self._focus_state.publish(state)
+    def _refuse(self, request: FocusRequest, refusal: Refusal) -> FocusState:
+        """Refuse a request that could not be attempted. Publishes the state."""
+        state = self._state_after(request, Outcome(refusal=refusal))
+        self._focus_state.publish(state)
         return state
 
-    def _send(self, signals: Any) -> Any:
+    def _send(self, signals: Any, now_ns: int | None = None) -> Any:
         command = ActuatorCommand(signals=doubles(signals))
-        command.header.stamp = self.get_clock().now().to_msg()
+        command.header.stamp = time_message(self._now_ns() if now_ns is None else now_ns)
         self._command.publish(command)
         self._latency.sent(command)
         return command.header.stamp
@@ -276,7 +326,13 @@ class FocusControllerNode(Node):
                 self._send(signals)
 
     def _on_focus_request(self, request: FocusRequest) -> None:
-        self._carry_out(request)
+        with self._turn:
+            outcome = self._attempt(request)
+            if outcome.stamp is None:
+                self._focus_state.publish(self._state_after(request, outcome))
+            else:
+                self._untold = request, outcome
+                self._teller.reset()
 
     def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
         response.state, _ = self._carry_out(request.request, request.dry_run)
@@ -298,7 +354,7 @@ class FocusControllerNode(Node):
         else:
             steps = condition_steps(use, self._values["condition.degauss_steps"])
             message = capabilities_message(use, tolerance, unknown, self._stale(use), self._degauss_time(steps))
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = time_message(self._now_ns())
         message.latency = self._latency.typical
         if self._mirror_info is not None:
             message.settling = settling_time(self._mirror_info)

@@ -94,20 +94,6 @@ class Pieces:
         self.duhem_slope = law.duhem_weight * np.concatenate(([1.0], -law.duhem_slope, [0.0]))
 
         self.powers = np.arange(1.0, len(self.polynomial))[:, None]
-        self._bends: dict[tuple[float, float], float] = {}
-
-    def bend(self, low: float, high: float) -> float:
-        """Largest second derivative over twice the smallest slope, signals within `low` .. `high`; inf = not known."""
-        if self.duhem is not None:
-            return float("inf")
-        if (low, high) not in self._bends:
-            grid = np.linspace(low, high, 201)[:, None, None]
-            slopes = self.polynomial[1:, None] * self.powers[:, :, None, None]
-            bends = slopes[1:] * self.powers[:-1, :, None, None]
-            second = sum((bend * grid**power for power, bend in enumerate(bends)), np.zeros(1))
-            first = sum(slope * grid**power for power, slope in enumerate(slopes))
-            self._bends[low, high] = float(np.abs(second).max() / (2.0 * np.maximum(first, SLOPE_MIN).min()))
-        return self._bends[low, high]
 
     def solve(self, state: MemoryState, wanted: Floats, low: float, high: float) -> Inverted:
         """Signals for the static effective signals `wanted` (N,)."""

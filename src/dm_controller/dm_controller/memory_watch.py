@@ -16,6 +16,7 @@ from dm_msgs.msg import ActuatorState
 from dm_calibration.calibration_messages import stamp_ns
 from dm_calibration.memory.law import MemoryLaw, MemoryState
 from dm_calibration.memory.tracker import Applied, MemoryTracker
+from dm_controller.open_loop import OpenLoop
 
 #: Reports kept for a law that is identified later: a calibration run makes some hundred.
 LOG_LENGTH = 20_000
@@ -57,9 +58,10 @@ class MemoryWatch:
     def use(self, law: MemoryLaw, middle: float) -> None:
         """Follow another law, through all that was reported since this node started."""
         with self._lock:
-            if same_law(law, self.law) and middle == self._middle:
-                return
+            same = same_law(law, self.law) and middle == self._middle
             self.law, self._middle = law, middle
+            if same:
+                return
             self._tracker = MemoryTracker(law, middle)
             for report in list(self._log):
                 self._track(report)
@@ -97,6 +99,12 @@ class MemoryWatch:
             share = min(1.0, max(0.0, now - state.time) * slew_rate / largest) if largest > 0.0 else 0.0
             state = self.law.move(state, state.signals + share * gap, now)
         return Look(state, unknown)
+
+    def prepare(self, loop: OpenLoop | None) -> None:
+        """Have the next plan of `loop` from where the mirror now stands prepared; nothing while it moves."""
+        last, state = self._last, self._tracker.state
+        if loop is not None and state is not None and last is not None and not last.moving and loop.law is self.law:
+            loop.prepare(state)
 
     def _unknown(self) -> str:
         if self._tracker.state is None or self._last is None:

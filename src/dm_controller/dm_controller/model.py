@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.optics.zernike import basis
+from dm_controller.closed_form import ClosedForm
 from dm_controller.solvers.bounded import BoundedProgramme, Limits
 from dm_controller.target import FocusTarget
 
@@ -79,10 +83,22 @@ class Plan:
     saturated: NDArray[np.bool_]
 
 
+class Commanded(NamedTuple):
+    """A command and the largest coefficient error that it leaves, m; `judged()` works out the rest.
+
+    Attributes:
+        signals: (N,).
+    """
+
+    signals: NDArray[np.float64]
+    max_zernike: float
+    judged: Callable[[], Plan]
+
+
 def rms_bounds(rms: float, spread: float) -> tuple[float, float]:
     """95 % interval of an rms, m, when an independent error with the rms `spread` (m) comes on top, in squares."""
     reach = (1.96 * spread) ** 2
-    return float(np.sqrt(max(rms**2 - reach, 0.0))), float(np.sqrt(rms**2 + reach))
+    return math.sqrt(max(rms**2 - reach, 0.0)), math.sqrt(rms**2 + reach)
 
 
 class CalibratedMirror:
@@ -109,6 +125,14 @@ class CalibratedMirror:
         self.sag_root: NDArray[np.float64] = np.linalg.qr(reduced)[1]
         response = np.linalg.norm(reduced, axis=0)
         self._programme = BoundedProgramme(self.matrix, limits, ridge=(RIDGE_SHARE * float(np.median(response))) ** 2)
+        self._closed_form = ClosedForm(
+            model.aperture_radius,
+            (model.sample_x, model.sample_y),
+            model.zernike_offset,
+            model.sag_offset,
+            lambda coefficients, sag: self._programme.unlimited(self.rows(coefficients, sag)),
+            self._errors,
+        )
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
     def _reduce(self, sag: NDArray[np.float64], removed: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -143,8 +167,23 @@ class CalibratedMirror:
         Raises:
             TargetError: no such surface exists over the aperture.
         """
+        return self.command(target).judged()
+
+    def command(self, target: FocusTarget) -> Commanded:
+        """Find the command for `target`, and leave the rest of its prediction for later.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        found = self._closed_form.find(target)
+        if found is not None and self.limits.allow(found.signals):
+            signals, largest, remaining = found
+            return Commanded(
+                signals, largest, lambda: self._plan(signals, math.sqrt(float(remaining @ remaining)), largest)
+            )
         coefficients, sag = self._wanted(target)
-        return self._judged(self.solve(self.rows(coefficients, sag)), coefficients, sag)
+        plan = self._judged(self.solve(self.rows(coefficients, sag)), coefficients, sag)
+        return Commanded(plan.signals, plan.max_zernike, lambda: plan)
 
     def predict(self, target: FocusTarget, signals: NDArray[np.float64]) -> Plan:
         """What `signals` (N,) are expected to do when `target` is wanted.
@@ -163,18 +202,26 @@ class CalibratedMirror:
     def _judged(
         self, signals: NDArray[np.float64], coefficients: NDArray[np.float64], sag: NDArray[np.float64]
     ) -> Plan:
+        zernike_error, sag_error = self._errors(signals, coefficients, sag)
+        return self._plan(signals, float(np.linalg.norm(sag_error)), float(np.abs(zernike_error).max()))
+
+    def _errors(
+        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64], sag: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficient errors beyond tilt (K - 3,) and weighted sag errors (P,), piston and tilt removed, or columns."""
         model = self.model
         zernike_error = model.influence_zernike[FREE_TERMS:] @ signals - coefficients[FREE_TERMS:]
-        sag_error = self._reduce(model.influence_sag @ signals - sag, self._tilt_free)
-        rms = float(np.linalg.norm(sag_error))
-        largest = float(np.abs(zernike_error).max())
+        return zernike_error, self._reduce(model.influence_sag @ signals - sag, self._tilt_free)
+
+    def _plan(self, signals: NDArray[np.float64], rms: float, largest: float) -> Plan:
+        lower, upper = rms_bounds(rms, self.model.held_out_rms)
         return Plan(
             signals=signals,
             rms=rms,
-            rms_lower=rms_bounds(rms, model.held_out_rms)[0],
-            rms_upper=rms_bounds(rms, model.held_out_rms)[1],
+            rms_lower=lower,
+            rms_upper=upper,
             max_zernike=largest,
-            max_zernike_upper=largest + model.held_out_max_zernike,
+            max_zernike_upper=largest + self.model.held_out_max_zernike,
             saturated=self.limits.at_limit(signals),
         )
 

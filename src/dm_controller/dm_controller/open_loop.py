@@ -115,34 +115,43 @@ class OpenLoop:
             TargetError: no such surface exists over the aperture.
         """
         limits = self.mirror.limits
-        planned = self.mirror.plan(target)
-        aim = planned.signals if effective is None else effective
-        travel = float(np.abs(aim - state.signals).max()) / self.slew_rate if state is not None else 0.0
-        if effective is not None:
-            planned = self.mirror.predict(target, aim)
+        if effective is None:
+            aim, largest, judged = self.mirror.command(target)
+        else:
+            given = self.mirror.predict(target, effective)
+            aim, largest, judged = effective, given.max_zernike, lambda: given
         if error is not None:
-            planned = replace(planned, max_zernike=min(planned.max_zernike, error), max_zernike_upper=error)
+            largest = min(largest, error)
+        travel = 0.0
+        if state is not None:
+            travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
         if self.memory is None:
-            return Move(planned.signals, aim, travel, planned.max_zernike, lambda: planned)
+
+            def predict_at_once() -> Plan:
+                plan = judged()
+                return plan if error is None else replace(plan, max_zernike=largest, max_zernike_upper=error)
+
+            return Move(aim, aim, travel, largest, predict_at_once)
         if state is None:
             state, known = self.law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
         # A move counts from its last write; older creep goes on during the way.
-        arrival = time + travel
-        signals, missed = self._inverted(state, arrival, aim, ahead)
+        begun, arrival = state, time + travel
+        signals, missed = self._inverted(begun, arrival, aim, ahead)
         if missed is not None and np.abs(missed).max() > MISSED_MAX and effective is None:
-            planned = self.mirror.predict(target, aim - missed)
+            short = self.mirror.predict(target, aim - missed)
+            largest, judged = short.max_zernike, lambda: short
 
         def predict() -> Plan:
-            reached = aim if missed is None else aim - missed
+            plan = judged()
+            if error is not None:
+                plan = replace(plan, max_zernike=min(plan.max_zernike, error), max_zernike_upper=error)
             # But for creep, how far the actuators go.
-            step = reached - self.law.effective(self.law.advance(state, arrival))
-            return self._bounded(planned, signals, known, self._young_creep(step, ahead), error)
+            step = (aim if missed is None else aim - missed) - self.law.effective(self.law.advance(begun, arrival))
+            return self._bounded(plan, signals, known, self._young_creep(step, ahead), error)
 
-        return Move(signals, aim, travel, planned.max_zernike, predict)
+        return Move(signals, aim, travel, largest, predict)
 
-    def _inverted(
-        self, state: MemoryState, arrival: float, aim: Floats, ahead: float
-    ) -> tuple[Floats, Floats | None]:
+    def _inverted(self, state: MemoryState, arrival: float, aim: Floats, ahead: float) -> tuple[Floats, Floats | None]:
         """Signals (N,) for the effective signals `aim`, and what limits make them miss; None = nothing."""
         limits, ready = self.mirror.limits, self._prepared
         if ready is not None and ready.state is state:

@@ -28,7 +28,7 @@ def check_driver(driver: ActuatorState | None) -> None:
 
 def check_reachable(decision: Decision, tolerance: float) -> None:
     """Raise Refusal when the limits leave a larger coefficient error than `tolerance` (m)."""
-    if decision.move.plan.max_zernike <= tolerance:
+    if decision.move.max_zernike <= tolerance:
         return
     low, high = decision.reachable
     if math.isnan(low):
@@ -38,5 +38,5 @@ def check_reachable(decision: Decision, tolerance: float) -> None:
     raise Refusal(
         ErrorCode.UNREACHABLE,
         f"curvature = {decision.target.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error "
-        f"of {decision.move.plan.max_zernike * 1e9:.1f} nm (allowed {tolerance * 1e9:.1f} nm); {words}",
+        f"of {decision.move.max_zernike * 1e9:.1f} nm (allowed {tolerance * 1e9:.1f} nm); {words}",
     )

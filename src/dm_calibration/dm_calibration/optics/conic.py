@@ -67,13 +67,13 @@ def conic_coefficients(
     """
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius = {radius} m: must be positive")
-    return disc_coefficients(
-        lambda x, y: conic_sag(radius * x, radius * y, curvature, conic_constant, shift)
-    )
+    return disc_coefficients(lambda x, y: conic_sag(radius * x, radius * y, curvature, conic_constant, shift))
 
 
-def disc_coefficients(sag: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
-    """(21,) Born & Wolf coefficients of `sag`, a function of points of the unit disc, by least squares over all of it."""
+def disc_coefficients(
+    sag: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """(21,) Born & Wolf coefficients of `sag`, a function of points of the unit disc, by least squares over it."""
     x, y, projection = _quadrature()
     return sag(x, y) @ projection
 

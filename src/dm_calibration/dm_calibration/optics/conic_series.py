@@ -8,27 +8,26 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .conic import disc_coefficients
 
-#: C_j / (2 4^j).
-_FACTORS = (1 / 2, 1 / 8, 1 / 16, 5 / 128)
-ORDERS = len(_FACTORS)
+#: Powers of q that are kept.
+ORDERS = 4
 #: Largest |q| at the rim for which the series is used: what is left out is below 14/512 q^4, 3e-18 of the whole.
 Q_MAX = 1e-4
 
 
-def series(curvature: float, conic_constant: float, radius: float) -> list[float] | None:
+def series(curvature: float, conic_constant: float, radius: float) -> tuple[float, float, float, float] | None:
     """The ORDERS amplitudes (m) of (r / radius)^2, ^4, ^6, ^8; None where the series is too short."""
     q = (1.0 + conic_constant) * (curvature * radius) ** 2
     if not abs(q) <= Q_MAX:
         return None
     reach = curvature * radius * radius
-    return [reach * factor * q**order for order, factor in enumerate(_FACTORS)]
+    return reach / 2, reach * q / 8, reach * q * q / 16, reach * q**3 * (5 / 128)
 
 
 def series_sag(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -39,4 +38,8 @@ def series_sag(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.flo
 @cache
 def series_coefficients() -> NDArray[np.float64]:
     """(21, ORDERS) Born & Wolf coefficients per amplitude, by least squares over the full disc."""
-    return np.column_stack([disc_coefficients(lambda x, y, n=n: (x**2 + y**2) ** n) for n in range(1, ORDERS + 1)])
+    return np.column_stack([disc_coefficients(partial(_power, n)) for n in range(1, ORDERS + 1)])
+
+
+def _power(order: int, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray((x**2 + y**2) ** order)
