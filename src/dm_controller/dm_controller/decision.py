@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 from dm_msgs.msg import ErrorCode, FocusRequest
 
@@ -18,6 +18,10 @@ from dm_controller.open_loop import Move
 from dm_controller.recipes import FoundRecipe, find
 from dm_controller.refusal import Refusal
 from dm_controller.target import FocusTarget, TargetError
+
+#: A message's constants are properties of its class, which take longer to look up.
+_MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED)
+_AUTO, _DIRECT, _CONDITIONED = _MODES
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +51,7 @@ class Decision:
         return self._find_range()
 
 
-@dataclass(frozen=True)
-class Situation:
+class Situation(NamedTuple):
     """What a decision depends on beside the request.
 
     Attributes:
@@ -87,9 +90,9 @@ def decide(request: FocusRequest, situation: Situation, values: Mapping[str, Any
         if situation.conditioned is not None:
             steps = situation.conditioned
         options = _Options(situation, target, values["reachable_tolerance"], steps, values["settle_time"])
-        if request.mode == FocusRequest.MODE_DIRECT:
+        if request.mode == _DIRECT:
             return options.direct()
-        if request.mode == FocusRequest.MODE_CONDITIONED:
+        if request.mode == _CONDITIONED:
             return options.conditioned()
         return options.best(budget)
     except TargetError as error:
@@ -97,7 +100,7 @@ def decide(request: FocusRequest, situation: Situation, values: Mapping[str, Any
 
 
 def _budget(request: FocusRequest, values: Mapping[str, Any]) -> float:
-    if request.mode not in (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED):
+    if request.mode not in _MODES:
         raise Refusal(
             ErrorCode.INVALID_ARGUMENT, f"mode = {request.mode}: must be AUTO (0), DIRECT (1) or CONDITIONED (2)"
         )
@@ -127,7 +130,7 @@ class _Options:
         look, loop = situation.look, situation.use.loop
         move = loop.plan(self.target, look.state, situation.now, look.known, ahead=self.settle)
         duration = move.duration + self.settle
-        return Decision(self.target, move, FocusRequest.MODE_DIRECT, None, duration, look, self._range)
+        return Decision(self.target, move, _DIRECT, None, duration, look, self._range)
 
     def _range(self) -> tuple[float, float]:
         return self.situation.use.reachable_range(self.target, self.tolerance)

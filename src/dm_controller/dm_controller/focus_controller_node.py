@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from dm_msgs.msg import (
@@ -29,7 +29,7 @@ from dm_controller.converge_action import ConvergeAction
 from dm_controller.conversions import doubles
 from dm_controller.decision import Decision, Situation, condition_steps, decide
 from dm_controller.focus_parameters import PARAMETERS
-from dm_controller.focus_report import fill_state, state_of
+from dm_controller.focus_report import Outcome, fill_state, health, state_of
 from dm_controller.hold import Hold
 from dm_controller.latency import Latency
 from dm_controller.memory_watch import CURE, MemoryWatch, same_law
@@ -46,22 +46,6 @@ from dm_runtime.parameters import declare
 #: Time after a command until `focus_state` tells of it, s. Whoever waits for the command wakes up meanwhile: it may
 #: have to on this very core (measured: 0.2 ms sooner).
 TELL_S = 1e-3
-
-
-class Outcome(NamedTuple):
-    """What came of a request.
-
-    Attributes:
-        decision: None = refused before there was one.
-        stamp: of the command that went out; None = none did.
-        waiting: for the mirror to be conditioned.
-        refusal: None = not refused.
-    """
-
-    decision: Decision | None = None
-    stamp: Any = None
-    waiting: Waiting | None = None
-    refusal: Refusal | None = None
 
 
 class FocusControllerNode(Node):
@@ -99,6 +83,8 @@ class FocusControllerNode(Node):
             self, self._values, self._decide, lambda: (self._calibration, self._mirror_info),
             standing=lambda: self._watch.look(self._now()).state,
         )  # fmt: skip
+        self._untold: tuple[FocusRequest, Outcome] | None = None
+        self._teller = self.create_timer(TELL_S, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
@@ -106,8 +92,6 @@ class FocusControllerNode(Node):
         self.create_service(SetFocus, "set_focus", self._on_set_focus)
         self.create_service(Flatten, "flatten", self._on_flatten)
         self.create_timer(self._values["hold.period"], self._correct_held_shape)
-        self._untold: tuple[FocusRequest, Outcome] | None = None
-        self._teller = self.create_timer(TELL_S, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         self._publish_capabilities()
 
@@ -134,6 +118,7 @@ class FocusControllerNode(Node):
     def _take_calibration(self) -> None:
         """Use the calibration if it belongs to this mirror; else say why not, and refuse requests."""
         with self._turn:
+            self._tell()
             before = self._use
             try:
                 use = mirror_in_use(self._calibration, self._mirror_info, self._values["aperture_tolerance"])
@@ -373,16 +358,7 @@ class FocusControllerNode(Node):
         use, unknown = self._use, self._watch.unknown
         values: dict[str, object] = dict(self._counts)
         values |= {"history": unknown or "known", "held": self._hold.active, "corrections": self._hold.corrections}
-        try:
-            if use is None:
-                raise self._not_calibrated
-            check_driver(self._driver)
-        except Refusal as refusal:
-            return diagnostics.Health(diagnostics.WARN, str(refusal), values)
-        warnings = self._remarks(use, unknown)
-        if warnings:
-            return diagnostics.Health(diagnostics.WARN, warnings, values)
-        return diagnostics.Health(diagnostics.OK, "ready", values)
+        return health(self._not_calibrated if use is None else self._remarks(use, unknown), self._driver, values)
 
 
 def main() -> int:

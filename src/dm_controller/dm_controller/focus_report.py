@@ -1,15 +1,37 @@
-"""The message `focus_state`: what was made of a request."""
+"""What the focus controller tells: the message `focus_state`, and its health."""
 
 from __future__ import annotations
 
 import array
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
-from dm_msgs.msg import FocusRequest, FocusState
+from dm_msgs.msg import ActuatorState, FocusRequest, FocusState
 
+from dm_controller.conditioning import Waiting
 from dm_controller.conversions import doubles
 from dm_controller.decision import Decision
 from dm_controller.prediction import Forecast
+from dm_controller.refusal import Refusal
+from dm_controller.request_checks import check_driver
+from dm_runtime import diagnostics
+
+
+class Outcome(NamedTuple):
+    """What came of a request.
+
+    Attributes:
+        decision: None = refused before there was one.
+        stamp: of the command that went out; None = none did.
+        waiting: for the mirror to be conditioned.
+        refusal: None = not refused.
+    """
+
+    decision: Decision | None = None
+    stamp: Any = None
+    waiting: Waiting | None = None
+    refusal: Refusal | None = None
 
 
 def state_of(request: FocusRequest) -> FocusState:
@@ -46,3 +68,20 @@ def fill_state(state: FocusState, calibration_id: str, decision: Decision, forec
     state.curvature_min, state.curvature_max = decision.reachable
     state.history_known = decision.look.known
     state.mode = decision.mode
+
+
+def health(trouble: Refusal | str, driver: ActuatorState | None, values: Mapping[str, object]) -> diagnostics.Health:
+    """The node's health.
+
+    Args:
+        trouble: why there is no calibration, or remarks on it in words, "" = none.
+        driver: its last report.
+        values: figures.
+    """
+    try:
+        if isinstance(trouble, Refusal):
+            raise trouble
+        check_driver(driver)
+    except Refusal as refusal:
+        return diagnostics.Health(diagnostics.WARN, str(refusal), values)
+    return diagnostics.Health(diagnostics.WARN if trouble else diagnostics.OK, trouble or "ready", values)

@@ -9,6 +9,9 @@ from dm_msgs.msg import ActuatorState, ErrorCode
 from dm_controller.decision import Decision
 from dm_controller.refusal import Refusal
 
+#: A message's constants are properties of its class, which take longer to look up.
+_ACTIVE = ActuatorState.STATE_ACTIVE
+
 
 def check_age(stamp_ns: int, now_ns: int, limit_s: float) -> None:
     """Raise Refusal when a request stamped `stamp_ns` (0 = now) is older than `limit_s` (0 = any age will do)."""
@@ -21,7 +24,7 @@ def check_driver(driver: ActuatorState | None) -> None:
     """Raise Refusal when the driver, by its last report, takes no commands."""
     if driver is None:
         raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no actuator_state from pdm_driver yet: is the driver running?")
-    if driver.driver_state != ActuatorState.STATE_ACTIVE:
+    if driver.driver_state != _ACTIVE:
         reason = f": {driver.message}" if driver.message else ""
         raise Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
 

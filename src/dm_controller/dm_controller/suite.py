@@ -145,6 +145,11 @@ class Suite:
         """The log file of a node."""
         return self.folder / f"{name}.log"
 
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by the names of the nodes."""
+        return {name: process.pid for name, process in self._processes.items()}
+
     def ended(self) -> list[str]:
         """Names of the nodes that are no longer running."""
         return [name for name, process in self._processes.items() if process.poll() is not None]

@@ -164,7 +164,7 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
         executor = make_executor(node)
         signals = StopOnSignals()
         signals.wake(executor)
-        # What is there now stays: a full collection through all modules would stall the node for some 50 ms.
+        # What is there now stays: a full collection through all modules would stall the node for 30 to 50 ms.
         gc.collect()
         gc.freeze()
         spin(executor, until=lambda: signals.requested)

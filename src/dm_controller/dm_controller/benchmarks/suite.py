@@ -6,19 +6,36 @@ from collections.abc import Callable, Iterator, Mapping
 from types import ModuleType
 from typing import Any
 
-from dm_controller.benchmarks import bounded_solve, influence_maps, map_fitting, map_reading, scaling
+from dm_controller.benchmarks import (
+    bounded_solve,
+    calibration_time,
+    hosts,
+    idle,
+    influence_maps,
+    map_fitting,
+    map_reading,
+    map_to_coefficients,
+    memory_inverse,
+    request_to_command,
+    scaling,
+)
 from dm_controller.benchmarks.timing import Effort, machine
 
 Job = Callable[[Effort, dict[str, ModuleType]], dict[str, Any]]
 
-#: By the name that `--only` takes. The hysteresis inverse (`inverse`) and the measurements over ROS (`relay`, `focus`,
-#: `file_to_coefficients`) belong here too, each in a module of its own; their lines go to `targets.TARGETS`.
+#: By the name that `--only` takes; from `focus` on with nodes in processes of their own, but for `calibration`.
 JOBS: Mapping[str, Job] = {
     "fit": map_fitting.measure,
     "read": map_reading.measure,
     "influence": influence_maps.measure,
     "solve": bounded_solve.measure,
+    "inverse": memory_inverse.measure,
     "scaling": scaling.measure,
+    "focus": request_to_command.measure,
+    "files": map_to_coefficients.measure,
+    "idle": idle.measure,
+    "calibration": calibration_time.measure,
+    "hosts": hosts.measure,
 }
 
 

@@ -111,6 +111,73 @@ TARGETS: tuple[Target, ...] = (
         lambda f: 0.2,
         _others("solve", {"BVLS": "bvls_ms", "inside the limits": "inside_ms"}),
     ),
+    Target(
+        "inverse of the memory law, 37 actuators, at most 0.3 ms",
+        "ms",
+        lambda f: f["inverse"]["ms"],
+        lambda f: 0.3,
+        _others("inverse", {"linear and clipped": "linear_ms"}),
+    ),
+    Target(
+        "curvature request to command, p50, at most 1.3 × a bare relay",
+        "µs",
+        lambda f: f["focus"]["p50_us"],
+        lambda f: 1.3 * f["relay"]["p50_us"],
+        _others("relay", {"relay": "p50_us"}),
+    ),
+    Target(
+        "the same, p99",
+        "µs",
+        lambda f: f["focus"]["p99_us"],
+        lambda f: 1.3 * f["relay"]["p99_us"],
+        _others("relay", {"relay": "p99_us"}),
+    ),
+    Target(
+        "the same at 100 requests a second, p50",
+        "µs",
+        lambda f: f["at_100_hz"]["focus"]["p50_us"],
+        lambda f: 1.3 * f["at_100_hz"]["relay"]["p50_us"],
+        lambda f: {"relay": f["at_100_hz"]["relay"]["p50_us"]},
+    ),
+    Target(
+        "500 requests a second, age of the last answers, at most 1.5 × the first",
+        "µs",
+        lambda f: f["stream"]["focus"]["last_quarter_p50_us"],
+        lambda f: 1.5 * f["stream"]["focus"]["first_quarter_p50_us"],
+        lambda f: {"relay": f["stream"]["relay"]["last_quarter_p50_us"]},
+    ),
+    Target(
+        "map file on disk to coefficients published, .dat of 944², p99 at most 20 ms",
+        "ms",
+        lambda f: f["file_to_coefficients"]["p99_ms"],
+        lambda f: 20.0,
+        lambda f: {
+            "p50": f["file_to_coefficients"]["p50_ms"],
+            ".datx": f["file_to_coefficients"]["datx"]["p99_ms"],
+            "from the watched folder": f["file_to_coefficients"]["watched"]["p99_ms"],
+        },
+    ),
+    Target(
+        "idle suite, at most 3 % of a core",
+        "%",
+        lambda f: f["idle"]["percent"],
+        lambda f: 3.0,
+        lambda f: {"the twin": f["idle"]["nodes"]["virtual_bench"]},
+    ),
+    Target(
+        "computing of a calibration, plan FULL, at most 5 % of the bench's time",
+        "s",
+        lambda f: f["calibration"]["full"]["compute_s"],
+        lambda f: 0.05 * f["calibration"]["full"]["bench_s"],
+        lambda f: {"bench": f["calibration"]["full"]["bench_s"]},
+    ),
+    Target(
+        "the same, plan MEMORY",
+        "s",
+        lambda f: f["calibration"]["memory"]["compute_s"],
+        lambda f: 0.05 * f["calibration"]["memory"]["bench_s"],
+        lambda f: {"bench": f["calibration"]["memory"]["bench_s"]},
+    ),
 )
 
 

@@ -54,9 +54,13 @@ def _number(value: float) -> str:
 
 
 def bench(
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer turns and small sizes: some 30 seconds.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer turns and small sizes: some three minutes.")] = False,
     only: Annotated[
-        list[str] | None, typer.Option(help="Only this job (fit, read, influence, solve, scaling); repeatable.")
+        list[str] | None,
+        typer.Option(
+            help="Only this job (fit, read, influence, solve, inverse, scaling, focus, files, idle, calibration, "
+            "hosts); repeatable."
+        ),
     ] = None,
     rivals: Annotated[
         bool, typer.Option(help="Install prysm, hcipy and zernike apart from the suite, to compare with.")

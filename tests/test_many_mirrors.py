@@ -1,0 +1,67 @@
+"""Several mirrors from one `dm up`, each in a namespace of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dm_controller.cli.demo import bench_config
+from dm_controller.cli.up import configurations
+from dm_controller.client import DeformableMirrorClient
+from dm_controller.suite import save_config
+
+
+def test_virtual_mirrors_share_neither_ports_nor_folders() -> None:
+    left, right = configurations([], ["left", "/right/"]).values()
+    for node, names in {
+        "virtual_bench": ("electronics.tcp_port", "electronics.udp_port", "trigger.port", "output_folder", "seed"),
+        "pdm_driver": ("electronics.port", "mirror.serial"),
+        "interferometer": ("watch_folder", "trigger_command"),
+        "calibration": ("calibration_folder",),
+    }.items():
+        for name in names:
+            assert left[node][name] != right[node][name], (node, name)
+    for config in (left, right):
+        assert config["virtual_bench"]["electronics.tcp_port"] == config["pdm_driver"]["electronics.port"]
+        assert str(config["virtual_bench"]["trigger.port"]) in config["interferometer"]["trigger_command"]
+
+
+def test_one_mirror_is_as_shipped() -> None:
+    assert list(configurations([], [""]).values()) == list(configurations([], ["a"]).values())
+
+
+@pytest.mark.parametrize(
+    ("files", "names", "words"), [(1, ["a", "b"], "1 files for 2"), (0, ["a", "/a"], "one of its own")]
+)
+def test_what_does_not_fit_is_refused(tmp_path: Path, files: int, names: list[str], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        configurations([tmp_path / "config.yaml"] * files, names)
+
+
+def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:
+    arguments: list[str] = []
+    for name in ("left", "right"):
+        save_config(bench_config(tmp_path / name, "preisach", 0.01, 1, 0.0), tmp_path / f"{name}.yaml")
+        arguments += ["--config", str(tmp_path / f"{name}.yaml"), "--namespace", name]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dm_controller.cli", "up", *arguments, "--logs", str(tmp_path / "logs")],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        with DeformableMirrorClient("left", domain) as left, DeformableMirrorClient("right", domain) as right:
+            left.wait_until_active(60.0)
+            right.wait_until_active(60.0)
+            before = np.array(right.latest("actuator_state").applied)
+            left.set_signals([0.3] * 37)
+            assert left.wait(lambda: np.allclose(left.latest("actuator_state").applied, 0.3, atol=1e-3), 20.0)
+            np.testing.assert_array_equal(right.latest("actuator_state").applied, before)
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(40.0) == 0
