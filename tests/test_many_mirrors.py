@@ -63,5 +63,5 @@ def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:
             assert left.wait(lambda: np.allclose(left.latest("actuator_state").applied, 0.3, atol=1e-3), 20.0)
             np.testing.assert_array_equal(right.latest("actuator_state").applied, before)
     finally:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)  # as systemd stops a service
         assert process.wait(40.0) == 0

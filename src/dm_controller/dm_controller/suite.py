@@ -162,16 +162,20 @@ class Suite:
             raise RuntimeError(f"the node {name} ended with status {status}{tail}")
 
     def stop(self, timeout_s: float = 15.0) -> None:
-        """Stop all nodes in reverse order of their start; a node that does not end in time is killed."""
-        for _name, process in reversed(list(self._processes.items())):
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
+        """Stop all nodes, the emulated hardware last; a node that does not end in time is killed."""
+        hardware = [process for name, process in self._processes.items() if name == "virtual_bench"]
+        nodes = [process for process in self._processes.values() if process not in hardware]
+        for group in (nodes, hardware):
+            for process in group:
+                if process.poll() is None:
+                    process.send_signal(signal.SIGINT)
             deadline = time.monotonic() + timeout_s
-            while process.poll() is None and time.monotonic() < deadline:
-                time.sleep(0.01)
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+            for process in group:
+                try:
+                    process.wait(max(deadline - time.monotonic(), 0.0))
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
 
     def __exit__(
         self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import signal
 import tempfile
-import time
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -38,10 +39,15 @@ def up(
     ] = None,
     logs: Annotated[Path | None, typer.Option(help="Write the nodes' output to files in this folder instead.")] = None,
 ) -> None:
-    """Start the nodes and keep them running until Ctrl-C; the mirror is then ramped to its safe shape."""
+    """Start the nodes and keep them running until Ctrl-C or SIGTERM; the mirror is then ramped to its safe shape."""
     from dm_controller.suite import Suite
 
     mirrors = configurations(config or [], namespace or [""])
+    stop = threading.Event()
+    # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
+    # because a shell starts commands in the background with SIGINT ignored.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: stop.set())
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
         folder = logs if logs is not None else Path(temporary)
         suites = [
@@ -52,13 +58,10 @@ def up(
             kind = "virtual bench" if "virtual_bench" in configuration else "hardware"
             console.print(f"the nodes {f'of {name} ' if name else ''}are starting ({kind})")
         console.print("Ctrl-C stops them and makes every mirror safe")
-        try:
-            while True:
-                for suite in suites:
-                    suite.check()
-                time.sleep(0.2)
-        except KeyboardInterrupt:
-            console.print("\nstopping")
+        while not stop.wait(0.2):
+            for suite in suites:
+                suite.check()
+        console.print("\nstopping")
 
 
 def configurations(files: list[Path], namespaces: list[str]) -> dict[str, Config]:
