@@ -13,6 +13,8 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
+from dm_driver.electronics.frame_format import FrameFormat
+
 EDAC40_TABLE = [
     *(6, 7, 4, 5, 2, 3, 0, 1, 22, 23, 20, 21, 18, 19, 16, 17, 14, 15, 12, 13),
     *(10, 11, 8, 9, 38, 39, 36, 37, 34, 35, 32, 33, 30, 31, 28, 29, 26, 27, 24, 25),
@@ -59,6 +61,25 @@ def decode_dac40(data: bytes) -> Frame:
                 code = 2 * code + (byte >> chip & 1)
             frame[DAC40_TABLE[5 * group + chip]] = code
     return frame
+
+
+def crc16_modbus(data: bytes) -> int:
+    """Bit by bit, as the Modbus specification tells it."""
+    register = 0xFFFF
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = register >> 1 ^ (0xA001 if register & 1 else 0)
+    return register
+
+
+def decode_framed(data: bytes) -> Frame:
+    """Decode the 86 bytes that `FramedSerialUnit` takes."""
+    assert len(data) == 86 and data[:2] == b"\xa5\x5a" and data[84:] == b"\r\n"
+    assert data[82] + 256 * data[83] == crc16_modbus(data[2:82])
+    words = [data[2 + 2 * k] + 256 * data[3 + 2 * k] for k in range(40)]
+    # Two's complement about mid scale, the last channel first.
+    return {39 - k: (word + 0x8000) % 0x10000 for k, word in enumerate(words)}
 
 
 class DriveUnit:
@@ -253,8 +274,47 @@ class UsbDac40Unit(DriveUnit):
                     self.frames.append(decode_dac40(part))
 
 
+class FramedSerialUnit(UsbDac40Unit):
+    """A unit whose frames need every part of the description."""
+
+    kind = "framed_serial"
+
+    @property
+    def settings(self) -> dict[str, object]:
+        frame = FrameFormat(
+            channels=40,
+            bits=16,
+            header="A5 5A",
+            terminator="0D 0A",
+            channel_order=tuple(range(39, -1, -1)),
+            byte_order="little",
+            offset=-32768,
+            checksum="crc16_modbus",
+            checksum_covers_header=False,
+            checksum_byte_order="little",
+            opening="55 55",
+            reply="06",
+            baud_rate=921600,
+        )
+        return {"serial_port": str(self._path), "frame": frame}
+
+    def _serve(self) -> None:
+        buffer = b""
+        while not self._stop.is_set():
+            if not select.select([self._master], [], [], 0.02)[0]:
+                continue
+            data = os.read(self._master, 4096)
+            self.raw += data
+            buffer = (buffer + data).removeprefix(b"\x55\x55")
+            while len(buffer) >= 86:
+                part, buffer = buffer[:86], buffer[86:]
+                self.frames.append(decode_framed(part))
+                os.write(self._master, b"\x06")
+
+
 UNITS: dict[str, Callable[[Path], DriveUnit]] = {
     "edac40_tcp": lambda folder: Edac40TcpUnit(),
     "edac40_udp": lambda folder: Edac40UdpUnit(),
     "usb_dac40": UsbDac40Unit,
+    "framed_serial": FramedSerialUnit,
 }

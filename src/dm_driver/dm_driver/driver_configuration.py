@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_driver.electronics import BACK_ENDS, DriveElectronics, ElectronicsSettings, make_electronics
+from dm_driver.electronics import DriveElectronics, ElectronicsSettings, make_electronics
+from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.output_stage import OutputStage
 from dm_driver.refusal import Refusal
@@ -54,15 +57,16 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         raise ValueError("mirror.serial is empty: must be the mirror's serial number")
     actuators = values["mirror.actuators"]
     kind = values["electronics.kind"]
+    serial_port = values["electronics.serial_port"]
     settings = ElectronicsSettings(
         address=values["electronics.address"],
         port=values["electronics.port"],
         discovery_port=values["electronics.discovery_port"],
-        serial_port=values["electronics.serial_port"],
+        serial_port=str(Path(serial_port).expanduser()) if serial_port else "",
         timeout_s=values["electronics.timeout"],
+        frame=_frame(values) if kind == "framed_serial" else FrameFormat(),
     )
-    make_electronics(kind, settings)  # finds a missing setting now
-    back_end = BACK_ENDS[kind]
+    back_end = make_electronics(kind, settings)  # finds a missing setting now
     channel_of_actuator = wiring_table(values["mirror.wiring"], values["mirror.channels"], actuators, back_end.channels)
     scale = VoltScale(
         max_code=back_end.max_code,
@@ -86,14 +90,15 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         neighbour_difference=values["limits.neighbour_difference"],
         neighbour_a=neighbour_a,
         neighbour_b=neighbour_b,
-        step=values["limits.step"],
+        step=values["limits.step"] / back_end.frames_per_step,
         slew_rate=values["limits.slew_rate"],
         command_age=values["limits.command_age"],
         command_lead=values["limits.command_lead"],
     )
     if limits.step < scale.resolution:
         raise ValueError(
-            f"limits.step = {limits.step:g}: must be at least {scale.resolution:.3g}, the signal of one DAC code"
+            f"limits.step = {values['limits.step']:g}: must be at least "
+            f"{scale.resolution * back_end.frames_per_step:.3g}, the signal of one DAC code per frame"
         )
     limiter = SafetyLimiter(limits)
     try:
@@ -106,9 +111,14 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         limiter=limiter,
         output=OutputStage(scale, channel_of_actuator, back_end.channels),
         safe_shape=safe_shape,
-        settings=settings,
+        settings=replace(settings, doubt=math.floor(limits.step / scale.resolution)),
         kind=kind,
     )
+
+
+def _frame(values: Mapping[str, Any]) -> FrameFormat:
+    prefix = "framed_serial."
+    return FrameFormat(**{name.removeprefix(prefix): values[name] for name in values if name.startswith(prefix)})
 
 
 def _positions(values: Mapping[str, Any], actuators: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

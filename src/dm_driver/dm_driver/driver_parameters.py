@@ -6,7 +6,11 @@ import math
 from typing import Final
 
 from dm_driver.electronics import BACK_ENDS
+from dm_driver.electronics.check_sums import CHECK_SUMS
+from dm_driver.electronics.frame_format import BYTE_ORDERS, MOST_BITS, MOST_WORD_BITS, PARITIES, FrameFormat
 from dm_runtime.parameters import REQUIRED, Parameter
+
+_FRAME: Final = FrameFormat()
 
 PARAMETERS: Final = (
     Parameter("autostart", bool, True, "Configure and activate by itself after the start."),
@@ -53,8 +57,74 @@ PARAMETERS: Final = (
         low=0,
         high=65535,
     ),
-    Parameter("electronics.serial_port", str, "", "USB DAC-40: device file, for example /dev/ttyUSB0."),
+    Parameter("electronics.serial_port", str, "", "USB DAC-40, framed_serial: device file, for example /dev/ttyUSB0."),
     Parameter("electronics.timeout", float, 1.0, "Longest wait for the electronics.", "s", 0.01, 60.0),
+    Parameter("framed_serial.channels", int, _FRAME.channels, "Output channels of the unit.", low=1, high=4096),
+    Parameter("framed_serial.bits", int, _FRAME.bits, "Bits of a code.", low=1, high=MOST_BITS),
+    Parameter("framed_serial.header", str, _FRAME.header, "Bytes before the words, hexadecimal, for example 'A5 5A'."),
+    Parameter("framed_serial.terminator", str, _FRAME.terminator, "Bytes after the check sum, hexadecimal."),
+    Parameter(
+        "framed_serial.channel_order",
+        "int[]",
+        [],
+        "Connector channels, from 0, in the order of their words; empty = 0, 1, 2, ...",
+        low=0,
+        high=4095,
+    ),
+    Parameter(
+        "framed_serial.word_bits",
+        int,
+        _FRAME.word_bits,
+        "Bits of a word on the wire, no gaps between words; 0 = framed_serial.bits rounded up to whole bytes.",
+        low=0,
+        high=MOST_WORD_BITS,
+    ),
+    Parameter(
+        "framed_serial.byte_order",
+        str,
+        _FRAME.byte_order,
+        "big: words begin with their most significant bit; little: with their least significant byte and bit.",
+        choices=BYTE_ORDERS,
+    ),
+    Parameter("framed_serial.scale", int, _FRAME.scale, "word = offset + scale * code.", low=-(2**31), high=2**31),
+    Parameter(
+        "framed_serial.offset",
+        int,
+        _FRAME.offset,
+        "word = offset + scale * code; negative words in two's complement.",
+        low=-(2**31),
+        high=2**32,
+    ),
+    Parameter("framed_serial.checksum", str, _FRAME.checksum, "Check sum.", choices=tuple(CHECK_SUMS)),
+    Parameter(
+        "framed_serial.checksum_covers_header", bool, _FRAME.checksum_covers_header, "The check sum counts the header."
+    ),
+    Parameter(
+        "framed_serial.checksum_byte_order",
+        str,
+        _FRAME.checksum_byte_order,
+        "Of check sums of two bytes.",
+        choices=BYTE_ORDERS,
+    ),
+    Parameter("framed_serial.opening", str, _FRAME.opening, "Bytes sent once after opening, hexadecimal."),
+    Parameter(
+        "framed_serial.reply",
+        str,
+        _FRAME.reply,
+        "What the unit answers to every frame within electronics.timeout, hexadecimal; empty = it does not answer.",
+    ),
+    Parameter("framed_serial.baud_rate", int, _FRAME.baud_rate, "Of the line.", "bit/s", 50, 10_000_000),
+    Parameter("framed_serial.parity", str, _FRAME.parity, "Parity bit.", choices=PARITIES),
+    Parameter("framed_serial.stop_bits", int, _FRAME.stop_bits, "Stop bits.", low=1, high=2),
+    Parameter(
+        "framed_serial.frame_rate",
+        float,
+        _FRAME.frame_rate,
+        "Most frames per second; 0 = as many as the line carries.",
+        "Hz",
+        0.0,
+        1e6,
+    ),
     Parameter("volts.dac_at_zero", float, REQUIRED, "DAC output for code 0 (EDAC40 as delivered: -6).", "V"),
     Parameter("volts.dac_at_full", float, REQUIRED, "DAC output for the full-scale code (EDAC40: +6).", "V"),
     Parameter("volts.amplifier_gain", float, REQUIRED, "Actuator volts per DAC volt (about 80)."),

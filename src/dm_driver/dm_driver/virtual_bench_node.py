@@ -48,7 +48,7 @@ class VirtualBenchNode(Node):
         endpoints.publish(String(data=json.dumps(self.bench.endpoints)))
         WorkerService(self, Trigger, "~/trigger", self._trigger)
         WorkerService(self, SetBool, "~/power", self._power)
-        Diagnostics(self, "virtual PDM30-37", self._check)
+        Diagnostics(self, f"virtual {values['mirror.name']}", self._check)
         self._ticker: threading.Thread | None = None
         if self._fast_clock is not None:
             # Reliable, depth 1: matches the best-effort subscriptions of all time sources and any stricter one.

@@ -153,6 +153,17 @@ def test_layout_of_the_actuators() -> None:
         Plate(PlateConfig(pitch=6e-3))
 
 
+def test_other_numbers_of_actuators() -> None:
+    solved = Plate(PlateConfig(actuators=19, pitch=7e-3))
+    assert solved.influence.shape == (len(solved.terms), 19)
+    given = Plate(PlateConfig(actuator_x=tuple(solved.x), actuator_y=tuple(solved.y)))
+    np.testing.assert_allclose(given.influence, solved.influence)
+    with pytest.raises(ValueError, match=r"plate\.actuators = 20: full rings hold 1, 7, 19"):
+        Plate(PlateConfig(actuators=20))
+    with pytest.raises(ValueError, match=r"plate\.actuator_x has 1 values, plate\.actuator_y 0"):
+        Plate(PlateConfig(actuator_x=(0.0,)))
+
+
 def test_design_numbers(plate: Plate) -> None:
     """Agreed: condition number 11.8 for Zernikes 2-21, coupling 0.46, up to 83 nm beyond 21 terms for one poke of full
     stroke, fitting limit 3.0 / 7.7 / 16.5 nm rms at 20 / 22 / 24 mm. A 1 mm plate: 3.7 and 0.12."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import shutil
-import socket
 import time
 from enum import StrEnum
 from pathlib import Path
@@ -13,6 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_controller.cli.demo_bench import bench_config
+from dm_controller.cli.demo_bench import free_ports as free_ports
 from dm_controller.cli.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
 
 #: Curvatures of the sweep [1/m]: the paper's range (section 3.2).
@@ -26,59 +26,6 @@ class Hysteresis(StrEnum):
     prandtl_ishlinskii = "prandtl_ishlinskii"
     preisach = "preisach"
     bouc_wen = "bouc_wen"
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports that are free on loopback now, for TCP and UDP alike."""
-    sockets: list[socket.socket] = []
-    while len(sockets) < count:
-        stream = socket.create_server(("127.0.0.1", 0))
-        datagram = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            datagram.bind(stream.getsockname())
-        except OSError:
-            stream.close()
-            continue
-        finally:
-            datagram.close()
-        sockets.append(stream)
-    ports = [item.getsockname()[1] for item in sockets]
-    for item in sockets:
-        item.close()
-    return ports
-
-
-def bench_config(folder: Path, law: str, creep: float, seed: int, speed: float) -> dict[str, dict[str, Any]]:
-    """The shipped bench configuration with ports and folders of this run's own, and time running `speed` times fast."""
-    from dm_controller.cli.up import shared_config
-    from dm_controller.suite import load_config
-
-    config = copy.deepcopy(load_config(shared_config("bench.yaml")))
-    tcp, udp, discovery, trigger = free_ports(4)
-    config["virtual_bench"] |= {
-        "seed": seed,
-        "piezo.law": "none" if law == "off" else law,
-        "piezo.creep": creep,
-        "electronics.tcp_port": tcp,
-        "electronics.udp_port": udp,
-        "electronics.discovery_port": discovery,
-        "trigger.port": trigger,
-        "clock.speed": speed,
-        "output_folder": str(folder / "maps"),
-    }
-    config["pdm_driver"]["electronics.port"] = tcp
-    config["pdm_driver"]["state_folder"] = str(folder / "driver")
-    command = [str(trigger) if part == "12343" else part for part in config["interferometer"]["trigger_command"]]
-    config["interferometer"] |= {"watch_folder": str(folder / "maps"), "trigger_command": command}
-    config["calibration"] |= {"calibration_folder": str(folder / "calibrations"), "load_on_start": ""}
-    (folder / "maps").mkdir(parents=True, exist_ok=True)
-    if speed > 0:
-        # Ages are in ROS time, in which the same delay between two processes is `speed` times as long.
-        config["pdm_driver"]["limits.command_age"] = max(1.0, speed)
-        config["focus_controller"]["request_age"] = max(1.0, speed)
-        for name in config:
-            config[name]["use_sim_time"] = name != "virtual_bench"
-    return config
 
 
 def sample_map() -> Path | None:
@@ -226,6 +173,9 @@ def demo(
         int, typer.Option(min=0, help="Maps to identify hysteresis and creep from; 0 = leave that out.")
     ] = 200,
     map_file: Annotated[Path | None, typer.Option("--map", help="A real ZYGO file to ingest first.")] = None,
+    config_file: Annotated[
+        Path | None, typer.Option("--config", help="Parameter file of another virtual bench, such as mirror_19.yaml.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for logs, calibration and picture.")] = Path("runs/demo"),
     keep_maps: Annotated[bool, typer.Option(help="Keep the map files (about 4 MB each).")] = False,
     camera: Annotated[
@@ -233,7 +183,7 @@ def demo(
     ] = False,
     json: JsonOption = None,
 ) -> None:
-    """Calibrate a virtual PDM30-37 through the real nodes, wire protocol and file formats, then focus it."""
+    """Calibrate a virtual mirror (a PDM30-37) through the real nodes, wire protocol and file formats, then focus it."""
     if camera:
         from dm_controller.cli.demo_camera import demo_camera
 
@@ -252,7 +202,8 @@ def demo(
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
     actual_creep = creep if creep is not None else (0.0 if hysteresis is Hysteresis.off else 0.01)
-    config = bench_config(folder, hysteresis.value, actual_creep, seed, speed)
+    config = bench_config(folder, hysteresis.value, actual_creep, seed, speed, config_file)
+    name = config["pdm_driver"].get("mirror.name", "PDM30-37")
     figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": actual_creep, "seed": seed}
     with own_domain() as domain:
         real = map_file if map_file is not None else sample_map()
@@ -261,7 +212,7 @@ def demo(
         else:
             console.print("no real ZYGO map at hand; give one with --map FILE")
         console.print(
-            f"virtual bench: PDM30-37, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
+            f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
             f"seed {seed}; logs in {os.path.relpath(folder)}"
         )
         with Suite(config, folder, domain) as suite, DeformableMirrorClient(domain=domain) as client:
@@ -288,7 +239,7 @@ def demo(
                 suite.check()  # a node that died explains more than the request that failed
                 raise
     show_sweep(rows, fitting_limit, "hysteresis and creep inverted" if without_memory else "influence function alone")
-    title = f"PDM30-37 twin, hysteresis: {hysteresis.value}"
+    title = f"{name} twin, hysteresis: {hysteresis.value}"
     picture = save_sweep_figure(rows, folder / "demo.png", title, mirror, without_memory)
     console.print(f"picture: {os.path.relpath(picture)}")
     if not keep_maps:

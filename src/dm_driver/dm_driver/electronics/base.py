@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dm_driver.electronics.frame_format import FrameFormat
 
 
 class ElectronicsError(Exception):
@@ -38,6 +40,9 @@ class ElectronicsSettings:
         discovery_port: UDP port on which the unit answers discovery; 0 = not used.
         serial_port: device file.
         timeout_s: longest wait for the unit to take a frame or to answer.
+        frame: of a framed serial unit.
+        doubt: codes by which frames on their way may differ from what has surely arrived, where a back end can tell;
+            0 = any.
     """
 
     address: str = ""
@@ -45,6 +50,8 @@ class ElectronicsSettings:
     discovery_port: int = 0
     serial_port: str = ""
     timeout_s: float = 1.0
+    frame: FrameFormat = field(default_factory=FrameFormat)
+    doubt: int = 0
 
 
 class DriveElectronics(ABC):
@@ -57,9 +64,12 @@ class DriveElectronics(ABC):
     """
 
     #: Number of output channels at the connector.
-    channels: ClassVar[int]
+    channels: int
     #: Code of full scale.
-    max_code: ClassVar[int]
+    max_code: int
+    #: Frames per `limits.step` of a ramp: more than one where a frame may be lost without a trace, so that the next one
+    #: is no larger step.
+    frames_per_step: int = 1
 
     def __init__(self) -> None:
         self._open = False

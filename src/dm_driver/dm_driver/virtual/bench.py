@@ -25,14 +25,15 @@ from dm_driver.virtual.zygo_files import FORMATS, UNITS, deliver, encode_dat, en
 
 @dataclass(frozen=True)
 class FilesConfig:
-    """Map files: where they go, "dat" or "datx", unit of .datx heights, intensity frame in .dat, and seconds over which
-    a file grows (0: it appears whole)."""
+    """Map files: where they go, "dat" or "datx", unit of .datx heights, intensity frame in .dat, seconds over which a
+    file grows (0: it appears whole), and the name of the part."""
 
     folder: Path = Path("maps")
     format: str = "datx"
     datx_unit: str = "NanoMeters"
     intensity: bool = False
     slow_write: float = 0.0
+    part_name: str = "PDM30-37"
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class VirtualBench:
             self._on_event(True, wrong)
 
     def displacement(self) -> Array:
-        """Base displacements (37,), m, at this moment, with all frames that have arrived."""
+        """Base displacements (N,), m, at this moment, with all frames that have arrived."""
 
         def sample() -> Array:
             self.piezo.advance(self._now())
@@ -151,11 +152,11 @@ class VirtualBench:
             sag = instrument.measure(displacement)
             if path is None:
                 path = self._next_path()
-            wavelength = instrument.config.wavelength
+            facts = (sag, instrument.pitch, instrument.config.wavelength, stamp)
             if path.suffix == ".dat":
-                content = encode_dat(sag, instrument.pitch, wavelength, stamp, intensity=files.intensity)
+                content = encode_dat(*facts, intensity=files.intensity, part_name=files.part_name)
             else:
-                content = encode_datx(sag, instrument.pitch, wavelength, stamp, unit=files.datx_unit)
+                content = encode_datx(*facts, unit=files.datx_unit, part_name=files.part_name)
             deliver(content, path, files.slow_write)
             self.maps_written += 1
         return path

@@ -30,7 +30,8 @@ class DriveConfig:
         amplifier_gain: actuator volts per DAC volt.
         amplifier_min, amplifier_max: where the amplifier saturates, V at the actuator.
         volts_min, volts_max: V at the actuator for signals -1 and +1.
-        wiring: connector channel (0-based) that actuator 1..37 is really connected to.
+        wiring: connector channel (0-based) that actuator 1, 2, ... is really connected to.
+        channels: at the connector; EDAC40 and USB DAC-40 have 40.
     """
 
     dac_volts_at_zero: float = 0.0
@@ -41,10 +42,11 @@ class DriveConfig:
     volts_min: float = 0.0
     volts_max: float = 300.0
     wiring: Sequence[int] = TRIHEX
+    channels: int = frames.CHANNELS
 
 
 class DriveUnit:
-    """Forty outputs that hold their values until the next frame, whoever sent it.
+    """Outputs that hold their values until the next frame, whoever sent it.
 
     After power-up every actuator is at 0 V, or as near as the DAC reaches.
 
@@ -55,8 +57,9 @@ class DriveUnit:
     def __init__(self, config: DriveConfig) -> None:
         self.config = config
         wiring = np.asarray(config.wiring, int)
-        if len(np.unique(wiring)) != len(wiring) or wiring.min() < 0 or wiring.max() >= frames.CHANNELS:
-            raise ValueError(f"wiring = {list(config.wiring)}: must be different channels from 0 to 39")
+        last = config.channels - 1
+        if len(np.unique(wiring)) != len(wiring) or wiring.min() < 0 or wiring.max() > last:
+            raise ValueError(f"wiring = {list(config.wiring)}: must be different channels from 0 to {last}")
         for name, value in (
             ("electronics.dac_volts_at_full - electronics.dac_volts_at_zero", self._span),
             ("electronics.amplifier_gain", config.amplifier_gain),
@@ -67,8 +70,8 @@ class DriveUnit:
                 raise ValueError(f"{name} = 0: must not be zero")
         self._wiring = wiring
         at_rest = np.clip(-config.dac_volts_at_zero / self._span, 0, 1)
-        #: Outputs as fractions of the DAC's range (40,).
-        self.outputs: Array = np.full(frames.CHANNELS, at_rest)
+        #: Outputs as fractions of the DAC's range; a unit of few channels still has the registers of an EDAC40.
+        self.outputs: Array = np.full(max(frames.CHANNELS, config.channels), at_rest)
         self._codes = np.zeros(frames.CHANNELS, np.int64)
         self._offset = np.full(frames.CHANNELS, 0x8000, np.int64)
         self._gain = np.full(frames.CHANNELS, 0xFFFF, np.int64)
@@ -92,22 +95,27 @@ class DriveUnit:
             elif frame.command == frames.EDAC40_GLOBAL_OFFSET:
                 self._global_offset = int(frame.values[-1]) & 0x3FFF
         if frame.command != frames.EDAC40_SAVE:
+            outputs = self.outputs[: frames.CHANNELS]
             dac = self._codes * (self._gain + 1) // 65536 + self._offset - 0x8000
             shift = 4 * (self._global_offset - FACTORY_GLOBAL_OFFSET)
             touched = slice(None) if frame.command == frames.EDAC40_GLOBAL_OFFSET else frame.channels
-            self.outputs[touched] = ((np.clip(dac, 0, EDAC40_FULL_SCALE) - shift) / EDAC40_FULL_SCALE)[touched]
+            outputs[touched] = ((np.clip(dac, 0, EDAC40_FULL_SCALE) - shift) / EDAC40_FULL_SCALE)[touched]
 
     def take_dac40(self, codes: NDArray[np.int64]) -> None:
         """Carry out a USB DAC-40 frame: codes (40,) by connector channel."""
-        self.outputs = codes / DAC40_FULL_SCALE
+        self.outputs[: frames.CHANNELS] = codes / DAC40_FULL_SCALE
+
+    def take_shares(self, outputs: Array) -> None:
+        """Set all channels (C,) to shares of the DAC's range."""
+        self.outputs[: len(outputs)] = outputs
 
     def actuator_volts(self) -> Array:
-        """Volts at the actuators (37,)."""
+        """Volts at the actuators (N,)."""
         config = self.config
         dac_volts = config.dac_volts_at_zero + self._span * self.outputs[self._wiring]
         return np.clip(config.amplifier_gain * dac_volts, config.amplifier_min, config.amplifier_max)
 
     def signals(self) -> Array:
-        """Normalised signals (37,) that the actuators really get; beyond -1..+1 when driven too far."""
+        """Normalised signals (N,) that the actuators really get; beyond -1..+1 when driven too far."""
         config = self.config
         return 2 * (self.actuator_volts() - config.volts_min) / (config.volts_max - config.volts_min) - 1

@@ -1,4 +1,4 @@
-"""The units on the wire: an EDAC40 on loopback TCP and UDP with discovery, a USB DAC-40 on a pseudo-terminal.
+"""The units on the wire: an EDAC40 on loopback TCP and UDP with discovery, a serial unit on a pseudo-terminal.
 
 One thread owns all sockets and, through `run()`, everything that frames change: frames are carried out in the order in
 which they arrived, and whoever asks for the state sees every frame that was sent before the question.
@@ -13,13 +13,14 @@ import time
 import tty
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
 from dm_driver.virtual import frames
 from dm_driver.virtual.drive_unit import DriveUnit
 from dm_driver.virtual.event_loop import EventLoop
+from dm_driver.virtual.framed_unit import FramedConfig, FramedDecoder
 from dm_driver.virtual.frames import FrameError
 
 T = TypeVar("T")
@@ -33,13 +34,14 @@ DISCOVERY_ANSWER = b"EDAC40".ljust(17) + b"02-00-00-DA-C4-00\r\n"
 
 @dataclass(frozen=True)
 class PortsConfig:
-    """Where the units are to be found: loopback ports (0 = any free one, -1 = off), and the path of a symbolic link to
-    the pseudo-terminal ("" = off)."""
+    """Where the units are to be found: loopback ports (0 = any free one, -1 = off), the path of a symbolic link to the
+    pseudo-terminal ("" = off), and what is spoken there (by default a USB DAC-40)."""
 
     tcp_port: int = 1234
     udp_port: int = 1234
     discovery_port: int = 30303
     pty_link: str = ""
+    framed: FramedConfig = field(default_factory=FramedConfig)
 
 
 class ElectronicsServer:
@@ -79,6 +81,7 @@ class ElectronicsServer:
         self._terminal_name = ""
         self._stream = bytearray()
         self._serial = bytearray()
+        self._framed = FramedDecoder(ports.framed) if ports.framed.channels else None
         self._loop = EventLoop("electronics", lambda error: on_event(f"{type(error).__name__}: {error}"))
         try:
             self._loop.run(self._plug)
@@ -201,6 +204,8 @@ class ElectronicsServer:
         assert self._client is not None and self._listener is not None
         try:
             received = self._client.recv(65536)
+            # Acknowledge at once, as small network stacks do; Linux would wait 40 ms for more.
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         except BlockingIOError:
             return
         except OSError as error:
@@ -265,6 +270,7 @@ class ElectronicsServer:
         if link.is_symlink() and str(link.readlink()).startswith("/dev/pts/"):
             link.unlink()  # left behind by a bench that was killed
         try:
+            link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(self._terminal_name)
         except OSError as error:
             raise OSError(f"electronics.pty_link = {str(link)!r}: {error}") from None
@@ -276,6 +282,9 @@ class ElectronicsServer:
         try:
             self._serial += os.read(self._terminal[0], 65536)
         except OSError:
+            return
+        if self._framed is not None:
+            self._take_framed(self._framed)
             return
         while len(self._serial) >= frames.DAC40_FRAME:
             frame = bytes(self._serial[: frames.DAC40_FRAME])
@@ -292,6 +301,21 @@ class ElectronicsServer:
             if codes is not None:
                 self._unit.take_dac40(codes)
                 self._on_update()
+
+    def _take_framed(self, decoder: FramedDecoder) -> None:
+        assert self._terminal is not None
+        while True:
+            try:
+                outputs = decoder.take(self._serial)
+            except FrameError as error:
+                self._reject("serial", str(error), b"")
+                continue
+            if outputs is None:
+                return
+            self._unit.take_shares(outputs)
+            self._on_update()
+            if decoder.reply:
+                os.write(self._terminal[0], decoder.reply)
 
 
 def _bind(endpoint: socket.socket, port: int, name: str, patience_s: float = 0.0) -> None:

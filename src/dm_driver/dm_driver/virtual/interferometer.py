@@ -1,6 +1,6 @@
 """The camera: what a Fizeau interferometer would report of the plate, with its noise, piston, tilt and dropouts.
 
-Everything smooth (37 influence functions to order 36, initial figure, low-order noise, piston, tilt) is a polynomial in
+Everything smooth (influence functions to order 36, initial figure, low-order noise, piston, tilt) is a polynomial in
 x and y over the field, so a map is two thin matrix products, T(y) C T(x)^T with T the Chebyshev polynomials at the
 pixel centres: about 3 ms for 944 x 944 pixels, and no influence maps to keep in memory.
 """
@@ -121,7 +121,7 @@ class Interferometer:
         return other
 
     def surface(self, displacement: Array) -> Array:
-        """The true surface over the field, without the instrument's noise, for bases at `displacement` (37,), m.
+        """The true surface over the field, without the instrument's noise, for bases at `displacement` (N,), m.
 
         Returns:
             Sag in m as coefficients (p, q) of T_p(y) T_q(x), x and y in units of the field's radius.
@@ -145,7 +145,7 @@ class Interferometer:
         return self._camera(sag)
 
     def measure(self, displacement: Array) -> Array:
-        """A map of the surface with spring bases at `displacement` (37,), m: (pixels, pixels), m, NaN = no data."""
+        """A map of the surface with spring bases at `displacement` (N,), m: (pixels, pixels), m, NaN = no data."""
         config, rng = self.config, self._noise
         low = np.empty(len(self._low_orders))
         low[0] = config.piston_spread * rng.standard_normal()

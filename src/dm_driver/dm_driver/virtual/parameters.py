@@ -11,6 +11,7 @@ from dm_driver.virtual.bench import BenchConfig, FilesConfig
 from dm_driver.virtual.camera import CameraConfig
 from dm_driver.virtual.drive_unit import DriveConfig
 from dm_driver.virtual.electronics import PortsConfig
+from dm_driver.virtual.framed_unit import BYTE_ORDERS, CHECK_LENGTH, FramedConfig
 from dm_driver.virtual.hysteresis import LAWS
 from dm_driver.virtual.interferometer import InterferometerConfig
 from dm_driver.virtual.monitor import MonitorConfig
@@ -21,19 +22,28 @@ from dm_runtime.parameters import Parameter
 
 _PLATE, _PIEZO, _CAMERA, _SCENE = PlateConfig(), PiezoConfig(), InterferometerConfig(), CameraConfig()
 _DRIVE, _PORTS, _WATCH, _FILES = DriveConfig(), PortsConfig(), MonitorConfig(), FilesConfig()
+_FRAMED = FramedConfig()
 _PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
 
 TABLE = (
     Parameter("seed", int, 1, "Fixes gains, initial figure and noise.", low=0, high=2**31),
+    Parameter("mirror.name", str, _FILES.part_name, "Model of the mirror, as map files name it."),
     Parameter("plate.diameter", float, _PLATE.diameter, "Diameter of the faceplate.", "m", 1e-3, 1.0),
     Parameter("plate.thickness", float, _PLATE.thickness, "Thickness of the faceplate.", "m", 1e-5, 0.1),
     Parameter("plate.youngs_modulus", float, _PLATE.youngs_modulus, "Young's modulus.", "Pa", 1e6, 1e13),
     Parameter("plate.poisson_ratio", float, _PLATE.poisson_ratio, "Poisson's ratio.", "", 0.0, 0.49),
     Parameter("plate.spring_stiffness", float, _PLATE.spring_stiffness, "Stiffness of one stack.", "N/m", 1.0, 1e12),
+    Parameter("plate.actuators", int, _PLATE.actuators, "Actuators of the hexagonal pattern.", "", 7, 1000),
     Parameter("plate.pitch", float, _PLATE.pitch, "Distance of neighbouring actuators.", "m", 1e-4, 0.1),
     Parameter("plate.start_angle", float, _PLATE.start_angle, "Angle of actuator 2 from the x axis.", "rad", -7.0, 7.0),
     Parameter("plate.clockwise", bool, _PLATE.clockwise, "Whether actuators are numbered clockwise in their rings."),
     Parameter("plate.order", int, _PLATE.order, "Radial order of the Ritz solution.", low=12, high=60),
+    Parameter(
+        "plate.actuator_x", "float[]", [], "Actuator positions, x, in place of the hexagonal pattern.", "m", -1.0, 1.0
+    ),
+    Parameter(
+        "plate.actuator_y", "float[]", [], "Actuator positions, y, in place of the hexagonal pattern.", "m", -1.0, 1.0
+    ),
     Parameter("piezo.stroke", float, _PIEZO.stroke, "Stroke of a stack from signal -1 to +1.", "m", 0.0, 1e-3),
     Parameter("piezo.gain_spread", float, _PIEZO.gain_spread, "Standard deviation of relative gains.", "", 0.0, 0.3),
     Parameter("piezo.law", str, _PIEZO.law, "Hysteresis law.", choices=LAWS),
@@ -95,8 +105,26 @@ TABLE = (
     ),
     Parameter(
         "electronics.pty_link", str, _PORTS.pty_link,
-        "Path of a symbolic link to the pseudo-terminal of the USB DAC-40; empty = not offered.",
+        "Path of a symbolic link to the pseudo-terminal of the USB DAC-40 or the framed unit; empty = not offered.",
     ),
+    Parameter(
+        "framed.channels", int, _FRAMED.channels, "Words in a frame of the serial unit; 0 = it is a USB DAC-40.", "",
+        0, 4096,
+    ),
+    Parameter("framed.bits", int, _FRAMED.bits, "Bits of a code of the serial unit.", "", 1, 16),
+    Parameter("framed.header", str, _FRAMED.header, "Bytes before the words, hexadecimal."),
+    Parameter("framed.terminator", str, _FRAMED.terminator, "Bytes after the check sum, hexadecimal."),
+    Parameter("framed.opening", str, _FRAMED.opening, "Bytes that may come before a frame, hexadecimal."),
+    Parameter("framed.reply", str, _FRAMED.reply, "Answer to every frame, hexadecimal."),
+    Parameter("framed.channel_order", "int[]", [], "Channels in the order of their words.", "", 0, 4095),
+    Parameter("framed.word_bits", int, _FRAMED.word_bits, "Bits of a word; 0 = whole bytes.", "", 0, 32),
+    Parameter("framed.byte_order", str, _FRAMED.byte_order, "Order of bytes and bits.", choices=BYTE_ORDERS),
+    Parameter("framed.scale", int, _FRAMED.scale, "word = offset + scale * code.", "", -(2**31), 2**31),
+    Parameter("framed.offset", int, _FRAMED.offset, "word = offset + scale * code.", "", -(2**31), 2**32),
+    Parameter("framed.checksum", str, _FRAMED.checksum, "Check sum.", choices=tuple(CHECK_LENGTH)),
+    Parameter("framed.checksum_covers_header", bool, _FRAMED.checksum_covers_header, "It counts the header."),
+    Parameter("framed.checksum_byte_order", str, _FRAMED.checksum_byte_order, "Of two bytes.", choices=BYTE_ORDERS),
+    Parameter("electronics.channels", int, _DRIVE.channels, "Channels at the connector.", "", 1, 4096),
     Parameter(
         "electronics.dac_volts_at_zero", float, _DRIVE.dac_volts_at_zero, "DAC output at code 0.", "V", -100.0, 100.0
     ),
@@ -109,7 +137,7 @@ TABLE = (
     Parameter("volts.min", float, _DRIVE.volts_min, "Actuator volts at signal -1.", "V", -1e4, 1e4),
     Parameter("volts.max", float, _DRIVE.volts_max, "Actuator volts at signal +1.", "V", -1e4, 1e4),
     Parameter(
-        "wiring", "int[]", list(_DRIVE.wiring), "True connector channel (0-based) of actuators 1-37.", low=0, high=39
+        "wiring", "int[]", list(_DRIVE.wiring), "True connector channel (0-based) of actuators 1, 2, ...", "", 0, 4095
     ),
     Parameter("monitor.jump", float, _WATCH.jump, "Counted: change per frame above this; 0 = off.", "", 0.0, 4.0),
     Parameter(
@@ -147,9 +175,13 @@ def bench_config(values: Mapping[str, Any]) -> BenchConfig:
 
     electronics = group("electronics")
     ports = {name: electronics.pop(name) for name in ("tcp_port", "udp_port", "discovery_port", "pty_link")}
+    if ports["pty_link"]:
+        ports["pty_link"] = str(Path(ports["pty_link"]).expanduser())
     return BenchConfig(
         seed=values["seed"],
-        plate=PlateConfig(**group("plate")),
+        plate=PlateConfig(
+            **group("plate") | {name: tuple(values[f"plate.{name}"]) for name in ("actuator_x", "actuator_y")}
+        ),
         piezo=PiezoConfig(**group("piezo")),
         interferometer=InterferometerConfig(**group("interferometer")),
         camera=CameraConfig(**group("camera") | {"distances": tuple(values["camera.distances"])}),
@@ -159,7 +191,9 @@ def bench_config(values: Mapping[str, Any]) -> BenchConfig:
             volts_max=values["volts.max"],
             wiring=tuple(values["wiring"]),
         ),
-        ports=PortsConfig(**ports),
+        ports=PortsConfig(
+            **ports, framed=FramedConfig(**group("framed") | {"channel_order": tuple(values["framed.channel_order"])})
+        ),
         monitor=MonitorConfig(**group("monitor")),
         files=FilesConfig(
             folder=Path(values["output_folder"]).expanduser(),
@@ -167,6 +201,7 @@ def bench_config(values: Mapping[str, Any]) -> BenchConfig:
             datx_unit=values["output_datx_unit"],
             intensity=values["output_intensity"],
             slow_write=values["output_slow_write"],
+            part_name=values["mirror.name"],
         ),
         trigger_port=values["trigger.port"],
     )

@@ -1,4 +1,4 @@
-"""The 37 piezo stacks: gain spread, hysteresis and creep, from signals to base displacements of the plate's springs."""
+"""The piezo stacks: gain spread, hysteresis and creep, from signals to base displacements of the plate's springs."""
 
 from __future__ import annotations
 

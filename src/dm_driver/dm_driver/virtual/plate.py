@@ -1,4 +1,4 @@
-"""The faceplate: a free-edge elastic circular plate on 37 springs whose bases the piezo stacks move.
+"""The faceplate: a free-edge elastic circular plate on springs whose bases the piezo stacks move.
 
 Kirchhoff plate theory (Timoshenko & Woinowsky-Krieger, Theory of Plates and Shells, sections 10 and 21), solved by the
 Rayleigh-Ritz method: free edges are natural boundary conditions, so Zernike polynomials are admissible as they stand.
@@ -20,8 +20,9 @@ from dm_driver.virtual.zernike import Array, Term
 class PlateConfig:
     """Geometry and material of the mirror, SI units.
 
-    Actuators: 1 in the centre, then rings of 6, 12, 18 on a true hexagonal grid, numbered sequentially in angle inside
-    a ring, from `start_angle` (rad, from the x axis), anticlockwise unless `clockwise`.
+    Actuators: at `actuator_x`, `actuator_y` (m), or where these are empty `actuators` of them: 1 in the centre, then
+    rings of 6, 12, 18, ... on a true hexagonal grid, numbered sequentially in angle inside a ring, from `start_angle`
+    (rad, from the x axis), anticlockwise unless `clockwise`.
     """
 
     diameter: float = 0.030
@@ -29,19 +30,35 @@ class PlateConfig:
     youngs_modulus: float = 74.5e9
     poisson_ratio: float = 0.17
     spring_stiffness: float = 2e7
+    actuators: int = 37
     pitch: float = 4.3e-3
     start_angle: float = 0.0
     clockwise: bool = False
     order: int = 36
+    actuator_x: tuple[float, ...] = ()
+    actuator_y: tuple[float, ...] = ()
 
 
-def actuator_positions(pitch: float, start_angle: float = 0.0, clockwise: bool = False) -> tuple[Array, Array]:
-    """Positions x, y (37,) in m of the actuators 1..37."""
+def actuator_positions(
+    pitch: float, start_angle: float = 0.0, clockwise: bool = False, actuators: int = 37
+) -> tuple[Array, Array]:
+    """Positions x, y (N,) in m of the actuators 1..N.
+
+    Raises:
+        ValueError: no number of full rings has that many.
+    """
     corners = np.exp(1j * np.pi / 3 * np.arange(7))
     grid = [np.zeros(1, complex)]
-    for ring in (1, 2, 3):
+    placed = ring = 1
+    while placed < actuators:
         side, step = np.divmod(np.arange(6 * ring), ring)
         grid.append(corners[side] * (ring - step) + corners[side + 1] * step)
+        placed += 6 * ring
+        ring += 1
+    if placed != actuators:
+        raise ValueError(
+            f"plate.actuators = {actuators}: full rings hold 1, 7, 19, 37, 61, ...; give plate.actuator_x and _y"
+        )
     points = np.concatenate(grid)
     points = pitch * np.exp(1j * start_angle) * (points.conj() if clockwise else points)
     return points.real.copy(), points.imag.copy()
@@ -109,18 +126,29 @@ class Plate:
     """The solved plate.
 
     Attributes:
-        x, y: actuator positions (37,), m.
+        x, y: actuator positions (N,), m.
         terms: Zernike terms over the full plate.
         stiffness: (T, T), N/m: bending energy is c^T stiffness c / 2 for coefficients c in m.
-        influence: (T, 37): coefficients of the sag per metre of base displacement of each spring.
+        influence: (T, N): coefficients of the sag per metre of base displacement of each spring.
     """
 
     def __init__(self, config: PlateConfig | None = None) -> None:
         self.config = config = config or PlateConfig()
         self.radius = config.diameter / 2
-        self.x, self.y = actuator_positions(config.pitch, config.start_angle, config.clockwise)
+        if len(config.actuator_x) != len(config.actuator_y):
+            raise ValueError(
+                f"plate.actuator_x has {len(config.actuator_x)} values, plate.actuator_y {len(config.actuator_y)}: must"
+                " be as many"
+            )
+        if config.actuator_x:
+            self.x, self.y = np.array(config.actuator_x), np.array(config.actuator_y)
+        else:
+            self.x, self.y = actuator_positions(config.pitch, config.start_angle, config.clockwise, config.actuators)
         if np.hypot(self.x, self.y).max() > self.radius:
-            raise ValueError(f"plate: a pitch of {config.pitch:g} m puts actuators beyond the edge of the plate")
+            raise ValueError(
+                f"plate.pitch = {config.pitch:g} m, or plate.actuator_x and _y: actuators beyond the edge of the plate,"
+                f" plate.diameter = {config.diameter:g} m"
+            )
         self.terms = zernike.terms_to_order(config.order)
         self.rigidity = config.youngs_modulus * config.thickness**3 / (12 * (1 - config.poisson_ratio**2))
         self.stiffness = self.rigidity / self.radius**2 * bending_energy_matrix(self.terms, config.poisson_ratio)
@@ -134,5 +162,5 @@ class Plate:
         return zernike.evaluate(np.asarray(x) / self.radius, np.asarray(y) / self.radius, self.terms)
 
     def influence_at(self, x: Array, y: Array) -> Array:
-        """Sag at points (in m) per unit base displacement of each actuator: x.shape + (37,)."""
+        """Sag at points (in m) per unit base displacement of each actuator: x.shape + (N,)."""
         return self.modes(x, y) @ self.influence
