@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,10 @@ class StandIn:
         self.other_wavelength: set[str] = set()
         self.other_aperture: set[str] = set()
         self.disturbed_at = ""
+        self.on_label: dict[str, Callable[[], object]] = {}  # called as a map of the label is asked for
+        self.on_degauss_done: Callable[[], object] | None = None
+        self.other: dict[str, Any] = {}  # what the maps tell of aperture and instrument, where not as usual
+        self.bump: dict[str, float] = {}  # tilt (m), shift_px, figure (m) of a mirror that was bumped
         self.driver_state, self.history_known = ActuatorState.STATE_ACTIVE, True
         self.turns, self.turned_at, self.written = 0, mirror.rest, node.get_clock().now()
         self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
@@ -77,10 +82,14 @@ class StandIn:
         self.degaussed += 1
         self.history_known = True
         self.move(self.mirror.rest)
+        if self.on_degauss_done is not None:
+            self.on_degauss_done()
         return response
 
     def on_measure(self, request: Any, response: Any) -> Any:
         self.measured.append(request.label)
+        if request.label in self.on_label:
+            self.on_label[request.label]()
         if request.label == self.disturbed_at:
             self.move(np.full(self.mirror.actuators, 0.3))
         if request.label in self.failing:
@@ -91,8 +100,22 @@ class StandIn:
             response.zernike.radius = 10e-3
         if request.label in self.other_wavelength:
             response.zernike.wavelength = 635e-9
+        self.tell_instrument(response)
         response.info.file, response.info.sha256 = f"/maps/{request.label}.dat", "00"
         return response
+
+    def tell_instrument(self, response: Any) -> None:
+        """What the file would tell, and what a bump does to it."""
+        info, zernike = response.info, response.zernike
+        info.instrument, info.pitch, info.width, info.height = "Verifire, serial 1", 25e-6, 944, 944
+        info.centre_x = info.centre_y = 471.5
+        info.centre_x += self.bump.get("shift_px", 0.0)
+        info.aperture_radius_px = RADIUS / info.pitch
+        for name, value in self.other.items():
+            target = zernike if name in ("wavelength", "radius") else info
+            setattr(target, name, value)
+        zernike.coefficients[1] += self.bump.get("tilt", 0.0)
+        zernike.coefficients[4] += self.bump.get("figure", 0.0)
 
     def map(self, response: Any = None, bump: float = 0.0) -> Any:
         """A map of what stands at the mirror; `bump` (m) is astigmatism that the mirror does not have."""

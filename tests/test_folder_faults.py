@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dm_msgs.msg import ErrorCode, ZernikeCoefficients
-from dm_msgs.srv import Measure
+from dm_msgs.srv import IngestFile, Measure
 
 from dm_calibration.folder_watch import FolderWatch
 from dm_runtime import qos
@@ -28,7 +28,17 @@ def watched(start: Start, observer: Observer, folder: Path, **parameters: Any) -
     values = {"watch_folder": str(folder), "stable_time": 0.2, "publish_map": False, **parameters}
     node = start("dm_calibration", "interferometer", values)
     wait_until(lambda: "active; maps from" in node.output, 60, "activation")
-    wait_until(lambda: observer.node.count_publishers("zernike"), 20, "discovery")
+    # Maps come within milliseconds; what is published before the node has discovered this subscription is lost.
+    known = folder.parent / "known.dat"
+    known.write_bytes(map_bytes(0))
+
+    def comes() -> bool:
+        observer.call(IngestFile, "ingest_file", IngestFile.Request(path=str(known)))
+        time.sleep(0.2)
+        return bool(taken)
+
+    wait_until(comes, 20, "a first map")
+    taken.clear()
     return node, taken
 
 

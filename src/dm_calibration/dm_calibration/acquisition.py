@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from .closed_files import ClosedFiles
 from .folder_watch import FolderWatch, Sighting
 from .ingest import Measurement
 from .map_files import MapFileError, NoValidPixelsError
@@ -235,12 +236,22 @@ class Acquisition:
 
     def _run(self, watch: FolderWatch) -> None:
         period = min(max(self.settings.stable_time / 4, 0.02), 0.25)
-        while not self._stop.wait(period):
-            for sighting in self._poll(watch):
-                if sighting.refused:
-                    self._on_trouble(f"{sighting.path}: {sighting.refused}")
-                else:
-                    self._hand_over(sighting)
+        closed = ClosedFiles(watch.folder)
+        due = time.monotonic() + period
+        try:
+            while not self._stop.is_set():
+                names = closed.wait(due - time.monotonic())
+                sightings = watch.closed(names, time.monotonic())
+                if time.monotonic() >= due:
+                    sightings += self._poll(watch)
+                    due = time.monotonic() + period
+                for sighting in sightings:
+                    if sighting.refused:
+                        self._on_trouble(f"{sighting.path}: {sighting.refused}")
+                    else:
+                        self._hand_over(sighting)
+        finally:
+            closed.close()
 
     def _poll(self, watch: FolderWatch) -> list[Sighting]:
         try:

@@ -10,17 +10,22 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
+from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_bench import RosBench
 from dm_calibration.calibration_desk import CalibrationDesk
 from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
 from dm_calibration.calibration_parameters import fit_options, procedure_options
-from dm_calibration.calibrator import check_fit, dropped_maps, evaluate
+from dm_calibration.calibrator import Provenance, check_fit, dropped_maps, evaluate
+from dm_calibration.event_frames import Storing
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.mirror import Mirror
 from dm_calibration.memory_forecast import forecast
 from dm_calibration.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
-from dm_calibration.procedure import Outcome, Procedure, Progress
+from dm_calibration.procedure import Procedure, Progress
+from dm_calibration.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
+from dm_calibration.unfinished_runs import UnfinishedRuns
 from dm_runtime.worker import wait_for_clock
 
 #: Least time between two feedback messages, s.
@@ -42,39 +47,37 @@ START_GRACE_S = 5.0
 class CalibrateAction:
     """Runs one goal at a time, in a worker thread."""
 
-    def __init__(self, node: Node, values: Mapping[str, Any], bench: RosBench, desk: CalibrationDesk) -> None:
+    def __init__(
+        self,
+        node: Node,
+        values: Mapping[str, Any],
+        bench: RosBench,
+        desk: CalibrationDesk,
+        driver_facts: Callable[[], Mapping[str, Any]],
+    ) -> None:
+        """`driver_facts` tells of wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
         self._node, self._values, self._bench, self._desk = node, values, bench, desk
+        self._driver_facts = driver_facts
 
     def run(self, handle: ServerGoalHandle) -> tuple[str, Calibrate.Result]:
         result = Calibrate.Result()
         clock = self._node.get_clock()
         started = clock.now()
-        outcome = Outcome()
-        moved = False
         try:
             mirror = self._desk.known_mirror(wait_s=START_GRACE_S)
             wait_for_clock(clock)
             started = clock.now()
-            plan = self._planned(handle.request, mirror)
+            plan, options = self._planned(handle.request, mirror)
             self._foretell(handle.request, plan, result)
             if handle.request.dry_run:
                 return "succeed", result
             self._bench.check_ready()
             self._bench.settle_time = handle.request.settle_time or self._values["settle_time"]
             self._bench.cancelled = lambda: bool(handle.is_cancel_requested)
-            procedure, report = self._procedure(handle, plan, mirror)
-            outcome = procedure.outcome
-            moved = True
-            procedure.run()
-            report(Calibrate.Feedback.PHASE_FIT, "fit", len(plan.steps))
-            self._conclude(handle.request, plan, mirror, outcome, report, result)
+            with UnfinishedRuns(self._desk.store.folder) as runs:
+                self._run_kept(handle, plan, options, mirror, runs, result)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
-            result.maps = result.maps or len(outcome.records)
-            result.dropped = result.dropped or list(outcome.dropped)
-        finally:
-            if moved:
-                result.message = "; ".join(filter(None, (result.message, self._bench.rest(mirror.rest))))
         result.maps_dropped = len(result.dropped)
         result.duration = (clock.now() - started).nanoseconds * 1e-9
         if result.error_code == ErrorCode.OK:
@@ -83,8 +86,60 @@ class CalibrateAction:
         self._node.get_logger().warning(f"calibration ended with code {result.error_code}: {result.message}")
         return ("canceled" if result.error_code == ErrorCode.CANCELED else "abort"), result
 
-    def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> Plan:
-        """The plan of a goal, after its fields were checked."""
+    def _run_kept(
+        self,
+        handle: ServerGoalHandle,
+        plan: Plan,
+        options: PlanOptions,
+        mirror: Mirror,
+        runs: UnfinishedRuns,
+        result: Calibrate.Result,
+    ) -> None:
+        """Begin or resume a run, keep each map as it comes, conclude; fills `result`, also after a failure."""
+        run = self._opened(handle.request, plan, options, mirror, runs)
+        procedure, report = self._procedure(handle, plan, mirror, run)
+        try:
+            procedure.run()
+            report(Calibrate.Feedback.PHASE_FIT, "fit", len(plan.steps))
+            self._conclude(handle.request, plan, mirror, run, runs, report, result)
+        except EXPECTED as error:
+            result.error_code, result.message = error_code(error), str(error)
+            result.maps = result.maps or len(run.outcome.records)
+            result.dropped = result.dropped or list(run.outcome.dropped)
+        finally:
+            run.journal.close()
+            rested = self._bench.rest(mirror.rest)
+        kept = ""
+        if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
+            kept = (
+                f"{len(run.outcome.records)} maps are kept in {run.journal.folder}: the same goal goes on from there, "
+                "`dm calibrate --fresh` begins anew"
+            )
+        result.message = "; ".join(filter(None, (run.resumed, result.message, kept, rested)))
+
+    def _opened(
+        self, goal: Calibrate.Goal, plan: Plan, options: PlanOptions, mirror: Mirror, runs: UnfinishedRuns
+    ) -> OpenRun:
+        in_use = self._desk.in_use
+        settings = {
+            "settle_time_s": self._bench.settle_time,
+            "maps_per_state": goal.maps_per_state or 1,
+            "degauss": "over the full range, steps as configured in the driver" if options.degauss else "none",
+            "model": in_use.id if in_use and plan.kind is PlanKind.SURFACES else "",
+        }
+        identity = identity_of(plan, options, mirror, settings, self._driver_facts())
+        resume = ResumeOptions(
+            self._values["resume_max_age"], self._values["start_fresh"], self._node.get_clock().now().nanoseconds
+        )
+        run = open_run(runs, identity, plan, resume, goal.maps_per_state or 1, goal.note)
+        if resume.fresh:  # for one goal only
+            self._node.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, False)])
+        for words in filter(None, (*run.notes, run.resumed)):
+            self._node.get_logger().info(words)
+        return run
+
+    def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> tuple[Plan, PlanOptions]:
+        """The plan of a goal and what it follows from, after its fields were checked."""
         if goal.plan not in tuple(PlanKind):
             raise Refused(ErrorCode.OUT_OF_RANGE, f"plan = {goal.plan}: must be 0 to {max(PlanKind)}")
         if not 0.0 <= goal.poke_amplitude <= 1.0:  # also refuses NaN
@@ -102,7 +157,7 @@ class CalibrateAction:
             degauss=not goal.skip_degauss,
             memory_maps=goal.memory_maps or self._values["memory_maps"],
         )
-        return make_plan(PlanKind(goal.plan), mirror, options)
+        return make_plan(PlanKind(goal.plan), mirror, options), options
 
     def _foretell(self, goal: Calibrate.Goal, plan: Plan, result: Calibrate.Result) -> None:
         """Fill in what is to be expected; the message of a dry run."""
@@ -118,7 +173,7 @@ class CalibrateAction:
             result.message = f"{maps} maps in about {expected.duration:.0f} s{accuracy}; nothing was moved"
 
     def _procedure(
-        self, handle: ServerGoalHandle, plan: Plan, mirror: Mirror
+        self, handle: ServerGoalHandle, plan: Plan, mirror: Mirror, run: OpenRun
     ) -> tuple[Procedure, Callable[[int, str, int], None]]:
         """The run of `plan`, and a function that reports phase, label and step."""
         feedback = Calibrate.Feedback(steps=len(plan.steps))
@@ -139,9 +194,28 @@ class CalibrateAction:
         in_use = self._desk.in_use
         # A full plan solves its shapes on the pokes of this very run.
         model = in_use.fit if in_use and plan.kind is PlanKind.SURFACES else None
-        options = procedure_options(self._values, handle.request.maps_per_state)
+        facts = mirror_facts(mirror)
+
+        def guard() -> None:
+            if (now := self._desk.mirror) is not None and mirror_facts(now) != facts:
+                raise Refused(
+                    ErrorCode.CALIBRATION_MISMATCH,
+                    f"the mirror changed in the middle of the run: {now.name} {now.serial!r}, before it was "
+                    f"{mirror.name} {mirror.serial!r} (or its limits did)",
+                )
+            self._bench.check_history()
+
         procedure = Procedure(
-            plan, mirror, self._bench, options, model=model, progress=progress, cancelled=self._bench.cancelled
+            plan,
+            mirror,
+            self._bench,
+            procedure_options(self._values, handle.request.maps_per_state),
+            model=model,
+            progress=progress,
+            cancelled=self._bench.cancelled,
+            outcome=run.outcome,
+            keep=run.journal.keep,
+            guard=guard,
         )
         return procedure, report
 
@@ -150,36 +224,50 @@ class CalibrateAction:
         goal: Calibrate.Goal,
         plan: Plan,
         mirror: Mirror,
-        outcome: Outcome,
+        run: OpenRun,
+        runs: UnfinishedRuns,
         report: Callable[[int, str, int], None],
         result: Calibrate.Result,
     ) -> None:
-        """Fit, check, store and publish what was measured; fills `result`."""
-        if plan.kind is PlanKind.POKE_CHECK:
-            fit = fit_influence(outcome.maps(), fit_options(self._values), rings=mirror.rings)
-            check = check_fit(fit, mirror)
-            result.dropped = dropped_maps(outcome.maps(), fit, outcome.dropped)
-        else:
-            state = self._bench.state
-            unknown = goal.skip_degauss and not (state is not None and state.history_known)
-            remarks = ["Measured from an unknown hysteresis state, without a degauss before."] if unknown else []
-            provenance = self._desk.provenance(mirror.name, mirror.serial, goal.note)
-            calibration, check = evaluate(outcome, mirror, fit_options(self._values), provenance, remarks)
-            fit = calibration.fit
-            if (memory := calibration.memory) is not None:
-                result.memory_law, result.memory_held_out_max_zernike = memory.name, memory.held_out_max_zernike
-            result.dropped = dropped_maps(calibration.maps, fit, outcome.dropped)
+        """Fit, check, store and publish what was measured; fills `result`. The journal goes when all is on disk."""
+        outcome = run.outcome
+        calibration: Calibration | None = None
+        try:
+            if plan.kind is PlanKind.POKE_CHECK:
+                fit = fit_influence(outcome.maps(), fit_options(self._values), rings=mirror.rings)
+                check = check_fit(fit, mirror)
+            else:
+                state = self._bench.state
+                unknown = goal.skip_degauss and not (state is not None and state.history_known)
+                remarks = ["Measured from an unknown hysteresis state, without a degauss before."] if unknown else []
+                provenance = self._desk.provenance(mirror.name, mirror.serial, goal.note)
+                if run.storing is not None:  # killed while storing: the same calibration again, not another one
+                    provenance = Provenance(run.storing.id, run.storing.created_ns, provenance.note)
+                calibration, check = evaluate(outcome, mirror, fit_options(self._values), provenance, remarks)
+                fit = calibration.fit
+        except ValueError as error:
+            # The next goal would end in the same way; what was measured stays at hand.
+            run.journal.close()
+            raise Refused(
+                error_code(error), f"{error}; the maps are in {runs.set_aside(run.journal.folder)}"
+            ) from error
+        result.dropped = dropped_maps(outcome.maps(), fit, outcome.dropped)
         result.maps = int(fit.used.sum())
         result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms
         result.condition_number = fit.condition_number
         result.poke_check_passed, result.poke_findings = check.passed, list(check.findings)
-        if plan.kind is PlanKind.POKE_CHECK:
+        if calibration is None:
+            run.journal.remove()
             if not check.passed:
                 raise Refused(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
             result.message = "wiring and orientation are as configured"
             return
+        if (memory := calibration.memory) is not None:
+            result.memory_law, result.memory_held_out_max_zernike = memory.name, memory.held_out_max_zernike
         report(Calibrate.Feedback.PHASE_STORE, calibration.id, len(plan.steps))
-        result.file = str(self._desk.store.save(calibration))
+        run.journal.keep(Storing(calibration.id, calibration.created_ns))
+        result.file = str(self._desk.keep(calibration))
+        run.journal.remove()
         result.id = calibration.id
         if goal.activate:
             self._desk.use(calibration)

@@ -58,6 +58,7 @@ class RosBench:
         self.settle_time = float(values["settle_time"])
         self.cancelled: Callable[[], bool] = _never
         self._commanded: Floats | None = None
+        self._history_known = False
         node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
 
     def _on_state(self, message: ActuatorState) -> None:
@@ -70,7 +71,25 @@ class RosBench:
             return
         raise BenchError(ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active: activate it first")
 
+    def check_history(self) -> None:
+        """Raise BenchError when the driver knew what the actuators went through and no longer does.
+
+        A driver that was restarted, or lost its link, takes commands again soon; what was measured before and after
+        does not belong together without a degauss between.
+        """
+        state = self.state
+        if state is None:
+            return
+        if self._history_known and not state.history_known:
+            self._history_known = False
+            raise BenchError(
+                ErrorCode.DRIVER_UNAVAILABLE,
+                "pdm_driver no longer knows what the actuators went through: it was restarted or lost its link",
+            )
+        self._history_known = state.history_known
+
     def degauss(self) -> None:
+        self._history_known = False
         self._call(self._degauss, Degauss.Request(), self._values["degauss_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
 
     def apply(self, signals: Floats) -> Floats:
@@ -113,7 +132,7 @@ class RosBench:
 
     def rest(self, signals: Floats) -> str:
         """Ramp back to `signals`, whatever was cancelled. Returns what became of it, in words."""
-        self.cancelled = _never
+        self.cancelled, self._history_known = _never, False
         deadline = time.monotonic() + self._values["degauss_timeout"]
         while True:
             try:

@@ -14,9 +14,10 @@ from dm_msgs.msg import ErrorCode
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_errors import Refused
 from dm_calibration.calibrator import Provenance, mismatch
+from dm_calibration.event_frames import map_hashes
 from dm_calibration.influence.mirror import Mirror
 from dm_calibration.memory.recipes import RecipeBook, RecipeError
-from dm_calibration.store import CalibrationStore, UnknownCalibrationError
+from dm_calibration.store import CalibrationStore, StoreError, UnknownCalibrationError
 
 
 class CalibrationDesk:
@@ -185,6 +186,21 @@ class CalibrationDesk:
             return replace(calibration, recipes=calibration.recipes.merged(book))
 
         return self.change(calibration_id, changed)
+
+    def keep(self, calibration: Calibration) -> Path:
+        """Store `calibration` and read it back; one that is there already, whole, stays as it is. Returns its file.
+
+        Raises:
+            StoreError: it cannot be written, or what is read back is not what was measured.
+            CalibrationFileError: what is read back is damaged.
+        """
+        try:
+            file = self.store.find(calibration.id)
+        except UnknownCalibrationError:
+            file = self.store.save(calibration)
+        if map_hashes(self.store.load(calibration.id).maps) != map_hashes(calibration.maps):
+            raise StoreError(f"calibration {calibration.id}: the maps in {file} are not those that were measured")
+        return file
 
     def provenance(self, name: str, serial: str, note: str) -> Provenance:
         """A new id and the time for a calibration of mirror `name`, `serial`."""

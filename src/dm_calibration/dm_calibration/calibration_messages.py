@@ -70,6 +70,17 @@ def mirror_from(message: MirrorInfo) -> Mirror:
     )
 
 
+def driver_facts(message: MirrorInfo) -> dict[str, Any]:
+    """What maps depend on beside the mirror itself: wiring, electronics and volts."""
+    return {
+        "wiring": message.wiring,
+        "electronics": message.electronics,
+        "volts_min": message.volts_min,
+        "volts_max": message.volts_max,
+        "slew_rate_max": message.slew_rate_max,
+    }
+
+
 def measurement_from(response: Any) -> Measurement:
     """The map in an answer of the service `measure`.
 
@@ -96,6 +107,11 @@ def measurement_from(response: Any) -> Measurement:
         system_error_subtracted=response.info.system_error_subtracted,
         file=response.info.file,
         sha256=response.info.sha256,
+        instrument=response.info.instrument,
+        pitch=response.info.pitch,
+        camera=(response.info.width, response.info.height),
+        centre=(response.info.centre_x, response.info.centre_y),
+        radius_px=response.info.aperture_radius_px,
     )
 
 

@@ -28,12 +28,18 @@ from dm_calibration.calibration_action import CalibrateAction
 from dm_calibration.calibration_bench import RosBench
 from dm_calibration.calibration_desk import CalibrationDesk
 from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
-from dm_calibration.calibration_messages import calibration_message, mirror_from, recipe_book_from, time_message
+from dm_calibration.calibration_messages import (
+    calibration_message,
+    driver_facts,
+    mirror_from,
+    recipe_book_from,
+    time_message,
+)
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options
 from dm_calibration.calibration_watch import PUBLISH_PERIOD_S, CalibrationWatch
 from dm_calibration.calibrator import refit
 from dm_calibration.error_prediction import ErrorPrediction
-from dm_calibration.store import CalibrationStore
+from dm_calibration.report_writer import ReportingStore, ReportWriter
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
 from dm_runtime.parameters import declare
@@ -43,6 +49,8 @@ from dm_runtime.worker import WorkerActionServer, WorkerService
 class CalibrationNode(Node):
     """Topics, services and the action of the calibration; what they do is in CalibrationDesk and CalibrateAction."""
 
+    _forecast_warned = ""
+
     def __init__(self) -> None:
         super().__init__("calibration")
         self._values = declare(self, PARAMETERS)
@@ -50,14 +58,18 @@ class CalibrationNode(Node):
         self._start_pending = bool(self._values["load_on_start"])
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.LATCHED)
+        self._reports = ReportWriter(self._tell_of_report)
         self._desk = CalibrationDesk(
-            CalibrationStore(self._values["calibration_folder"]),
+            ReportingStore(
+                self._values["calibration_folder"], self._reports, lambda: bool(self._values["write_report"])
+            ),
             lambda: float(self._values["aperture_tolerance"]),
             lambda: int(self.get_clock().now().nanoseconds),
             self._publish,
         )
         self._bench = RosBench(self, self._values)
-        action = CalibrateAction(self, self._values, self._bench, self._desk)
+        self._driver_facts: dict[str, Any] = {}
+        action = CalibrateAction(self, self._values, self._bench, self._desk, lambda: self._driver_facts)
         self._server = WorkerActionServer(self, Calibrate, "calibrate", action.run, exclusive="refuse")
         self._watch = CalibrationWatch(self, self._values, self._desk, self._bench, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
@@ -82,6 +94,13 @@ class CalibrationNode(Node):
         mirror = self._desk.mirror
         if self._server.busy and mirror is not None:
             self.get_logger().warning(f"ended during a calibration: {self._bench.rest_at_exit(mirror.rest)}")
+        self._reports.end()
+
+    def _tell_of_report(self, words: str, warning: bool) -> None:
+        if warning:
+            self.get_logger().warning(words)
+        else:
+            self.get_logger().info(words)
 
     def _publish(self, calibration: Calibration | None, file: Path | None) -> None:
         error_max = self._values["calibrated_error_max"]
@@ -97,6 +116,7 @@ class CalibrationNode(Node):
         except ValueError as error:
             self.get_logger().error(f"mirror_info refused: {error}")
             return
+        self._driver_facts = driver_facts(message)
         if withdrawn := self._desk.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"
@@ -113,17 +133,24 @@ class CalibrationNode(Node):
         except EXPECTED as error:
             self.get_logger().warning(f"load_on_start = {name!r}: {error}")
 
-    def _answer(self, response: Any, work: Callable[[], None]) -> Any:
-        """Run `work`; an expected failure becomes error code and message of the response."""
+    def _answer(self, response: Any, work: Callable[[], None], told: str = "") -> Any:
+        """Run `work`; an expected failure becomes error code and message of the response.
+
+        It is logged too, unless its sentence is `told`.
+        """
         try:
             work()
         except EXPECTED as error:
             response.error_code, response.message = error_code(error), str(error)
-            self.get_logger().warning(str(error))
+            if response.message != told:
+                self.get_logger().warning(response.message)
         return response
 
     def _serve(self, work: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
-        return self._answer(response, lambda: work(request, response))
+        # The controller asks for many commands at once; one refusal is one line of the log.
+        self._answer(response, lambda: work(request, response), self._forecast_warned)
+        self._forecast_warned = response.message if response.error_code else ""
+        return response
 
     def _on_list(self, _request: Any, response: Any) -> Any:
         in_use = self._desk.in_use

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dm_calibration.bump_check import BumpOptions
 from dm_calibration.calibration_updates import UpdateOptions
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.quality import GradeOptions
@@ -21,6 +22,13 @@ PARAMETERS = (
         "",
         "Calibration to use as soon as the mirror is known: empty = none, newest = the newest that fits, or an id.",
     ),
+    Parameter(
+        "write_report",
+        bool,
+        True,
+        "Write the report of every calibration that is stored, <id>.html and <id>.pdf, beside its file.",
+        live=True,
+    ),
     Parameter("poke_amplitude", float, 0.5, "Half-swing of a push-pull poke, normalised.", "", 0.01, 1.0, live=True),
     Parameter("reference_every", int, 10, "Steps between two reference frames.", "", 1, 1000, live=True),
     Parameter("memory_maps", int, 300, "Commands of a memory plan; more give less noise.", "", 60, 2000, live=True),
@@ -32,6 +40,55 @@ PARAMETERS = (
     Parameter("driver_timeout", float, 30.0, "Longest wait for the driver to set a shape.", "s", 0.1, 600.0, live=True),
     Parameter("degauss_timeout", float, 180.0, "Longest wait for a degauss.", "s", 0.1, 3600.0, live=True),
     Parameter("measure_timeout", float, 60.0, "Longest wait for one map.", "s", 0.1, 3600.0, live=True),
+    Parameter(
+        "resume_max_age",
+        float,
+        43200.0,
+        "An interrupted run goes on with the next goal of the same plan, settings and mirror when it is not older; "
+        "0 = never.",
+        "s",
+        0.0,
+        1e8,
+        live=True,
+    ),
+    Parameter(
+        "start_fresh",
+        bool,
+        False,
+        "The next goal sets interrupted runs aside and begins anew; false again as soon as it has begun.",
+        live=True,
+    ),
+    Parameter(
+        "bump.tilt_max",
+        float,
+        3e-6,
+        "Largest change of tilt between two reference frames, as sag at the edge; 0 = not looked at.",
+        "m",
+        0.0,
+        1e-3,
+        live=True,
+    ),
+    Parameter(
+        "bump.shift_max",
+        float,
+        1e-4,
+        "Largest shift of the aperture on the map between two reference frames, at the mirror; 0 = not looked at.",
+        "m",
+        0.0,
+        1e-2,
+        live=True,
+    ),
+    Parameter(
+        "bump.figure_max",
+        float,
+        50e-9,
+        "Largest change of the rms figure between two reference frames, beyond what `hysteresis_allowance` explains; "
+        "0 = not looked at.",
+        "m",
+        0.0,
+        1e-3,
+        live=True,
+    ),
     Parameter(
         "aperture_tolerance",
         float,
@@ -189,6 +246,12 @@ def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> Pro
         maps_per_state=maps_per_state or 1,
         aperture_tolerance=values["aperture_tolerance"],
         fit=fit_options(values),
+        bump=BumpOptions(
+            values["bump.tilt_max"],
+            values["bump.shift_max"],
+            values["bump.figure_max"],
+            values["hysteresis_allowance"],
+        ),
     )
 
 

@@ -64,6 +64,8 @@ def evaluate(
         )
     if outcome.wavelength == 0.0:
         limitations.append("The maps do not tell their wavelength.")
+    if (parts := np.unique(maps.segment).size) > 1:
+        limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")
     limitations += [f"Poke check: {finding}." for finding in check.findings]
     limitations += [f"Measured differently: {remark}." for remark in outcome.remarks]
     calibration = Calibration(

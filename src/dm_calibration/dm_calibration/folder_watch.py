@@ -1,6 +1,7 @@
 """Watching a folder for files that another machine writes. Knows no ROS.
 
-A file is taken when its size and time have stood still for a while. Nothing depends on clocks of two machines agreeing:
+A file is taken when its size and time have stood still for a while, or at once when this machine's kernel tells that
+its writer has closed it and it is as long as it says itself. Nothing depends on clocks of two machines agreeing:
 stillness is judged by this machine's monotonic clock.
 """
 
@@ -9,10 +10,12 @@ from __future__ import annotations
 import fnmatch
 import os
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
+
+from .complete_file import is_complete
 
 
 class Signature(NamedTuple):
@@ -86,6 +89,29 @@ class FolderWatch:
                 ready.append((signature.modified_ns, self._judge(name, candidate.since)))
         self._known = known
         return [sighting for _time, sighting in sorted(ready)]
+
+    def closed(self, names: Iterable[str], now: float) -> list[Sighting]:
+        """Look at files whose writer has just closed them, as far as they are known to be whole, which need not wait.
+
+        Others are left to :meth:`poll`, so are those that it would refuse.
+        """
+        ready = []
+        for name in names:
+            if self._known is None or name in self._ignored or not self._matches(name):
+                continue
+            try:
+                status = (self.folder / name).stat()
+            except OSError:
+                continue
+            signature = Signature(status.st_ino, status.st_size, status.st_mtime_ns)
+            candidate = self._known.get(name)
+            if candidate is None or candidate.signature != signature:
+                candidate = self._known[name] = _Candidate(signature, now)
+            sighting = self._judge(name, now)
+            if not candidate.done and not sighting.refused and is_complete(sighting.path):
+                candidate.done = True
+                ready.append(sighting)
+        return ready
 
     def _list(self) -> dict[str, Signature]:
         """Signatures of the matching names; for links, of what they point to."""

@@ -114,13 +114,13 @@ def content_hash(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
     digest = hashlib.sha256()
 
     def add(kind: str, name: str, shape: tuple[int, ...], content: bytes) -> None:
-        digest.update(f"{name}\0{kind}\0{shape}\0{len(content)}\0".encode())
+        digest.update(_bytes(f"{name}\0{kind}\0{shape}\0{len(content)}\0"))
         digest.update(content)
 
     for name in sorted(columns):
         value = columns[name]
         if isinstance(value, tuple):
-            add("text", name, (len(value),), "\0".join(value).encode())
+            add("text", name, (len(value),), _bytes("\0".join(value)))
         else:
             plain = np.ascontiguousarray(value)
             little = plain.astype(plain.dtype.newbyteorder("<"))
@@ -128,10 +128,15 @@ def content_hash(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
     for name in sorted(attributes):
         attribute = attributes[name]
         if isinstance(attribute, tuple):
-            add("texts", f"@{name}", (len(attribute),), "\0".join(attribute).encode())
+            add("texts", f"@{name}", (len(attribute),), _bytes("\0".join(attribute)))
         else:
             add("value", f"@{name}", (), repr(attribute).encode())
     return digest.hexdigest()
+
+
+def _bytes(text: str) -> bytes:
+    """UTF-8; h5py hands over bytes that are none, in names and attributes of a damaged file, as lone surrogates."""
+    return text.encode("utf-8", "surrogatepass")
 
 
 def _datasets(file: h5py.File, length: int) -> Iterator[tuple[str, h5py.Dataset]]:

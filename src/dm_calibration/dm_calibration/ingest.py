@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -60,8 +61,8 @@ class Measurement:
         fit: coefficients in m, piston and tilt included.
         points: where `samples` were taken.
         samples: (P,), m, piston and tilt included; NaN = no valid pixel.
-        pv, rms: m, of `sag` over all its valid pixels: peak to valley and standard deviation.
         piston_tilt_removed: whether `sag` has its plane subtracted.
+        valid: (height, width), pixels with data.
     """
 
     source: SurfaceMap
@@ -71,9 +72,26 @@ class Measurement:
     fit: MapFit
     points: SamplePoints
     samples: NDArray[np.float64]
-    pv: float
-    rms: float
     piston_tilt_removed: bool
+    valid: NDArray[np.bool_]
+
+    @property
+    def pv(self) -> float:
+        """m, peak to valley of `sag` over all its valid pixels."""
+        return self._spread[0]
+
+    @property
+    def rms(self) -> float:
+        """m, standard deviation of the same."""
+        return self._spread[1]
+
+    @cached_property
+    def _spread(self) -> tuple[float, float]:
+        """Found when first asked for: coefficients need not wait for it."""
+        heights = self.sag[self.valid]
+        extent = float(np.ptp(heights))
+        heights -= heights.mean()
+        return extent, float(np.sqrt(heights @ heights / heights.size))
 
     @property
     def aperture_radius(self) -> float | None:
@@ -139,7 +157,6 @@ class Ingest:
         samples = sample_map(sag, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px, self.points)
         if settings.remove_piston_tilt:
             sag = remove_piston_tilt(sag)
-        heights = sag[valid]
         return Measurement(
             source=source,
             sag=sag,
@@ -148,9 +165,8 @@ class Ingest:
             fit=fit,
             points=self.points,
             samples=samples,
-            pv=float(np.ptp(heights)),
-            rms=float(heights.std()),
             piston_tilt_removed=settings.remove_piston_tilt,
+            valid=valid,
         )
 
     @staticmethod

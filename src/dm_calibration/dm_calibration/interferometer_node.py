@@ -180,15 +180,15 @@ class InterferometerNode(LifecycleNode):
         except Exception as error:  # whatever one file does, the next one must be taken
             self._warn_of_file(f"{path}: {type(error).__name__}: {error}")
             return
-        if self._published.get(str(path)) == measurement.source.sha256:
-            return  # touched or copied over itself
-        self._published.pop(str(path), None)
+        # The digest takes longer than the fit: coefficients wait for it only where it may say that nothing is new.
+        before = self._published.pop(str(path), None)
+        known = before is not None and before == measurement.source.sha256
+        if self._active and not known:
+            self._publish(measurement, self._header(self._file_time(measurement, believe_header=False)))
+            self._log_taken(measurement, "new file")
         self._published[str(path)] = measurement.source.sha256
         while len(self._published) > 1000:
             self._published.pop(next(iter(self._published)))
-        if self._active:
-            self._publish(measurement, self._header(self._file_time(measurement, believe_header=False)))
-            self._log_taken(measurement, "new file")
 
     def _read(self, path: Path) -> Measurement:
         return self._ingest.read(path, ingest_settings(self._values))
@@ -217,11 +217,12 @@ class InterferometerNode(LifecycleNode):
         with self._publishing:
             if not self._configured:
                 return
-            if self._values["publish_map"]:
-                self._map_publisher.publish(messages.image_message(measurement, header))
-            self._info_publisher.publish(messages.info_message(measurement, header))
+            # What is waited for most comes first; map and digest take longer than all before.
             self._zernike_publisher.publish(messages.zernike_message(measurement, header))
             self._samples_publisher.publish(messages.samples_message(measurement, header))
+            self._info_publisher.publish(messages.info_message(measurement, header))
+            if self._values["publish_map"]:
+                self._map_publisher.publish(messages.image_message(measurement, header))
 
     def _log_taken(self, measurement: Measurement, what: str) -> None:
         self._taken += 1

@@ -16,6 +16,7 @@ def write_whole(path: Path, content: bytes) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.unlink(missing_ok=True)  # of a process with the same id that was killed
         _write_through(temporary, content)
         temporary.replace(path)
         _sync_folder(path.parent)

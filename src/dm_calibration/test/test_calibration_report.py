@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from dm_calibration.memory.law import MemoryLaw
 from dm_calibration.memory.memory_fit import MemoryFit
 from dm_calibration.memory.recipes import Recipe, RecipeBook
 from dm_calibration.optics.sampling import edge_clustered_points
-from dm_calibration.plan import PlanKind, PlanOptions
+from dm_calibration.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure import Procedure, ProcedureOptions
 from dm_calibration.report import content, content_memory
 from dm_calibration.report.document import one_html
 from dm_calibration.report.figures import on_disc
@@ -25,8 +27,9 @@ from dm_calibration.report.memory_figures import loop_opening, step_response
 from dm_calibration.report.page import figures_of, write_report
 from dm_calibration.report.residuals import residuals
 from dm_calibration.store import CalibrationStore
+from linear_mirror import LinearMirror, make_mirror
 from recorded_bench import recorded
-from remembering_mirror import MIRROR
+from remembering_mirror import MIRROR, RememberingBench
 
 #: One play operator of half-width 0.2 and weight 1 beside the signal: the loop opens by 2 x 0.2 of a span of 2 + 1.6.
 PLAY = MemoryLaw(np.array([0.0, 0.2]), np.array([[1.0], [1.0]]), np.zeros(0), 0.0, 0.01, np.geomspace(0.03, 3e5, 15))
@@ -49,6 +52,35 @@ def page(calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> 
     text = written.html.read_text()
     assert hashlib.sha256(file.read_bytes()).hexdigest() in text
     return text
+
+
+class SmallBench(RememberingBench):
+    """A bench with 19 actuators."""
+
+    mirror = make_mirror(rings=2)
+
+    def __init__(self) -> None:
+        self.plant = LinearMirror(self.mirror.x, self.mirror.y, noise=0.5e-9, piston_tilt=1e-7)
+        self.signals, self.clock_ns = self.mirror.rest, 0
+        self.degauss()
+
+    def degauss(self) -> None:
+        self.lag = np.zeros(self.mirror.actuators)
+
+
+def test_a_mirror_of_nineteen_actuators_has_a_report(tmp_path: Path) -> None:
+    mirror = SmallBench.mirror
+    plan = make_plan(PlanKind.POKES, mirror, PlanOptions())
+    outcome = Procedure(plan, mirror, SmallBench(), ProcedureOptions()).run()
+    small = evaluate(outcome, mirror, FitOptions(), Provenance("small", 10**18))[0]
+    written = write_report(small, tmp_path)
+    text = written.html.read_text()
+    actuators = text[text.index("<caption>Actuators") :]
+    assert re.findall(r"<tr><td>(\d+)</td>", actuators[: actuators.index("</table>")]) == [
+        str(k + 1) for k in range(19)
+    ]
+    assert "<td>actuators</td><td>19 good</td>" in text
+    assert written.pdf.stat().st_size > 10_000
 
 
 def test_the_page_is_one_file(page: str) -> None:

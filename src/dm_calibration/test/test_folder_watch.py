@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
 
+from dm_calibration.closed_files import ClosedFiles
 from dm_calibration.folder_watch import FolderWatch
+from map_fixtures import dat_bytes, disc_counts
 
 STABLE = 1.0
+WHOLE = dat_bytes(disc_counts(20), pitch=1e-5)
 
 
 @pytest.fixture
@@ -118,3 +122,61 @@ def test_folder_that_vanishes_and_returns_loses_nothing(folder: Path) -> None:
     (folder / "new.dat").write_bytes(b"1")
     watch.poll(2)
     assert names(watch, 4) == ["new.dat"]
+
+
+def test_closed_file_of_the_length_it_tells_is_taken_at_once(folder: Path) -> None:
+    watch = FolderWatch(folder, ["*.dat"], STABLE)
+    watch.poll(0)
+    (folder / "whole.dat").write_bytes(WHOLE)
+    (folder / "half.dat").write_bytes(WHOLE[:-1])
+    (folder / "other.txt").write_bytes(WHOLE)
+    taken = watch.closed(["whole.dat", "half.dat", "other.txt", "gone.dat"], 1)
+    assert [sighting.path.name for sighting in taken] == ["whole.dat"]
+    assert watch.closed(["whole.dat"], 1.1) == []  # closed again, nothing new
+    assert names(watch, 3) == ["half.dat"]  # still as it was: it will not become longer
+
+
+def test_closed_file_before_the_first_look_is_not_new(folder: Path) -> None:
+    watch = FolderWatch(folder, ["*.dat"], STABLE)
+    (folder / "old.dat").write_bytes(WHOLE)
+    assert watch.closed(["old.dat"], 0) == []
+
+
+def test_closed_link_that_leads_out_is_left_to_be_refused(folder: Path, tmp_path: Path) -> None:
+    watch = FolderWatch(folder, ["*.dat"], STABLE)
+    watch.poll(0)
+    (tmp_path / "outside.dat").write_bytes(WHOLE)
+    (folder / "link.dat").symlink_to(tmp_path / "outside.dat")
+    assert watch.closed(["link.dat"], 1) == []
+    assert [bool(sighting.refused) for sighting in watch.poll(3)] == [True]
+
+
+def test_the_kernel_tells_of_closed_and_moved_files(folder: Path, tmp_path: Path) -> None:
+    closed = ClosedFiles(folder)
+    try:
+        assert closed.wait(0) == []
+        (folder / "a.dat").write_bytes(b"1")
+        assert "a.dat" in closed.wait(5)
+        (tmp_path / "b.dat").write_bytes(b"1")
+        (tmp_path / "b.dat").rename(folder / "b.dat")
+        assert "b.dat" in closed.wait(5)
+        with (folder / "open.dat").open("wb") as file:
+            file.write(b"1")
+            file.flush()
+            assert closed.wait(0.05) == []
+    finally:
+        closed.close()
+
+
+def test_a_folder_that_comes_later_is_watched_then(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dm_calibration.closed_files.RETRY_S", 0.01)
+    closed = ClosedFiles(tmp_path / "later")
+    try:
+        assert closed.wait(0) == []
+        (tmp_path / "later").mkdir()
+        time.sleep(0.02)
+        assert closed.wait(0) == []
+        (tmp_path / "later" / "a.dat").write_bytes(b"1")
+        assert "a.dat" in closed.wait(5)
+    finally:
+        closed.close()

@@ -45,6 +45,8 @@ class MapRecord:
         file, sha256: the map file it came from; "" = none.
         nominal: (K,) coefficients of the surface that was aimed at, m; None when signals were prescribed.
         moved_ns: when the mirror took this shape, ns; 0 = not told.
+        segment: number of the degauss, or of the resumption, from which the history of the actuators is known; 0 for a
+            run that was not interrupted.
     """
 
     label: str
@@ -62,6 +64,7 @@ class MapRecord:
     sha256: str = ""
     nominal: Floats | None = None
     moved_ns: int = 0
+    segment: int = 0
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ class MapSet:
     sha256: tuple[str, ...]
     nominal: Floats
     moved_ns: NDArray[np.int64]
+    segment: NDArray[np.int64]
 
     def __post_init__(self) -> None:
         points = self.points
@@ -101,6 +105,7 @@ class MapSet:
             "valid_fraction": (count,),
             "nominal": (count, terms),
             "moved_ns": (count,),
+            "segment": (count,),
         }
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
@@ -130,6 +135,8 @@ class MapSet:
     def moved_s(self) -> Floats:
         """(M,) s since the first map: when the mirror took each shape; right after the map before where not told."""
         before = np.concatenate((self.stamp_ns[:1], self.stamp_ns[:-1]))
+        resumed = np.concatenate(([False], np.diff(self.segment) != 0))
+        before = np.where(resumed, self.stamp_ns, before)  # nobody knows what was before
         told = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns)
         told[1:] &= self.moved_ns[1:] >= self.stamp_ns[:-1]
         return np.asarray(1e-9 * (np.where(told, self.moved_ns, before) - self.stamp_ns[0]))
@@ -161,6 +168,7 @@ class MapSet:
             sha256=tuple(record.sha256 for record in records),
             nominal=np.stack([unknown if record.nominal is None else record.nominal for record in records]),
             moved_ns=np.array([record.moved_ns for record in records], dtype=np.int64),
+            segment=np.array([record.segment for record in records], dtype=np.int64),
         )
 
     def select(self, keep: NDArray[np.bool_]) -> MapSet:

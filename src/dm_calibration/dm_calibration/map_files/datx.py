@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .datx_structure import SIGNATURE, check_end, check_storage
+from .datx_structure import SIGNATURE, check_end, check_place, check_storage
 from .surface_map import (
     MapFileError,
     SurfaceMap,
@@ -33,6 +33,9 @@ _NO_DATA_LEAST = 1e30
 
 #: Rows of /MetaData; real files have some dozens.
 _LINKS_MAX = 10_000
+
+#: Smaller values, in any unit, are no heights, by bytes per value: the shortest length in use, 1 pm, is 1e-12 m.
+_LEAST_HEIGHT = {4: 1e-30, 8: 1e-200}
 
 #: Two witnesses of one value may differ by this much (one is sometimes stored in single precision).
 _AGREEMENT = 1e-6
@@ -59,14 +62,14 @@ def parse_datx(content: bytes) -> SurfaceMap:
     try:
         check_end(content)
         with h5py.File(io.BytesIO(content), "r") as file:
-            return _parse(file, len(content))
+            return _parse(file, content)
     except MapFileError:
         raise
     except Exception as error:  # h5py raises whatever a damaged file provokes: OSError, KeyError, RuntimeError, ...
         raise MapFileError(f"the HDF5 content is damaged or truncated: {type(error).__name__}: {error}") from error
 
 
-def _parse(file: h5py.File, length: int) -> SurfaceMap:
+def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     metadata = _metadata(file)
     surface = _object(file, _path(metadata, "Surface"))
     if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
@@ -75,7 +78,7 @@ def _parse(file: h5py.File, length: int) -> SurfaceMap:
         raise MapFileError(f"{surface.name}: type {surface.dtype}: must be a plain little-endian number")
     height, width = surface.shape
     check_size(width, height)
-    check_storage(surface, length)
+    check_storage(surface, len(content))
     extra = _extra_attributes(file, metadata)
 
     wavelength = _number(surface, "Wavelength")
@@ -90,6 +93,7 @@ def _parse(file: h5py.File, length: int) -> SurfaceMap:
         raise _missing(surface, "No Data")
     if not (math.isnan(no_data) or no_data >= _NO_DATA_LEAST):
         raise MapFileError(f"{surface.name}: No Data = {no_data:g}: must be NaN or at least {_NO_DATA_LEAST:g}")
+    check_place(surface, content, no_data)
     pitch = _pitch(surface, extra)
     _check_witnesses(surface, extra, wavelength)
 
@@ -125,7 +129,9 @@ def _missing(where: Any, name: str) -> MapFileError:
 
 
 def _text(value: Any) -> str:
-    return value.decode("latin-1") if isinstance(value, bytes) else str(value)
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
+    return str(value).encode("utf-8", "backslashreplace").decode()  # h5py marks bytes that are no text as surrogates
 
 
 def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
@@ -306,4 +312,20 @@ def _read(surface: h5py.Dataset) -> NDArray[np.float64]:
                 f"{surface.name}: compressed with the HDF5 filter {label}, which this h5py lacks; "
                 "save the map uncompressed or as .dat, or install an HDF5 library with that filter"
             )
-    return surface[()].astype(np.float64, copy=False)
+    stored = surface[()]
+    _check_foreign(surface, stored)
+    return stored.astype(np.float64, copy=False)
+
+
+def _check_foreign(surface: h5py.Dataset, stored: NDArray[Any]) -> None:
+    """Refuse heights that are the file's own bookkeeping: the place of the data has no second witness.
+
+    A damaged address lets the data begin a little earlier or later, among counts and addresses. As floating-point
+    numbers these are smaller than any height could be.
+    """
+    if stored.dtype.kind != "f":
+        return
+    least = _LEAST_HEIGHT[stored.dtype.itemsize]
+    size = np.abs(stored)
+    if ((size < least) & (size > 0)).any():
+        raise MapFileError(f"{surface.name}: holds values smaller than {least:g} other than 0, which are no heights")

@@ -7,6 +7,7 @@ import struct
 from typing import Final
 
 import h5py
+import numpy as np
 
 from .surface_map import MapFileError
 
@@ -64,3 +65,38 @@ def check_storage(surface: h5py.Dataset, length: int) -> None:
             f"{surface.name}: {surface.shape[1]} x {surface.shape[0]} values of {surface.dtype} do not agree with"
             f" {stored} bytes stored in a file of {length}"
         )
+
+
+def check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
+    """The file tells only once where its values stand; a damaged address lets them begin too early or too late.
+
+    Where the map has corners without data, runs of "No Data" then stand within a row before the place, or behind it.
+
+    Raises:
+        MapFileError: they do, and not as the values of another dataset.
+    """
+    start = surface.id.get_offset()
+    if start is None:  # in chunks
+        return
+    end, row = start + surface.id.get_storage_size(), surface.shape[1] * surface.dtype.itemsize
+    one = np.asarray(no_data, surface.dtype).tobytes()
+    for first, last in ((max(0, start - row), start), (end, end + row)):
+        # One alone might be an attribute's value, but none begins right behind the place.
+        outside = 2 * one in content[first:last] or (first == end and content[first:last].startswith(one))
+        if outside and not _other_values(surface, first, last):
+            raise MapFileError(
+                f"{surface.name}: its values do not stand at byte {start}: they go on outside that place"
+            )
+
+
+def _other_values(surface: h5py.Dataset, first: int, last: int) -> bool:
+    """Whether values of another dataset may stand among the bytes `first` to `last`."""
+    found = []
+
+    def look(_name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset) and item != surface:
+            start = item.id.get_offset()
+            found.append(start is None or (start < last and start + item.id.get_storage_size() > first))
+
+    surface.file.visititems(look)
+    return any(found)

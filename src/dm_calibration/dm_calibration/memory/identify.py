@@ -20,9 +20,10 @@ from scipy.optimize import least_squares
 
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.memory.duhem import DuhemOperator
-from dm_calibration.memory.features import crept, fading_feature, play_features, relaxation
+from dm_calibration.memory.features import crept, fading_feature, play_features
 from dm_calibration.memory.law import CREEP_TIMES, MemoryLaw
 from dm_calibration.memory.responses import Responses
+from dm_calibration.memory.segments import basis_of, figure_columns, in_parts, parts_of, starts_of
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -77,6 +78,7 @@ class Run:
         responses: what was measured.
         start: s, when the degauss had ended; None = just before the first map.
         moved: (M,) s, when the mirror took each shape; None = right after the map before.
+        segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
     """
 
     signals: Floats
@@ -84,6 +86,7 @@ class Run:
     responses: Responses
     start: float | None = None
     moved: Floats | None = None
+    segment: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         if (np.diff(self.time) < 0.0).any():
@@ -94,6 +97,11 @@ class Run:
     @property
     def began(self) -> float:
         return float(self.time[0]) - 1.0 if self.start is None else min(self.start, float(self.time[0]))
+
+    @property
+    def parts(self) -> list[slice]:
+        """Rows of each part of the run, from one degauss to the next."""
+        return parts_of(np.zeros(len(self.time), dtype=np.int64) if self.segment is None else self.segment)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,11 +127,22 @@ class _Problem:
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
         self.run, self.candidate, self._scatter = run, candidate, scatter
         self.radius = np.concatenate(([0.0], (np.arange(candidate.plays) + 0.5) / max(candidate.plays, 1)))
-        self._plays = play_features(run.signals, self.radius, candidate.powers)
-        self._plays_crept = crept(self._plays, run.time, run.began, run.moved)
+        self._parts = run.parts
+        self._starts = [run.began, *starts_of(self._parts, run.time, run.moved)]
+        powers = candidate.powers
+        self._plays = in_parts(self._parts, lambda part: play_features(run.signals[part], self.radius, powers))
+        self._plays_crept = self._crept(self._plays)
         self._measured = run.responses.values / scatter
-        settled = relaxation(run.time, run.began)
-        self._figure = np.column_stack((np.ones(len(run.time)), settled, (run.time - run.began) / np.ptp(run.time)))
+        self._figure = figure_columns(run.time, self._parts, self._starts)
+
+    def _crept(self, features: Floats) -> Floats:
+        """What creep adds to `features` (M, F, N) per unit of creep rate; each part begins rested."""
+        time, moved = self.run.time, self.run.moved
+        start = {part.start: start for part, start in zip(self._parts, self._starts, strict=True)}
+        return in_parts(
+            self._parts,
+            lambda part: crept(features[part], time[part], start[part.start], None if moved is None else moved[part]),
+        )
 
     def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int = 20) -> LawFit:
         """Fit to the rows in `keep` (M,)."""
@@ -158,14 +177,15 @@ class _Problem:
         features = self._plays + rate * self._plays_crept
         if not self.candidate.slopes:
             return features
-        fading = fading_feature(self.run.signals, DuhemOperator(slope))
-        fading = fading + rate * crept(fading, self.run.time, self.run.began, self.run.moved)
+        operator = DuhemOperator(slope)
+        fading = in_parts(self._parts, lambda part: fading_feature(self.run.signals[part], operator))
+        fading = fading + rate * self._crept(fading)
         return np.concatenate((features, fading), axis=1)
 
     def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats, Floats]:
         """Weights (F,), residual (M, D) in units of the scatter, covariance of the weights."""
         measured, figure = self._measured[keep], self._figure[keep]
-        free = np.linalg.qr(figure)[0]
+        free = basis_of(figure)
         kept = features[keep]
         without_figure = measured - free @ (free.T @ measured)
         count = features.shape[1]

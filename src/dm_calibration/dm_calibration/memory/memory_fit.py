@@ -14,6 +14,7 @@ from dm_calibration.memory.features import relaxation
 from dm_calibration.memory.identify import CANDIDATES, Candidate, Identification, Run, identify
 from dm_calibration.memory.law import MemoryLaw, follow
 from dm_calibration.memory.responses import responses_of
+from dm_calibration.memory.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of
 from dm_calibration.optics.zernike import TERM_RMS
 
 Floats = NDArray[np.float64]
@@ -25,8 +26,6 @@ OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
 DRAWS = 4000
 #: Moves of the random histories that tell what not knowing the history means.
 HISTORY_MOVES = 12
-#: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
-BEFORE_FIRST_MAP_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ def fit_memory(
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s())
+    run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment)
     test = np.array([kind == CHECK for kind in maps.kind])
     found, run = _without_outliers(run, test, candidates, progress)
     covariance = _error_covariance(found, run, maps.terms)
@@ -116,31 +115,51 @@ def effective_maps(maps: MapSet, law: MemoryLaw) -> MapSet:
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
-    state = law.demagnetised(maps.actuators, -BEFORE_FIRST_MAP_S)
-    effective = follow(law, state, maps.applied, time, maps.moved_s())[0]
+    moved, parts = maps.moved_s(), parts_of(maps.segment)
+    start = dict(zip(range(len(parts)), [-BEFORE_FIRST_MAP_S, *starts_of(parts, time, moved)], strict=True))
+
+    def followed(part: slice) -> Floats:
+        state = law.demagnetised(maps.actuators, start[parts.index(part)])
+        return follow(law, state, maps.applied[part], time[part], moved[part])[0]
+
+    effective = in_parts(parts, followed)
     if law.creep_rate:
-        fading = law.creep_rate * relaxation(time, -BEFORE_FIRST_MAP_S)
-        effective += np.outer(fading, _crept_before(maps, effective, fading))
+        fading = np.zeros((len(maps), len(parts)))
+        for number, part in enumerate(parts):
+            fading[part, number] = law.creep_rate * relaxation(time[part], start[number])
+        effective += fading @ _crept_before(maps, effective, fading)
     return replace(maps, applied=effective)
 
 
 def _crept_before(maps: MapSet, effective: Floats, fading: Floats) -> Floats:
-    """(N,) effective signals that the mirror had crept to before the degauss, from what fades in the figure.
+    """(S, N) effective signals that the mirror had crept to before each degauss, from what fades in the figure.
 
     Without this the fading goes into the figure, which then belongs to the time of the run only. Expected to be of
     order 1, like all effective signals; that keeps patterns quiet which the maps hardly show.
+
+    Args:
+        fading: (M, S) how much of it each map still shows.
     """
     responses = responses_of(maps)
     keep, count = responses.usable, responses.coefficients
+    parts = fading.shape[1]
     design = np.column_stack((np.ones(len(maps)), fading, effective))[keep]
     values = responses.values[keep]
     solution = np.linalg.lstsq(design, values, rcond=1e-10)[0]
     freedom = max(len(design) - design.shape[1], 1)
     scatter = np.sqrt(np.square(values - design @ solution).sum(axis=0) / freedom)
     scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
-    scatter *= np.sqrt(np.linalg.pinv(design.T @ design)[1, 1])
-    influence, faded = solution[2:] / scatter, solution[1] / scatter
-    return np.linalg.solve(influence @ influence.T + np.eye(len(influence)), influence @ faded)
+    uncertainty = np.sqrt(np.diag(np.linalg.pinv(design.T @ design))[1 : 1 + parts])
+    crept = []
+    for faded, sigma in zip(solution[1 : 1 + parts], uncertainty, strict=True):
+        if not sigma > 0.0:  # no map of that part can be used
+            crept.append(np.zeros(maps.actuators))
+            continue
+        influence = solution[1 + parts :] / (scatter * sigma)
+        crept.append(
+            np.linalg.solve(influence @ influence.T + np.eye(len(influence)), influence @ (faded / (scatter * sigma)))
+        )
+    return np.array(crept)
 
 
 def unknown_history_sigma(law: MemoryLaw, seed: int = 0, actuators: int = 500) -> float:
@@ -163,7 +182,9 @@ def _error_covariance(found: Identification, run: Run, terms: int) -> Floats:
     rows = found.held_out[:, :count] / scale
     rows = rows[np.isfinite(rows).all(axis=1)]
     covariance = rows.T @ rows / len(rows)
-    repeated = np.flatnonzero((np.diff(run.signals, axis=0) == 0.0).all(axis=1)) + 1
+    same = (np.diff(run.signals, axis=0) == 0.0).all(axis=1)
+    same[[part.start - 1 for part in run.parts[1:]]] = False  # a degauss lies between
+    repeated = np.flatnonzero(same) + 1
     if repeated.size >= 3:
         values = run.responses.values[:, :count] / scale
         noise = 0.5 * np.mean(np.square(values[repeated] - values[repeated - 1]), axis=0)

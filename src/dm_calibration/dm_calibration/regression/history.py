@@ -23,6 +23,7 @@ from dm_calibration.influence.drift import drift_columns
 from dm_calibration.influence.gaps import usable_sag
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.sag import fill_gaps
+from dm_calibration.memory.segments import in_parts, parts_of
 
 Floats = NDArray[np.float64]
 
@@ -66,8 +67,12 @@ class RunHistory:
         self._sag = usable_sag(maps, reasons)
         self._sag[self.usable] = fill_gaps(maps.sag[self.usable], model[self.usable], maps.points)
         self._figure = drift_columns(maps.stamp_ns, maps.reference) if memory else np.ones((len(maps), 1))
-        plain = maps.applied[:, np.newaxis]
-        self._features = effective_signals(maps.applied, np.float64(1e-9) * maps.stamp_ns) if memory else plain
+        time_s = np.float64(1e-9) * maps.stamp_ns
+        self._features = (
+            in_parts(parts_of(maps.segment), lambda part: effective_signals(maps.applied[part], time_s[part]))
+            if memory
+            else maps.applied[:, np.newaxis]
+        )
 
     def fit(self, keep: NDArray[np.bool_]) -> SagLaw:
         """The law that explains the maps in `keep` (M,) best."""

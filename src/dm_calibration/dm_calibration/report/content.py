@@ -32,6 +32,11 @@ def length(metres: float, wavelength: float) -> str:
     return f"{metres * NM:.2f} nm{share}"
 
 
+def _counted(number: int, one: str, many: str) -> str:
+    """A number with its noun."""
+    return f"{number or 'No'} {one if number <= 1 else many}"
+
+
 def remeasured(calibration: Calibration) -> str:
     """The largest re-measured error of the recipes, in words."""
     recipes = calibration.recipes.recipes
@@ -71,7 +76,11 @@ def summary(calibration: Calibration) -> Section:
             f"This calibration knows how the mirror remembers ({memory.name}). Its influence function acts on "
             "effective signals, which follow from the history of all moves since the last degauss."
         )
-    warnings = len(calibration.limitations)
+    dropped, warnings = calibration.maps_dropped, len(calibration.limitations)
+    told = (
+        f"{_counted(dropped, 'map was', 'maps were')} dropped; "
+        f"{_counted(warnings, 'sentence', 'sentences')} of caution below."
+    )
     return Section(
         "Summary",
         [
@@ -79,9 +88,7 @@ def summary(calibration: Calibration) -> Section:
             "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that "
             "had no part in it: the honest one. Re-measured is what a map showed after a command of this calibration "
             "was applied. All lengths are surface sag, piston and tilt removed.",
-            f"{calibration.maps_dropped} maps were dropped, and {warnings} sentences of caution follow below."
-            if warnings or calibration.maps_dropped
-            else "No map was dropped, and nothing calls for caution.",
+            told,
         ],
         [Table("Key figures", ("figure", "value"), rows)],
     )
@@ -112,14 +119,18 @@ def provenance(calibration: Calibration, file: str, sha256: str) -> Section:
     if file:
         rows += [("file", file), ("SHA-256 of the file", sha256)]
     shapes = [(name, target.strip()) for name, _, target in (text.partition(":") for text in calibration.targets)]
-    solved = [Table("Shapes that were solved on an influence function", ("surface", "aim"), shapes)] if shapes else []
+    solved = (
+        [Table("Shapes that were solved on an influence function", ("surface", "aim"), shapes, words=True)]
+        if shapes
+        else []
+    )
     return Section(
         "What was measured, when and with what",
         [
             "The calibration file holds everything this page is made of: signals, coefficients and sag of every map, "
             "names and full SHA-256 of the map files, and the result."
         ],
-        [Table("Provenance", ("item", "value"), rows), *solved],
+        [Table("Provenance", ("item", "value"), rows, words=True), *solved],
     )
 
 
@@ -136,7 +147,7 @@ def cautions(calibration: Calibration) -> Section:
     rejected = [(maps.label[i], fit.reasons[i]) for i in np.flatnonzero(~fit.used)]
     never = [(label, reason.strip()) for label, _, reason in (entry.partition(":") for entry in calibration.dropped)]
     rows = [*rejected, *never]
-    table = [Table("Maps that are not in the fit", ("map", "reason"), rows)] if rows else []
+    table = [Table("Maps that are not in the fit", ("map", "reason"), rows, words=True)] if rows else []
     return Section("Warnings and known limitations", [*checked, *others], table)
 
 

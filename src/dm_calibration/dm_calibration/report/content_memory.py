@@ -21,7 +21,7 @@ def hysteresis(calibration: Calibration) -> Section:
             title,
             [
                 "Not identified: the maps of this plan do not show the memory apart from the influence function. "
-                "A calibration with the plan `memory` does (./dm calibrate --plan memory)."
+                "A calibration with the plan “memory” does (./dm calibrate --plan memory)."
             ],
         )
     law, wavelength = memory.law, calibration.wavelength
@@ -61,7 +61,7 @@ def hysteresis(calibration: Calibration) -> Section:
             "the turning points before it. A degauss wipes the loops, not the creep.",
             *memory.remarks,
         ],
-        [Table("The law", ("item", "value"), rows)],
+        [Table("The law", ("item", "value"), rows, words=True)],
         pictures,
     )
 
@@ -73,7 +73,7 @@ def recipes(calibration: Calibration) -> Section:
     if not book.recipes:
         return Section(
             title,
-            ["None are stored with this calibration, so no error was re-measured. The action `converge` builds them."],
+            ["None are stored with this calibration, so no error was re-measured. The action “converge” builds them."],
         )
     rows = [
         (

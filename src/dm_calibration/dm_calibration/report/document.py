@@ -23,17 +23,19 @@ PAGE = (8.27, 11.69)
 MARGIN = 0.08
 #: Height of a line of body text and of a table row, as a share of a PDF page.
 LINE, ROW = 0.0155, 0.019
+FOOT = "#444444"
 #: Characters on a line of body text of a PDF page.
 CHARACTERS = 104
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a header; the first column is a name, the others are set to the right."""
+    """Rows under a header; the first column is a name, the others are numbers, set to the right, unless `words`."""
 
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+    words: bool = False
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -78,11 +80,18 @@ nav a { margin-right: 1rem; white-space: nowrap; }
 table { border-collapse: collapse; font-size: 0.88rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; font-weight: 600; padding-bottom: 0.4rem; }
 th, td { padding: 0.22rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td:first-child, .words th, .words td { text-align: left; overflow-wrap: anywhere; }
 thead th { border-bottom: 2px solid #555; vertical-align: bottom; }
 figure { margin: 1.2rem 0; }
 figure img { max-width: 100%; height: auto; }
 figcaption { font-size: 0.88rem; color: #444; max-width: 48rem; }
+@media print {
+  body { font-size: 10pt; max-width: none; margin: 0; }
+  nav { display: none; }
+  tr, figure { break-inside: avoid; }
+  h2, caption { break-after: avoid; }
+  .scroll { overflow: visible; }
+}
 </style>
 </head>
 <body>
@@ -144,8 +153,9 @@ def _html(title: str, sections: Sequence[Section], place: Callable[[Picture], st
 def _html_table(table: Table) -> str:
     head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.header)
     body = "\n".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in table.rows)
+    kind = ' class="words"' if table.words else ""
     return (
-        f'<div class="scroll"><table><caption>{escape(table.caption)}</caption>\n'
+        f'<div class="scroll"><table{kind}><caption>{escape(table.caption)}</caption>\n'
         f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>"
     )
 
@@ -176,25 +186,28 @@ def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
 
 
 class _Paper:
-    """Text from the top of a page downwards, on as many pages as it takes."""
+    """Text from the top of a page downwards, on as many pages as it takes; title and number at the foot of each."""
 
     def __init__(self, pages: PdfPages, title: str) -> None:
-        self._pages = pages
+        self._pages, self._title = pages, title
+        self._done: list[Figure] = []
         self._page: Figure | None = None
         self._y = 0.0
         self.text(title, size=15, weight="bold")
 
     def end(self) -> None:
-        """Finish the page, if one was begun."""
-        if self._page is not None:
-            self._pages.savefig(self._page)
-        self._page = None
+        """Write all pages: how many there are is known only now."""
+        for number, page in enumerate(self._done, start=1):
+            page.text(MARGIN, MARGIN / 2, self._title, fontsize=7.5, color=FOOT)
+            words = f"page {number} of {len(self._done)}"
+            page.text(1.0 - MARGIN, MARGIN / 2, words, fontsize=7.5, color=FOOT, ha="right")
+            self._pages.savefig(page)
 
     def _room(self, height: float) -> Figure:
         """The page, a new one unless `height` is left on it."""
         if self._page is None or self._y - height < MARGIN:
-            self.end()
             self._page, self._y = Figure(figsize=PAGE), 1.0 - MARGIN
+            self._done.append(self._page)
         return self._page
 
     def text(self, text: str, size: float = 9.5, weight: str = "normal", keep: int = 0) -> None:
@@ -212,16 +225,19 @@ class _Paper:
         """A table whose columns are as wide as their longest cell."""
         widths = [max(len(row[k]) for row in (table.header, *table.rows)) for k in range(len(table.header))]
         size = min(8.0, 8.0 * 92 / (sum(widths) + 2 * len(widths)))
-        right = [MARGIN + edge for edge in _edges(widths)]
+        edges = [MARGIN + edge for edge in _edges(widths)]
+        if table.words:  # a column begins where the one before ends
+            edges = [MARGIN, *(edge + 0.02 for edge in edges[:-1])]
         height = ROW * (len(table.rows) + 3)
         # A table that fits on a page is not torn.
         kept = height if height < 1.0 - 2.5 * MARGIN else 12 * ROW
         self.text(table.caption, size=9.0, weight="bold", keep=round(kept / LINE))
-        self._row(table.header, right, size, "bold")
+        side = "left" if table.words else "right"
+        self._row(table.header, edges, size, side, "bold")
         for row in table.rows:
             if self._page is None or self._y - ROW < MARGIN:
-                self._row(table.header, right, size, "bold")  # again on every page
-            self._row(row, right, size)
+                self._row(table.header, edges, size, side, "bold")  # again on every page
+            self._row(row, edges, size, side)
         self._y -= ROW
 
     def picture(self, picture: Picture) -> None:
@@ -237,16 +253,18 @@ class _Paper:
         self._y -= 0.4 * LINE
         self.text(picture.caption, size=8.5)
 
-    def _row(self, cells: Sequence[str], right: Sequence[float], size: float, weight: str = "normal") -> None:
+    def _row(
+        self, cells: Sequence[str], edges: Sequence[float], size: float, side: str, weight: str = "normal"
+    ) -> None:
         page = self._room(ROW)
         for k, cell in enumerate(cells):
             page.text(
-                MARGIN if k == 0 else right[k],
+                MARGIN if k == 0 else edges[k],
                 self._y,
                 cell,
                 fontsize=size,
                 fontweight=weight,
-                ha="left" if k == 0 else "right",
+                ha="left" if k == 0 else side,
                 va="top",
             )
         self._y -= ROW

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
@@ -96,6 +97,7 @@ def response_figure(calibration: Calibration) -> Figure:
             left.bar(numbers[chosen], fit.response[chosen] * NM, color=colour, label=label)
     left.errorbar(numbers, fit.response * NM, fit.standard_error * NM, fmt="none", ecolor="black", elinewidth=0.8)
     left.set(xlabel="actuator", ylabel="rms sag of a unit signal, nm")
+    left.xaxis.set_major_locator(MaxNLocator(integer=True))
     left.legend(fontsize=8)
     left.grid(axis="y", alpha=0.3)
     shown = right.scatter(

@@ -41,6 +41,26 @@ def run_calibration(client: Any, goal: Any) -> Any:
     return result
 
 
+def start_fresh(client: Any) -> None:
+    """Have the next goal begin anew.
+
+    Raises:
+        DeformableMirrorError: the node does not answer, or refuses.
+    """
+    from rclpy.parameter import Parameter
+    from rclpy.parameter_client import AsyncParameterClient
+
+    from dm_controller.client import DeformableMirrorError
+    from dm_runtime.worker import answers_arrive
+
+    parameters = AsyncParameterClient(client.node, "calibration")
+    if not client.wait(lambda: answers_arrive(parameters, parameters.services_are_ready)):
+        raise DeformableMirrorError(599, "the node `calibration` does not answer: is it running (./dm up)?")
+    answer = parameters.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, True)])
+    if not client.wait(answer.done) or not all(each.successful for each in answer.result().results):
+        raise DeformableMirrorError(599, "the node `calibration` did not take start_fresh = true")
+
+
 def show_result(result: Any) -> None:
     """Print a calibration's figures and everything a person should know about it."""
     if result.id:
@@ -105,6 +125,9 @@ def calibrate(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Tell duration and expected accuracy, move nothing.")
     ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Begin anew; an interrupted run of the same plan is set aside.")
+    ] = False,
     activate: Annotated[bool, typer.Option(help="Use the new calibration at once.")] = True,
     note: Annotated[str, typer.Option(help="Stored with the calibration.")] = "",
     namespace: NamespaceOption = "",
@@ -112,7 +135,8 @@ def calibrate(
 ) -> None:
     """Calibrate the mirror on the bench: command, settle, measure, fit, store.
 
-    Needs the running suite (`dm up`). Ctrl-C cancels and leaves the mirror at mid range.
+    Needs the running suite (`dm up`). Ctrl-C cancels and leaves the mirror at mid range; what was measured is kept, and
+    the same command goes on from there.
     """
     from dm_msgs.action import Calibrate
 
@@ -132,6 +156,8 @@ def calibrate(
         note=note,
     )
     with DeformableMirrorClient(namespace) as client:
+        if fresh and not dry_run:
+            start_fresh(client)
         try:
             result = run_calibration(client, goal)
         except DeformableMirrorError as error:
@@ -141,5 +167,7 @@ def calibrate(
     if dry_run:
         console.print(result.message)
     else:
+        if result.message.startswith("resumed run"):
+            console.print(result.message.partition(";")[0])
         show_result(result)
     write_json(json, {"calibration": figures_of(result)})

@@ -1,0 +1,65 @@
+"""News from the kernel of files that were written: at once, where polling would wait for them to stand still.
+
+Linux tells of writers on this machine only (inotify(7)); what another one writes to a shared folder shows by polling.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import struct
+import time
+from pathlib import Path
+
+_CLOSE_WRITE, _MOVED_TO, _IGNORED, _ONLYDIR = 0x8, 0x80, 0x8000, 0x01000000
+_EVENT = struct.Struct("iIII")  # watch, mask, cookie, length of the name that follows
+_BUFFER = 64 * 1024
+#: Time after which a folder that could not be watched is tried again, s.
+RETRY_S = 1.0
+
+
+class ClosedFiles:
+    """Names of files in one folder that their writer has closed, or that were moved there under their name.
+
+    Nothing is raised where the kernel cannot tell: then nothing comes.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._library = ctypes.CDLL(None, use_errno=True)
+        self._descriptor: int = self._library.inotify_init1(os.O_CLOEXEC | os.O_NONBLOCK)
+        self._watching = False
+        self._tried = -RETRY_S
+
+    def wait(self, seconds: float) -> list[str]:
+        """Names that came, as soon as one does; empty after `seconds`."""
+        if not self._watching and time.monotonic() >= self._tried + RETRY_S:
+            self._watch()
+        if self._descriptor < 0:
+            time.sleep(max(seconds, 0.0))
+            return []
+        if not select.select([self._descriptor], [], [], max(seconds, 0.0))[0]:
+            return []
+        content, names, at = os.read(self._descriptor, _BUFFER), [], 0
+        while at < len(content):
+            _watch, mask, _cookie, length = _EVENT.unpack_from(content, at)
+            at += _EVENT.size + length
+            if mask & _IGNORED:
+                self._watching = False  # the folder is gone, perhaps to be mounted again
+            elif length:
+                names.append(os.fsdecode(content[at - length : at].rstrip(b"\0")))
+        return names
+
+    def close(self) -> None:
+        """End watching."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _watch(self) -> None:
+        self._tried = time.monotonic()
+        if self._descriptor >= 0:
+            mask = _CLOSE_WRITE | _MOVED_TO | _ONLYDIR
+            path = os.fsencode(self._folder)
+            self._watching = self._library.inotify_add_watch(self._descriptor, path, mask) >= 0

@@ -1,0 +1,268 @@
+"""A run that was cut off goes on from its last good map and ends as an uninterrupted one would have."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dm_calibration.calibration_errors import Refused
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.event_frames import map_hashes, record_hash
+from dm_calibration.influence.fit import FitOptions, fit_influence
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.measurement import BenchError, Measurement
+from dm_calibration.memory.identify import CANDIDATES
+from dm_calibration.memory.memory_fit import fit_memory
+from dm_calibration.outcome import Event, MapTaken
+from dm_calibration.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure import Procedure
+from dm_calibration.resumable_run import OpenRun, ResumeOptions, identity_of, open_run
+from dm_calibration.run_journal import EVENTS, read_run
+from dm_calibration.store import CalibrationStore, StoreError
+from dm_calibration.unfinished_runs import UnfinishedRuns
+from dm_controller.experiments.twin_bench import TwinBench, TwinConfig
+from remembering_mirror import MIRROR, RememberingBench
+
+POKES = make_plan(PlanKind.POKES, MIRROR)
+
+
+class PowerCut(Exception):
+    """The end of the process, wherever it comes."""
+
+
+def opened(folder: Path, plan: Plan, fresh: bool = False, age_max: float = 3600.0, **settings: object) -> OpenRun:
+    identity = identity_of(plan, PlanOptions(), MIRROR, settings, {})
+    with UnfinishedRuns(folder) as runs:
+        return open_run(runs, identity, plan, ResumeOptions(age_max, fresh))
+
+
+def cut_before(count: int) -> Callable[[Event], None]:
+    """A power cut as map `count` is to be kept."""
+    seen = 0
+
+    def check(event: Event) -> None:
+        nonlocal seen
+        seen += isinstance(event, MapTaken)
+        if seen > count:
+            raise PowerCut
+
+    return check
+
+
+def procedure(
+    run: OpenRun, plan: Plan, bench: object, check: Callable[[Event], None] = lambda event: None
+) -> Procedure:
+    def keep(event: Event) -> None:
+        check(event)
+        run.journal.keep(event)
+
+    return Procedure(plan, MIRROR, bench, outcome=run.outcome, keep=keep)  # type: ignore[arg-type]
+
+
+def test_each_map_is_measured_once_however_often_the_power_fails(tmp_path: Path) -> None:
+    bench = RememberingBench()
+    measured: dict[str, str] = {}
+    good = bench.measure
+    taken: list[str] = []
+
+    def measure(label: str) -> Measurement:
+        taken.append(label)
+        return good(label)
+
+    bench.measure = measure  # type: ignore[method-assign]
+
+    def cut(event: Event) -> None:
+        if isinstance(event, MapTaken):
+            measured[event.record.label] = record_hash(event.record)
+            if len(measured) % 9 == 8:
+                run.journal.keep(event)
+                raise PowerCut
+
+    cuts = 0
+    while True:
+        run = opened(tmp_path, POKES)
+        try:
+            outcome = procedure(run, POKES, bench, cut).run()
+            break
+        except PowerCut:
+            cuts += 1
+            run.journal.close()
+    assert cuts >= 9
+    assert len(taken) == len(set(taken)) == len(outcome.records)
+    planned = {step.label for step in POKES.steps if step.kind is not StepKind.DEGAUSS}
+    assert {label for label in taken if "resumed" not in label} == planned
+    assert map_hashes(outcome.maps()) == [measured[record.label] for record in outcome.records]
+
+
+def test_what_is_read_back_is_bit_for_bit_what_was_measured(tmp_path: Path) -> None:
+    run = opened(tmp_path, POKES)
+    live = procedure(run, POKES, RememberingBench()).run()
+    again = read_run(run.journal.folder).outcome
+    assert map_hashes(again.maps()) == map_hashes(live.maps())
+    assert np.array_equal(again.centres, live.centres, equal_nan=True)
+    calibration, _ = evaluate(again, MIRROR, FitOptions(), Provenance("resumed", 1))
+    store = CalibrationStore(tmp_path)
+    store.save(calibration)
+    assert map_hashes(store.load("resumed").maps) == [record_hash(record) for record in live.records]
+
+
+def test_shapes_solved_before_and_after_a_power_cut_come_from_the_same_pokes(tmp_path: Path) -> None:
+    plan = make_plan(PlanKind.FULL, MIRROR)
+    order = [step.label for step in plan.steps]
+    run = opened(tmp_path, plan)
+    with pytest.raises(PowerCut):
+        procedure(run, plan, RememberingBench(), cut_before(order.index("p57") - 1)).run()
+    run.journal.close()
+    resumed = procedure(opened(tmp_path, plan), plan, RememberingBench()).run()
+    whole = Procedure(plan, MIRROR, RememberingBench()).run()
+    assert resumed.targets[:2] == run.outcome.targets[:2]
+    assert [target.partition(":")[0] for target in resumed.targets] == [t.partition(":")[0] for t in whole.targets]
+    assert {record.label for record in whole.records} == {
+        record.label for record in resumed.records if "resumed" not in record.label
+    }
+
+
+@pytest.mark.parametrize("torn", [1, 40, 2000])
+def test_a_torn_last_frame_is_cut_off(tmp_path: Path, torn: int) -> None:
+    run = opened(tmp_path, POKES)
+    with pytest.raises(PowerCut):
+        procedure(run, POKES, RememberingBench(), cut_before(5)).run()
+    run.journal.close()
+    events = run.journal.folder / EVENTS
+    events.write_bytes(events.read_bytes()[:-torn])
+    again = opened(tmp_path, POKES)
+    assert [record.label for record in again.outcome.records] == [r.label for r in run.outcome.records[:4]]
+    outcome = procedure(again, POKES, RememberingBench()).run()
+    assert {step.label for step in POKES.steps[1:]} <= {record.label for record in outcome.records}
+
+
+def test_damage_in_the_middle_is_not_taken_for_a_map(tmp_path: Path) -> None:
+    run = opened(tmp_path, POKES)
+    with pytest.raises(PowerCut):
+        procedure(run, POKES, RememberingBench(), cut_before(9)).run()
+    events = run.journal.folder / EVENTS
+    content = bytearray(events.read_bytes())
+    content[len(content) // 2] ^= 1
+    events.write_bytes(content)
+    kept = read_run(run.journal.folder)
+    hashes = [record_hash(record) for record in kept.outcome.records]
+    assert 0 < len(hashes) < 9 and kept.torn > 0
+    assert hashes == [record_hash(record) for record in run.outcome.records[: len(hashes)]]
+
+
+def test_only_the_same_plan_settings_and_mirror_go_on(tmp_path: Path) -> None:
+    def begin() -> OpenRun:
+        run = opened(tmp_path, POKES, settle=1)
+        if not run.resumed:
+            with pytest.raises(PowerCut):
+                procedure(run, POKES, RememberingBench(), cut_before(3)).run()
+        run.journal.close()
+        return run
+
+    first = begin()
+    other = opened(tmp_path, POKES, settle=2)
+    assert not other.resumed and any("other settings: it waits" in note for note in other.notes)
+    assert begin().resumed == f"resumed run {first.journal.folder.name} with 3 maps"
+    fresh = opened(tmp_path, POKES, fresh=True, settle=1)
+    assert not fresh.resumed and any("3 maps) is set aside: a fresh run" in note for note in fresh.notes)
+    assert len(list((tmp_path / "unfinished").glob("*.set-aside"))) == 1
+    begin()
+    assert not opened(tmp_path, POKES, age_max=0.0, settle=1).resumed
+
+
+def test_what_failed_last_is_tried_again(tmp_path: Path) -> None:
+    bench = RememberingBench()
+    good = bench.measure
+
+    def measure(label: str) -> Measurement:
+        if label in ("poke+02", "poke-02", "poke+03"):
+            raise BenchError(306, "no interferometer node answered")
+        return good(label)
+
+    bench.measure = measure  # type: ignore[method-assign]
+    run = opened(tmp_path, POKES)
+    with pytest.raises(BenchError):
+        procedure(run, POKES, bench).run()
+    run.journal.close()
+    bench.measure = good  # type: ignore[method-assign]
+    again = opened(tmp_path, POKES)
+    outcome = procedure(again, POKES, bench).run()
+    assert outcome.dropped == []
+    assert {"poke+02", "poke-02", "poke+03"} <= {record.label for record in outcome.records}
+
+
+def test_a_disk_that_fills_up_costs_one_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = opened(tmp_path, POKES)
+    written = 0
+
+    def full(handle: int, content: bytes, position: int) -> int:
+        nonlocal written
+        written += 1
+        if written == 6:
+            return write(handle, bytes(content)[:100], position)
+        if written > 6:
+            raise OSError(28, "No space left on device")
+        return write(handle, content, position)
+
+    write = os.pwrite
+    monkeypatch.setattr("dm_calibration.run_journal.os.pwrite", full)
+    with pytest.raises(StoreError, match=r"map poke.*could not be kept in .*No space left"):
+        procedure(run, POKES, RememberingBench()).run()
+    run.journal.close()
+    assert len(read_run(run.journal.folder).outcome.records) == len(run.outcome.records) >= 2
+
+
+def test_two_nodes_do_not_calibrate_into_one_folder(tmp_path: Path) -> None:
+    with UnfinishedRuns(tmp_path), pytest.raises(Refused, match="another node is calibrating"):
+        UnfinishedRuns(tmp_path).__enter__()
+
+
+def interrupted(kind: PlanKind, config: TwinConfig, folder: Path, cuts: tuple[int, ...], maps: int = 100) -> MapSet:
+    """The maps of a run on the twin, cut off before some of them, with the power off for an hour each time."""
+    bench = TwinBench(config)
+    options = PlanOptions(memory_maps=maps)
+    plan = make_plan(kind, bench.mirror, options)
+    identity = identity_of(plan, options, bench.mirror, {}, {})
+    for cut in (*cuts, 10**9):
+        with UnfinishedRuns(folder) as runs:
+            run = open_run(runs, identity, plan, ResumeOptions(3600.0))
+        check = cut_before(cut - len(run.outcome.records))
+
+        def keep(event: Event, run: OpenRun = run, check: Callable[[Event], None] = check) -> None:
+            check(event)
+            run.journal.keep(event)
+
+        try:
+            Procedure(plan, bench.mirror, bench, outcome=run.outcome, keep=keep).run()
+        except PowerCut:
+            run.journal.close()
+            bench.power_cycle(3600.0)
+    return run.outcome.maps()
+
+
+def test_an_interrupted_memory_run_knows_the_law_as_well(tmp_path: Path) -> None:
+    config = TwinConfig(seed=90125)
+    laws = CANDIDATES[1:2]
+    whole = fit_memory(interrupted(PlanKind.MEMORY, config, tmp_path / "whole", ()), candidates=laws)
+    maps = interrupted(PlanKind.MEMORY, config, tmp_path / "parts", (30, 70))
+    assert np.unique(maps.segment).size == 3
+    parts = fit_memory(maps, candidates=laws)
+    assert parts.held_out_max_zernike < 2.0 * whole.held_out_max_zernike < 6e-9
+    assert parts.law.creep_rate == pytest.approx(whole.law.creep_rate, rel=0.1)
+    blind = fit_memory(replace(maps, segment=np.zeros_like(maps.segment)), candidates=laws)
+    assert blind.held_out_max_zernike > 2.0 * parts.held_out_max_zernike  # what not knowing of the cuts would cost
+
+
+@pytest.mark.parametrize(("law", "figure"), [("none", 2.5e-9), ("prandtl_ishlinskii", 25e-9)])
+def test_an_interrupted_poke_run_predicts_as_well(law: str, figure: float, tmp_path: Path) -> None:
+    config = TwinConfig(law=law, seed=90125)
+    whole = fit_influence(interrupted(PlanKind.POKES, config, tmp_path / "whole", ()))
+    parts = fit_influence(interrupted(PlanKind.POKES, config, tmp_path / "parts", (20, 55)))
+    assert parts.held_out_rms < 1.2 * whole.held_out_rms < 1.2 * figure
+    difference = np.linalg.norm(parts.influence_sag - whole.influence_sag)
+    assert difference < 0.05 * np.linalg.norm(whole.influence_sag)

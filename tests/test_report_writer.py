@@ -1,0 +1,71 @@
+"""The report beside each calibration file: written by itself, and never in the way of the calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.influence.fit import FitOptions
+from dm_calibration.plan import PlanKind, PlanOptions
+from dm_calibration.report_writer import ReportingStore, ReportWriter
+from recorded_bench import recorded
+from remembering_mirror import MIRROR
+
+PATIENCE_S = 200.0
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    outcome = recorded(PlanKind.POKES, PlanOptions())[1]
+    return evaluate(outcome, MIRROR, FitOptions(), Provenance("c1", 10**18))[0]
+
+
+def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration, tmp_path: Path) -> None:
+    told: list[tuple[str, bool]] = []
+    writer = ReportWriter(lambda words, warning: told.append((words, warning)))
+    store = ReportingStore(tmp_path, writer, lambda: True)
+    store.save(calibration)
+    assert writer.wait(PATIENCE_S)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c1.h5", "c1.html", "c1.pdf"]
+    assert told == [("report written: c1.html and .pdf beside the calibration", False)]
+    assert [entry.id for entry in store.entries()] == ["c1"]
+
+
+def test_a_changed_calibration_gets_a_new_report(calibration: Calibration, tmp_path: Path) -> None:
+    writer = ReportWriter(lambda _words, _warning: None)
+    store = ReportingStore(tmp_path, writer, lambda: True)
+    store.save(calibration)
+    store.replace(replace(calibration, limitations=("Somebody leaned on the table.",)))
+    assert writer.wait(PATIENCE_S)
+    assert "Somebody leaned on the table." in (tmp_path / "c1.html").read_text()
+
+
+def test_a_report_that_fails_leaves_the_calibration_and_a_sentence(calibration: Calibration, tmp_path: Path) -> None:
+    told: list[tuple[str, bool]] = []
+    writer = ReportWriter(lambda words, warning: told.append((words, warning)))
+    (tmp_path / "c1.html").mkdir()  # something else has the name
+    store = ReportingStore(tmp_path, writer, lambda: True)
+    store.save(calibration)
+    assert writer.wait(PATIENCE_S)
+    ((words, warning),) = told
+    assert warning and words.startswith("no report of c1.h5: ") and "./dm report" in words
+    assert store.load("c1").id == "c1"
+
+
+def test_nothing_is_written_when_none_is_wanted(calibration: Calibration, tmp_path: Path) -> None:
+    writer = ReportWriter(lambda _words, _warning: None)
+    ReportingStore(tmp_path, writer, lambda: False).save(calibration)
+    assert writer.wait(PATIENCE_S)
+    assert [path.name for path in tmp_path.iterdir()] == ["c1.h5"]
+
+
+def test_the_end_of_the_node_leaves_no_halves(calibration: Calibration, tmp_path: Path) -> None:
+    writer = ReportWriter(lambda _words, _warning: None)
+    ReportingStore(tmp_path, writer, lambda: True).save(calibration)
+    writer.end()
+    assert writer.wait(0.0)
+    assert {path.name for path in tmp_path.iterdir()} <= {"c1.h5", "c1.html", "c1.pdf"}
