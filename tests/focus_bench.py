@@ -32,6 +32,7 @@ from support import NodeProcess, Observer, wait_until
 
 MIRROR = LinearMirror(*hexagon())
 SLEW_RATE = 40.0
+REPORT_PERIOD = 0.5
 
 
 def mirror_info(serial: str = "T-1") -> MirrorInfo:
@@ -94,6 +95,8 @@ class Bench:
         self.request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.commands: list[ActuatorCommand] = []
         self.follow = follow
+        self._report: ActuatorState | None = None
+        node.create_timer(REPORT_PERIOD, lambda: self._report and self.state.publish(self._report))
         node.create_subscription(ActuatorCommand, "actuator_command", self._on_command, qos.COMMAND)
         self.focus_states = observer.record(FocusState, "focus_state", qos.STATE)
         self.capabilities: list[Capabilities] = observer.record(Capabilities, "capabilities", qos.LATCHED)
@@ -104,7 +107,12 @@ class Bench:
             self.publish_state(list(command.signals))
 
     def publish_state(self, applied: list[float], state: int = ActuatorState.STATE_ACTIVE) -> None:
-        self.state.publish(ActuatorState(driver_state=state, requested=applied, applied=applied, history_known=True))
+        self.report(ActuatorState(driver_state=state, requested=applied, applied=applied, history_known=True))
+
+    def report(self, message: ActuatorState) -> None:
+        """Publish it, and again from time to time."""
+        self._report = message
+        self.state.publish(message)
 
     def ready(self, message: Calibration | None = None) -> Bench:
         """Mirror, calibration and an active driver are known to the controller."""
@@ -113,6 +121,10 @@ class Bench:
         wait_until(lambda: self.capabilities and self.capabilities[-1].calibration_id == "known", 30.0)
         self.activate()
         return self
+
+    def fall_silent(self) -> None:
+        """The driver reports no more, until it is activated."""
+        self._report, self.follow = None, False
 
     def activate(self) -> None:
         wait_until(lambda: self.state.get_subscription_count() > 0)
@@ -196,7 +208,7 @@ class RememberingBench(Bench):
         message.moving, message.degausses = moving, self.degausses
         message.turns, message.turned_at = self.turns, self.turned_at
         message.header.stamp = time_message(round(1e9 * when))
-        self.state.publish(message)
+        self.report(message)
 
     def _on_command(self, command: ActuatorCommand) -> None:
         self.turns, self.turned_at = self.turns + 1, list(command.signals)

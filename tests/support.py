@@ -23,7 +23,7 @@ from dm_runtime.executor import BackgroundExecutor
 from dm_runtime.worker import answers_arrive
 
 
-def wait_until(condition: Callable[[], Any], timeout_s: float = 10.0, what: str = "") -> Any:
+def wait_until(condition: Callable[[], Any], timeout_s: float = 30.0, what: str = "") -> Any:
     """Return the first true value of `condition()`; fail the test when there is none in time."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:

@@ -186,3 +186,39 @@ def test_move_is_aborted_when_the_driver_loses_its_electronics(bench: Bench) -> 
     bench.publish_state([0.0] * 37, ActuatorState.STATE_LINK_LOST)
     wait_until(result.done)
     assert result.result().result.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
+
+
+def test_a_newer_request_ends_a_goal_that_is_under_way(bench: Bench) -> None:
+    bench.follow = False
+    bench.ready()
+    handle, result = bench.observer.send_goal(
+        MoveFocus, "move_focus", MoveFocus.Goal(request=FocusRequest(curvature=0.01))
+    )
+    wait_until(lambda: len(bench.commands) == 1)
+    newer = bench.set_focus(curvature=0.02).state
+    handle.cancel_goal_async()  # comes too late to stop anything
+    wait_until(result.done)
+    assert result.result().result.error_code in (ErrorCode.PREEMPTED, ErrorCode.CANCELED)
+    threading.Event().wait(0.2)
+    assert [list(command.signals) for command in bench.commands[1:]] == [list(newer.signals)]
+
+
+def test_a_command_that_the_driver_does_not_take_is_told_of(bench: Bench) -> None:
+    bench.follow = False
+    bench.ready()
+    assert bench.set_focus(curvature=0.01).error_code == ErrorCode.OK
+    told = wait_until(lambda: [s for s in bench.focus_states if s.error_code != ErrorCode.OK], 20.0)[0]
+    assert told.curvature == 0.01 and not told.applied
+    assert told.error_code == ErrorCode.PREEMPTED
+    assert "has not taken the command" in told.message
+
+
+def test_requests_are_refused_when_the_driver_falls_silent(bench: Bench) -> None:
+    bench.ready()
+    bench.fall_silent()
+    wait_until(lambda: bench.set_focus(dry_run=False).error_code != ErrorCode.OK, 20.0)
+    refused = bench.set_focus(curvature=0.01)
+    assert refused.error_code == ErrorCode.DRIVER_UNAVAILABLE
+    assert "has not reported for" in refused.message
+    bench.activate()
+    wait_until(lambda: bench.set_focus(curvature=0.01).error_code == ErrorCode.OK)

@@ -16,6 +16,7 @@ from dm_msgs.msg import ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import Degauss
 from rclpy.node import Node
 
+from dm_controller.driver_watch import DriverWatch
 from dm_controller.refusal import Refusal
 from dm_runtime.worker import ServiceCallError, call
 
@@ -59,6 +60,7 @@ class Conditioner:
         carry_out: executes a request right after a degauss of `steps` half-swings; called in the worker thread.
         refuse: makes, and publishes, the state of a request that could not be conditioned for.
         degausses: the driver's count, as far as it has been followed.
+        driver: tells when a driver that degausses is no longer there.
         on_learnt: called when the time that a degauss takes has been measured.
 
     Attributes:
@@ -74,8 +76,10 @@ class Conditioner:
         carry_out: Callable[[FocusRequest, int], FocusState],
         refuse: Callable[[FocusRequest, Refusal], FocusState],
         degausses: Callable[[], int],
+        driver: DriverWatch,
         on_learnt: Callable[[], None],
     ) -> None:
+        self._driver = driver
         self._values, self._turn = values, turn
         self._carry_out, self._refuse, self._degausses, self._on_learnt = carry_out, refuse, degausses, on_learnt
         self._client = node.create_client(Degauss, "degauss")
@@ -116,22 +120,23 @@ class Conditioner:
             begin, self.busy = not self.busy, True
             if begin:
                 self.steps, self._begun = steps, time.monotonic()
-        if old is not None:
-            self._preempt(old)
+            if old is not None:
+                self._preempt(old)
         if begin:
             threading.Thread(target=self._work, args=(steps,), daemon=True).start()
         return waiting
 
-    def drop(self, waiting: Waiting) -> None:
-        """Do not carry out `waiting` after all; the degauss under way goes on."""
+    def drop(self, waiting: Waiting) -> bool:
+        """Do not carry out `waiting` after all; the degauss under way goes on. False = it is too late for that."""
         with self._turn:
-            if self._waiting is waiting:
+            dropped = self._waiting is waiting
+            if dropped:
                 self._waiting = None
+            return dropped
 
-    @staticmethod
-    def _preempt(old: Waiting) -> None:
-        message = "a newer request took its place during the degauss"
-        old.finish(FocusState(curvature=old.request.curvature, error_code=ErrorCode.PREEMPTED, message=message))
+    def _preempt(self, old: Waiting) -> None:
+        refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
+        old.finish(self._refuse(old.request, refusal))
 
     def _work(self, steps: int) -> None:
         refusal: Refusal | None = None
@@ -151,11 +156,18 @@ class Conditioner:
                 waiting.finish(self._carry_out(waiting.request, steps))
 
     def _degauss(self, steps: int) -> None:
-        before = self._degausses()
+        before, starts = self._degausses(), self._driver.starts
+
+        def gone() -> str:
+            return "pdm_driver was restarted" if self._driver.starts != starts else self._driver.stopped
+
         try:
-            response = call(self._client, Degauss.Request(steps=steps), self._values["condition.timeout"])
+            # A driver that is killed or stopped never answers; its successor knows nothing of the degauss.
+            response = call(
+                self._client, Degauss.Request(steps=steps), self._values["condition.timeout"], lambda: bool(gone())
+            )
         except ServiceCallError as error:
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {error}") from error
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {gone() or error}") from error
         if response.error_code != ErrorCode.OK:
             raise Refusal(response.error_code, f"conditioning: {response.message}")
         self._learnt[steps] = response.duration

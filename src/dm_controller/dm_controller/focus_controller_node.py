@@ -28,16 +28,17 @@ from dm_controller.conditioning import Conditioner, Waiting
 from dm_controller.converge_action import ConvergeAction
 from dm_controller.conversions import doubles
 from dm_controller.decision import Decision, Situation, condition_steps, decide
+from dm_controller.driver_watch import DriverWatch
 from dm_controller.focus_parameters import PARAMETERS
 from dm_controller.focus_report import Outcome, fill_state, health, state_of
-from dm_controller.hold import Hold
+from dm_controller.hold import SAME_SIGNAL, Hold
 from dm_controller.latency import Latency
 from dm_controller.memory_watch import CURE, MemoryWatch, same_law
 from dm_controller.mirror_in_use import NO_CALIBRATION, MirrorInUse, mirror_in_use
 from dm_controller.move_focus_action import MoveFocusAction
 from dm_controller.prediction import ForecastClient
 from dm_controller.refusal import Refusal
-from dm_controller.request_checks import check_age, check_driver, check_reachable
+from dm_controller.request_checks import check_age, check_reachable
 from dm_controller.target import FocusTarget
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
@@ -46,6 +47,8 @@ from dm_runtime.parameters import declare
 #: Time after a command until `focus_state` tells of it, s. Whoever waits for the command wakes up meanwhile: it may
 #: have to on this very core (measured: 0.2 ms sooner).
 TELL_S = 1e-3
+#: How often it is looked whether the driver took the last command, s.
+LOOK_S = 0.5
 
 
 class FocusControllerNode(Node):
@@ -63,7 +66,9 @@ class FocusControllerNode(Node):
         self._calibration: Calibration | None = None
         self._use: MirrorInUse | None = None
         self._not_calibrated = Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
-        self._driver: ActuatorState | None = None
+        self._driver = DriverWatch(self._values)
+        self._asked: Any = ()  # signals of the last request's command; () = the last command answers none
+        self._sent: Any = ()  # signals of the last command: those, or with creep corrected
         self._watch, self._hold, self._latency = MemoryWatch(), Hold(self._values), Latency()
         self._told: tuple[object, ...] = ()  # what the last capabilities said of the driver
         self._counts = {"requests": 0, "refused": 0}
@@ -73,10 +78,10 @@ class FocusControllerNode(Node):
         self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.LATCHED)
         self._conditioner = Conditioner(
             self, self._values, self._turn, self._carry_out_conditioned, self._refuse,
-            lambda: self._watch.degausses, lambda: self._publish_capabilities(),
+            lambda: self._watch.degausses, self._driver, lambda: self._publish_capabilities(),
         )  # fmt: skip
         self._move = MoveFocusAction(
-            self, self._carry_out, self._conditioner.drop, self._stop_at, lambda: self._driver, self._values
+            self, self._carry_out, self._conditioner.drop, self._standing, self._stop, self._driver, self._values
         )
         self._forecast = ForecastClient(self)
         self._converge = ConvergeAction(
@@ -89,9 +94,10 @@ class FocusControllerNode(Node):
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         self.create_subscription(FocusRequest, "focus_request", self._on_focus_request, qos.COMMAND)
-        self.create_service(SetFocus, "set_focus", self._on_set_focus)
-        self.create_service(Flatten, "flatten", self._on_flatten)
+        self.create_service(SetFocus, "set_focus", self._on_set_focus, qos_profile=qos.SERVICE)
+        self.create_service(Flatten, "flatten", self._on_flatten, qos_profile=qos.SERVICE)
         self.create_timer(self._values["hold.period"], self._correct_held_shape)
+        self.create_timer(LOOK_S, self._look_for_untaken, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         self._publish_capabilities()
 
@@ -148,7 +154,7 @@ class FocusControllerNode(Node):
         self._forecast.use(use.calibration.id, use.mirror, reachable)
 
     def _on_actuator_state(self, message: ActuatorState) -> None:
-        self._driver = message
+        self._driver.observe(message)
         self._watch.observe(message)
         if message.driver_state != ActuatorState.STATE_ACTIVE:
             self._hold.end("the driver is not active")
@@ -181,7 +187,7 @@ class FocusControllerNode(Node):
         return self._conditioner.duration(steps, self._use.slew_rate, self._use.span) if self._use is not None else 0.0
 
     def _check_free(self) -> None:
-        check_driver(self._driver)
+        self._driver.check()
         if self._converge.busy:
             raise Refusal(ErrorCode.BUSY, "a closed loop (action converge) is running; cancel it first")
 
@@ -220,7 +226,7 @@ class FocusControllerNode(Node):
             if not dry_run:
                 self._check_free()
                 if conditioned is not None or (decision.condition is None and not self._conditioner.busy):
-                    stamp = self._go(decision, now_ns)
+                    stamp = self._go(request, decision, now_ns)
                 else:
                     waiting = self._condition(request, decision)
         except Refusal as refusal:
@@ -263,11 +269,12 @@ class FocusControllerNode(Node):
         state.header.stamp = stamp or time_message(self._now_ns())
         return state
 
-    def _go(self, decision: Decision, now_ns: int) -> Any:
+    def _go(self, request: FocusRequest, decision: Decision, now_ns: int) -> Any:
         """Send the command of `decision`, made at `now_ns`, and hold its shape from now on; returns its stamp."""
         assert self._use is not None
         move = decision.move
-        stamp = self._send(move.signals, now_ns)
+        stamp = self._send(move.signals, request, now_ns)
+        self._asked = move.signals
         self._hold.begin(self._use.loop, move.effective, move.signals, 1e-9 * now_ns, decision.look.known)
         return stamp
 
@@ -283,22 +290,49 @@ class FocusControllerNode(Node):
         self._focus_state.publish(state)
         return state
 
-    def _send(self, signals: Any, now_ns: int | None = None) -> Any:
+    def _send(self, signals: Any, request: FocusRequest | None = None, now_ns: int | None = None) -> Any:
         command = ActuatorCommand(signals=doubles(signals))
         command.header.stamp = time_message(self._now_ns() if now_ns is None else now_ns)
         self._command.publish(command)
         self._latency.sent(command)
+        self._driver.sent(command, request)
+        self._sent = command.signals
         return command.header.stamp
 
-    def _stop_at(self, signals: Any) -> None:
-        """Leave the move under way at `signals` (N,)."""
+    def _standing(self, signals: Any) -> Any:
+        """What was last sent to keep the shape that was asked for by `signals` (N,); None = another was asked since."""
         with self._turn:
+            ours = len(signals) == len(self._asked) and np.allclose(signals, self._asked, rtol=0.0, atol=SAME_SIGNAL)
+            return self._sent if ours else None
+
+    def _stop(self, signals: Any) -> bool:
+        """Leave the move to `signals` (N,) where it is; False = another shape was asked for since, nothing is sent."""
+        with self._turn:
+            driver = self._driver.latest
+            if self._standing(signals) is None:
+                return False
             self._hold.end("the move was cancelled")
-            self._send(signals)
+            self._asked = ()
+            if driver is not None and len(driver.applied):
+                self._send(driver.applied)
+            return True
+
+    def _look_for_untaken(self) -> None:
+        """Tell of a command that the driver did not take: its request had been answered as carried out."""
+        untaken = self._driver.untaken()
+        if untaken is None:
+            return
+        with self._turn:
+            request, refusal = untaken
+            self._hold.end("the driver did not take the command")
+            if request is not None:
+                self._refuse(request, refusal)
+            else:  # a correction, or the end of a move
+                self.get_logger().warning(str(refusal))
 
     def _correct_held_shape(self) -> None:
         with self._turn:
-            driver = self._driver
+            driver = self._driver.latest
             if not self._hold.active or driver is None or driver.moving:
                 return
             if self._converge.busy:
@@ -343,7 +377,8 @@ class FocusControllerNode(Node):
         message.latency = self._latency.typical
         if self._mirror_info is not None:
             message.settling = settling_time(self._mirror_info)
-        self._told = (self._driver.driver_state if self._driver is not None else None, unknown)
+        driver = self._driver.latest
+        self._told = (driver.driver_state if driver is not None else None, unknown)
         self._capabilities.publish(message)
 
     def _remarks(self, use: MirrorInUse, unknown: str) -> str:
@@ -358,7 +393,7 @@ class FocusControllerNode(Node):
         use, unknown = self._use, self._watch.unknown
         values: dict[str, object] = dict(self._counts)
         values |= {"history": unknown or "known", "held": self._hold.active, "corrections": self._hold.corrections}
-        return health(self._not_calibrated if use is None else self._remarks(use, unknown), self._driver, values)
+        return health(self._not_calibrated if use is None else self._remarks(use, unknown), self._driver.check, values)
 
 
 def main() -> int:

@@ -30,6 +30,17 @@ PARAMETERS: Final = (
     ),
     Parameter("move_timeout", float, 10.0, "longest time a move may take", "s", 0.1, 600.0),
     Parameter(
+        "driver_timeout",
+        float,
+        3.0,
+        "silence of pdm_driver after which requests are refused, and longest wait until it confirms a command; longer "
+        "than its state_period; 0 = never",
+        "s",
+        0.0,
+        600.0,
+        live=True,
+    ),
+    Parameter(
         "time_budget",
         float,
         0.0,

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from dm_msgs.msg import ActuatorState, FocusRequest, FocusState
+from dm_msgs.msg import FocusRequest, FocusState
 
 from dm_controller.conditioning import Waiting
 from dm_controller.conversions import doubles
 from dm_controller.decision import Decision
 from dm_controller.prediction import Forecast
 from dm_controller.refusal import Refusal
-from dm_controller.request_checks import check_driver
 from dm_runtime import diagnostics
 
 
@@ -70,18 +69,20 @@ def fill_state(state: FocusState, calibration_id: str, decision: Decision, forec
     state.mode = decision.mode
 
 
-def health(trouble: Refusal | str, driver: ActuatorState | None, values: Mapping[str, object]) -> diagnostics.Health:
+def health(
+    trouble: Refusal | str, check_driver: Callable[[], None], values: Mapping[str, object]
+) -> diagnostics.Health:
     """The node's health.
 
     Args:
         trouble: why there is no calibration, or remarks on it in words, "" = none.
-        driver: its last report.
+        check_driver: raises Refusal when the driver takes no commands.
         values: figures.
     """
     try:
         if isinstance(trouble, Refusal):
             raise trouble
-        check_driver(driver)
+        check_driver()
     except Refusal as refusal:
         return diagnostics.Health(diagnostics.WARN, str(refusal), values)
     return diagnostics.Health(diagnostics.WARN if trouble else diagnostics.OK, trouble or "ready", values)

@@ -19,7 +19,7 @@ from dm_calibration.memory.tracker import Applied, MemoryTracker
 from dm_controller.open_loop import OpenLoop
 
 #: Reports kept for a law that is identified later: a calibration run makes some hundred.
-LOG_LENGTH = 20_000
+LOG_LENGTH = 5_000
 CURE = "a degauss over the full range (service degauss) makes it known"
 
 

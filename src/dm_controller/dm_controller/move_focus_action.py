@@ -13,7 +13,11 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_controller.conditioning import Waiting
+from dm_controller.driver_watch import DriverWatch
 from dm_runtime.worker import WorkerActionServer, sleep
+
+#: How a goal ends whose shape somebody else replaced.
+_SUPERSEDED = ("abort", ErrorCode.PREEMPTED, "another command took over")
 
 
 class MoveFocusAction:
@@ -23,9 +27,11 @@ class MoveFocusAction:
         node: hosts the action.
         carry_out: (request, dry_run): judge a request and, unless it is refused or a dry run, send it. Returns its
             state and, when the mirror is conditioned first, what waits for the end of that.
-        drop: do not carry out what waits.
-        send: publish signals (N,) as a command.
-        driver: the driver's latest state; None before the first.
+        drop: do not carry out what waits; False = it has been.
+        standing: (signals) -> what was last sent to keep the shape that these (N,) asked for, which may be corrected
+            for creep; None = another shape was asked for since.
+        stop: (signals) leave the move to these (N,) where it is; False = another shape was asked for since.
+        driver: its reports.
         values: parameters `settle_time` and `move_timeout`.
     """
 
@@ -33,13 +39,14 @@ class MoveFocusAction:
         self,
         node: Node,
         carry_out: Callable[[FocusRequest, bool], tuple[FocusState, Waiting | None]],
-        drop: Callable[[Waiting], None],
-        send: Callable[[Any], Any],
-        driver: Callable[[], ActuatorState | None],
+        drop: Callable[[Waiting], bool],
+        standing: Callable[[Any], Any],
+        stop: Callable[[Any], bool],
+        driver: DriverWatch,
         values: Mapping[str, Any],
     ) -> None:
         self._clock = node.get_clock()
-        self._carry_out, self._drop, self._send = carry_out, drop, send
+        self._carry_out, self._drop, self._standing, self._stop_move = carry_out, drop, standing, stop
         self._driver, self._values = driver, values
         self._server = WorkerActionServer(node, MoveFocus, "move_focus", self._run, exclusive="preempt")
 
@@ -52,6 +59,9 @@ class MoveFocusAction:
             result.duration = time.monotonic() - started
             return outcome, result
 
+        # Goals that wait for their turn may get it in another order than they came in.
+        if self._told_to_stop(goal_handle):
+            return end(*self._stop(goal_handle))
         goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
         if goal.tolerance > 0.0:
             preview, _ = self._carry_out(goal.request, True)
@@ -80,7 +90,9 @@ class MoveFocusAction:
         settle = goal.settle_time or self._values["settle_time"]
         goal_handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))
         if not sleep(self._clock, settle, lambda: self._told_to_stop(goal_handle)):
-            return end(*self._stop(goal_handle))
+            return end(*self._stop(goal_handle, wanted))
+        if self._standing(wanted) is None:
+            return end(*_SUPERSEDED)
         return end(
             "succeed", ErrorCode.OK, f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
         )
@@ -88,14 +100,19 @@ class MoveFocusAction:
     def _told_to_stop(self, goal_handle: ServerGoalHandle) -> bool:
         return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
 
-    def _stop(self, goal_handle: ServerGoalHandle) -> tuple[str, int, str]:
-        """End a goal early: on cancel the mirror holds the shape it has; a newer goal goes on from there by itself."""
-        if goal_handle.is_cancel_requested:
-            driver = self._driver()
-            if driver is not None and len(driver.applied):
-                self._send(driver.applied)
+    def _stop(self, goal_handle: ServerGoalHandle, wanted: np.ndarray | None = None) -> tuple[str, int, str]:
+        """End a goal early, None = before it sent anything.
+
+        On cancel the mirror holds the shape it has, unless it is under way to one that was asked for since; a newer
+        goal goes on from there by itself.
+        """
+        if not goal_handle.is_cancel_requested:
+            return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
+        if wanted is None:
+            return "canceled", ErrorCode.CANCELED, "canceled before anything moved"
+        if self._stop_move(wanted):
             return "canceled", ErrorCode.CANCELED, "canceled; the mirror holds the shape it had reached"
-        return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
+        return "canceled", ErrorCode.CANCELED, "canceled; the mirror follows a newer request"
 
     def _await_conditioning(
         self, goal_handle: ServerGoalHandle, waiting: Waiting, expected_s: float
@@ -103,8 +120,7 @@ class MoveFocusAction:
         """Wait until the mirror is degaussed and the command is out; None when it is, or was refused."""
         started, next_feedback = time.monotonic(), 0.0
         while not waiting.done:
-            if self._told_to_stop(goal_handle):
-                self._drop(waiting)
+            if self._told_to_stop(goal_handle) and self._drop(waiting):
                 if goal_handle.is_cancel_requested:
                     return "canceled", ErrorCode.CANCELED, "canceled; the degauss under way ends at mid range"
                 return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
@@ -119,23 +135,30 @@ class MoveFocusAction:
     def _await_shape(self, goal_handle: ServerGoalHandle, wanted: np.ndarray) -> tuple[str, int, str] | None:
         """Wait until the driver reports the wanted shape; None when it stands."""
         deadline = time.monotonic() + self._values["move_timeout"]
-        next_feedback, first_gap = 0.0, 0.0
+        next_feedback, first_gap, taken = 0.0, 0.0, False
         while True:
             if self._told_to_stop(goal_handle):
-                return self._stop(goal_handle)
-            driver = self._driver()
-            if driver is not None and len(driver.requested) == len(wanted):
+                return self._stop(goal_handle, wanted)
+            sent, driver = self._standing(wanted), self._driver.latest
+            if sent is None:
+                return _SUPERSEDED
+            if driver is not None and driver.driver_state != ActuatorState.STATE_ACTIVE:
+                return (
+                    "abort",
+                    ErrorCode.ELECTRONICS_UNREACHABLE,
+                    f"the driver left its active state: {driver.message}",
+                )
+            if silent := self._driver.silent:
+                return "abort", ErrorCode.DRIVER_UNAVAILABLE, silent
+            if driver is not None and len(driver.requested) == len(driver.applied) == len(wanted):
                 gap = float(np.abs(np.asarray(driver.applied) - wanted).max())
                 first_gap = max(first_gap, gap)
-                ours = np.allclose(driver.requested, wanted, atol=1e-9)
-                if ours and not driver.moving and driver.driver_state == ActuatorState.STATE_ACTIVE:
+                ours = any(np.allclose(driver.requested, signals, rtol=0.0, atol=1e-9) for signals in (wanted, sent))
+                if ours and not driver.moving:
                     return None
-                if driver.driver_state != ActuatorState.STATE_ACTIVE:
-                    return (
-                        "abort",
-                        ErrorCode.ELECTRONICS_UNREACHABLE,
-                        f"the driver left its active state: {driver.message}",
-                    )
+                if taken and not ours:
+                    return _SUPERSEDED
+                taken = ours
                 if time.monotonic() >= next_feedback:
                     next_feedback = time.monotonic() + 0.1
                     goal_handle.publish_feedback(

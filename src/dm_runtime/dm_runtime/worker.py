@@ -23,6 +23,8 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.service import Service
 
+from dm_runtime import qos
+
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
 RESULT_TIMEOUT_S = 10
 
@@ -45,7 +47,9 @@ class WorkerService:
         self._node = node
         self._callback = callback
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name.replace("/", "_"))
-        self._service: Service = node.create_service(srv_type, name, lambda request, response: (request, response))
+        self._service: Service = node.create_service(
+            srv_type, name, lambda request, response: (request, response), qos_profile=qos.SERVICE
+        )
         # The executor calls `callback` and passes what it returns to `send_response(response, header)`: the only place
         # where the header that a later answer needs can be had.
         self._send: Callable[[Any, Any], None] = self._service.send_response
@@ -108,6 +112,9 @@ class WorkerActionServer(ActionServer):
             goal_callback=self._on_goal,
             cancel_callback=lambda goal_handle: CancelResponse.ACCEPT,
             result_timeout=RESULT_TIMEOUT_S,
+            goal_service_qos_profile=qos.SERVICE,
+            result_service_qos_profile=qos.SERVICE,
+            cancel_service_qos_profile=qos.SERVICE,
         )
 
     @property

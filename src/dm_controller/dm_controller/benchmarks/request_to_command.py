@@ -38,6 +38,8 @@ WARM_UP = 50
 #: The stream that must not grow queues.
 STREAM_RATE = 500.0
 ANSWER_S = 2.0
+#: As the driver reports when nothing happens: one that is silent is taken for dead.
+REPORT_PERIOD_S = 0.5
 EXECUTORS = ("events", "single", "multi")
 
 
@@ -107,6 +109,8 @@ class FocusPeer(Peer):
         node.create_subscription(FocusState, f"{prefix}/focus_state", self.focus_states.append, qos.STATE)
         self._turns = 0
         self._degausses = 0
+        self._reported: ActuatorState | None = None
+        node.create_timer(REPORT_PERIOD_S, lambda: self._reported and self._state.publish(self._reported))
 
     def asked_by(self) -> list[tuple[int, float]]:
         asked = {_ns(state.header.stamp): state.curvature for state in self.focus_states if state.applied}
@@ -128,6 +132,7 @@ class FocusPeer(Peer):
             history_known=self._degausses > 0,
         )
         report.header.stamp = self.room.node.get_clock().now().to_msg()
+        self._reported = report
         self._state.publish(report)
 
     def calibrate(self) -> None:
