@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from dm_calibration.hdf5_image import ImageError, read_image
+from dm_calibration.hdf5_image import ImageError, read_image, write_image
 from dm_calibration.hdf5_sandbox import Hdf5Sandbox, SandboxError
 from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
 from dm_controller.torture.fuzz import fuzz
@@ -136,4 +136,28 @@ def test_a_datx_file_that_goes_on_beyond_its_end_is_refused(tmp_path: Path) -> N
     path = tmp_path / "a.datx"
     path.write_bytes(intact("datx").content + b"more")
     with pytest.raises(MapFileError, match="longer than its superblock says"):
+        read_map(path)
+
+
+def test_texts_that_are_no_text_disagree_with_the_hash(tmp_path: Path) -> None:
+    """h5py hands such bytes over as lone surrogates, which cannot be encoded."""
+    path = tmp_path / "a.h5"
+    path.write_bytes(write_image({}, {"texts": ("whole",)}))
+    with h5py.File(path, "r+") as file:
+        del file.attrs["texts"]
+        file.attrs["texts"] = np.array([b"\xe8"], dtype=h5py.string_dtype())
+    with pytest.raises(ImageError, match="does not agree with its hash"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("shift", [-256, -128, -8, 8, 32, 640])
+def test_a_damaged_address_of_a_datx_map_is_noticed(tmp_path: Path, shift: int) -> None:
+    """Nothing in the format tells twice where the values stand."""
+    file = intact("datx")
+    ((start, _end),) = file.places["samples"]
+    old, new = (address.to_bytes(8, "little") for address in (start, start + shift))
+    assert file.content.count(old) == 1
+    path = tmp_path / "a.datx"
+    path.write_bytes(file.content.replace(old, new))
+    with pytest.raises(MapFileError, match=r"they go on outside|which are no heights|do not agree"):
         read_map(path)

@@ -6,7 +6,6 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -19,8 +18,9 @@ from lifecycle_msgs.msg import Transition
 from numpy.typing import NDArray
 from rosgraph_msgs.msg import Clock
 
-from dm_controller.torture.driver_rig import ACTUATORS, DriverRig, other_client
+from dm_controller.torture.driver_rig import ACTUATORS, DriverRig
 from dm_controller.torture.faults import Fault, FaultRecord
+from dm_controller.torture.rig_parts import judged, other_client
 
 ROUNDS = 3  # injections per start of a driver, where one driver can take several
 
@@ -48,7 +48,7 @@ def fault(words: str, rounds: int = ROUNDS, **rig_options: Any) -> Callable[[Inj
     def register(inject: Injection) -> Injection:
         def run(folder: Path, domain: int, random: Random, record: FaultRecord) -> None:
             with DriverRig(folder, domain, **rig_options) as rig:
-                with _judged(rig, record):
+                with judged(rig, record):
                     rig.recover(shape(random))
                     for _ in range(rounds):
                         inject(rig, random, record)
@@ -60,21 +60,6 @@ def fault(words: str, rounds: int = ROUNDS, **rig_options: Any) -> Callable[[Inj
         return inject
 
     return register
-
-
-@contextmanager
-def _judged(rig: DriverRig, record: FaultRecord) -> Any:
-    """Add what the monitor saw, however the block ends."""
-    try:
-        yield
-    finally:
-        record.limit_violations += rig.violations
-        if rig.violations:
-            seen = rig.bench.monitor.record
-            record.remarks.append(
-                f"{seen.jumps} jumps, largest {seen.largest_jump:.3f}; {seen.neighbour_violations} neighbours; "
-                f"{seen.range_violations} out of range"
-            )
 
 
 # The process

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import rclpy
@@ -55,35 +53,29 @@ class DriverRig:
     Args:
         folder: for the driver's files and log.
         domain: ROS domain.
-        kind: "edac40_tcp" or "usb_dac40".
+        kind: "edac40_tcp", "edac40_udp" or "usb_dac40".
+        via: port that the driver is told instead of the unit's: of a relay between the two; 0 = the unit's own.
         changes: parameters of the driver beside the rig's.
     """
 
-    def __init__(self, folder: Path, domain: int, kind: str = "edac40_tcp", **changes: Any) -> None:
+    def __init__(self, folder: Path, domain: int, kind: str = "edac40_tcp", via: int = 0, **changes: Any) -> None:
         self.folder = folder
         self._domain = domain
         folder.mkdir(parents=True, exist_ok=True)
         self.events: list[str] = []  # what happened at the unit, in words
         serial = str(folder / "ttyUSB") if kind == "usb_dac40" else ""
-        self.bench = VirtualBench(
-            BenchConfig(
-                interferometer=InterferometerConfig(pixels=32),
-                drive=DriveConfig(),
-                ports=PortsConfig(OFF if serial else 0, OFF, OFF, serial),
-                monitor=MonitorConfig(jump=0.1, neighbour_difference=1.0),
-                files=FilesConfig(folder=folder / "maps"),
-                trigger_port=OFF,
-            ),
-            on_event=lambda severe, text: self.events.append(text),
-        )
-        self.port = int(self.bench.electronics.endpoints.get("tcp_port", 1))
+        self._udp = kind == "edac40_udp"
+        self.bench = VirtualBench(self._bench_config(serial), on_event=lambda severe, text: self.events.append(text))
+        endpoints = self.bench.electronics.endpoints
+        self.port = int(endpoints.get("udp_port" if self._udp else "tcp_port", 1))
         self._parameters = folder / "driver.yaml"
         values = {
             "mirror.serial": "torture",
             "state_folder": str(folder / "state"),
             "electronics.kind": kind,
             "electronics.address": "127.0.0.1",
-            "electronics.port": self.port,
+            "electronics.port": via or self.port,
+            "electronics.discovery_port": int(endpoints.get("discovery_port", 0)),
             "electronics.serial_port": serial,
             "volts.dac_at_zero": 0.0,
             "volts.dac_at_full": 5.0,
@@ -97,7 +89,19 @@ class DriverRig:
         self.process: subprocess.Popen[bytes] | None = None
         self.states: list[ActuatorState] = []
 
-    def __enter__(self) -> DriverRig:
+    def _bench_config(self, serial: str) -> BenchConfig:
+        """The bench: the electronics and their monitor are what counts, so its camera is small."""
+        tcp, udp = (OFF, 0) if self._udp else (OFF if serial else 0, OFF)
+        return BenchConfig(
+            interferometer=InterferometerConfig(pixels=32),
+            drive=DriveConfig(),
+            ports=PortsConfig(tcp, udp, udp, serial),
+            monitor=MonitorConfig(jump=0.1, neighbour_difference=1.0),
+            files=FilesConfig(folder=self.folder / "maps"),
+            trigger_port=OFF,
+        )
+
+    def __enter__(self) -> Self:
         self._context = Context()
         rclpy.init(context=self._context, domain_id=self._domain)
         self.node = Node("torture", context=self._context, enable_rosout=False, start_parameter_services=False)
@@ -123,10 +127,13 @@ class DriverRig:
     def start(self) -> None:
         """Start the driver."""
         assert self.process is None
-        with (self.folder / "driver.log").open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "dm_driver.pdm_driver_node", "--ros-args", "--params-file", self._parameters],
-                stdout=log,
+        self.process = self._start("dm_driver.pdm_driver_node", self._parameters, self.folder / "driver.log")
+
+    def _start(self, module: str, parameters: Path, log: Path) -> subprocess.Popen[bytes]:
+        with log.open("ab") as output:
+            return subprocess.Popen(
+                [sys.executable, "-m", module, "--ros-args", "--params-file", str(parameters)],
+                stdout=output,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "ROS_DOMAIN_ID": str(self._domain)},
                 start_new_session=True,
@@ -140,16 +147,7 @@ class DriverRig:
     def kill(self, number: int = signal.SIGKILL) -> int:
         """End the driver by a signal; its exit status."""
         process, self.process = self.process, None
-        if process is None:
-            return 0
-        process.send_signal(signal.SIGCONT)
-        process.send_signal(number)
-        try:
-            return process.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            raise RigError(f"the driver did not end on signal {number}") from None
+        return 0 if process is None else end_process(process, number, "the driver")
 
     # The driver as a node
 
@@ -245,38 +243,52 @@ class DriverRig:
             RigError: it does not within PATIENCE_S, or says it did and the actuators stand elsewhere.
         """
         begun = time.monotonic()
-
-        def accepted() -> bool:
-            if not self._clients[SetSignals].service_is_ready():
-                return False
-            future = self._clients[SetSignals].call_async(
-                SetSignals.Request(signals=np.asarray(signals, dtype=np.float64).tolist(), wait=True)
-            )
-            try:
-                self.wait(future.done, "an answer", 5.0)
-            except RigError:  # a server that is found and lost again takes the answer with it
-                self._clients[SetSignals].remove_pending_request(future)
-                return False
-            return bool(future.result().error_code == ErrorCode.OK)
-
-        self.wait(accepted, "a command that is carried out")
+        request = SetSignals.Request(signals=np.asarray(signals, dtype=np.float64).tolist(), wait=True)
+        self.insist(SetSignals, request, "a command that is carried out")
         took = time.monotonic() - begun
         self.wait(lambda: self.stands_at(signals), "the accepted shape at the actuators", 5.0)
         return took
 
+    def insist(self, kind: Any, request: Any, what: str, answer_s: float = 5.0) -> Any:
+        """Call a service until it answers without an error; `answer_s` is the longest wait for one answer.
 
-@contextmanager
-def other_client(rig: DriverRig) -> Iterator[None]:
-    """Another program that holds the unit's only TCP connection."""
+        Raises:
+            RigError: it does not within PATIENCE_S.
+        """
+        client = self._clients[kind]
+        refusal = "not offered"
 
-    def connected() -> socket.socket | None:
+        def accepted() -> Any:
+            nonlocal refusal
+            if not client.service_is_ready():
+                return None
+            future = client.call_async(request)
+            try:
+                self.wait(future.done, "an answer", answer_s)
+            except RigError:  # a server that is found and lost again takes the answer with it
+                client.remove_pending_request(future)
+                refusal = "no answer"
+                return None
+            refusal = getattr(future.result(), "message", "")
+            return future.result() if future.result().error_code == ErrorCode.OK else None
+
         try:
-            return socket.create_connection(("127.0.0.1", rig.port), PATIENCE_S)
-        except OSError:
-            return None
+            return self.wait(accepted, what)
+        except RigError as error:
+            raise RigError(f"{client.srv_name}: {refusal}: {error}") from error
 
-    connection = rig.wait(connected, "the unit's connection")
+
+def end_process(process: subprocess.Popen[bytes], number: int, name: str) -> int:
+    """End a process, stopped or not, by a signal; its exit status.
+
+    Raises:
+        RigError: it goes on; it was killed.
+    """
+    process.send_signal(signal.SIGCONT)
+    process.send_signal(number)
     try:
-        yield
-    finally:
-        connection.close()
+        return process.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        raise RigError(f"{name} did not end on signal {number}") from None

@@ -10,6 +10,8 @@ from random import Random
 from statistics import median
 from typing import Any
 
+from dm_controller.network_namespaces import NotPermittedError
+
 
 @dataclass
 class FaultRecord:
@@ -21,6 +23,7 @@ class FaultRecord:
         lost: what was accepted and neither carried out nor reported as failed.
         recovery_s: per injection, seconds from the end of the fault until a new command stood at the actuators.
         remarks: what went wrong, in words.
+        skipped: why this machine does not let the fault be injected, in words; "" = it does.
     """
 
     name: str
@@ -29,10 +32,11 @@ class FaultRecord:
     lost: int = 0
     recovery_s: list[float] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
+    skipped: str = ""
 
     @property
     def harmless(self) -> bool:
-        return self.injected > 0 and not self.limit_violations and not self.lost
+        return bool(self.injected or self.skipped) and not self.limit_violations and not self.lost
 
     def figures(self) -> dict[str, Any]:
         """For JSON; null where nothing was measured."""
@@ -44,6 +48,7 @@ class FaultRecord:
             "recovery_s_p50": median(self.recovery_s) if self.recovery_s else None,
             "recovery_s_max": max(self.recovery_s, default=None),
             "remarks": self.remarks[:20],
+            "skipped": self.skipped or None,
         }
 
 
@@ -85,6 +90,8 @@ def run_faults(
             random = Random(f"{fault.name}/{seed}/{turn}")
             try:
                 fault.run(folder / f"{fault.name}-{turn}", domain, random, record)
+            except NotPermittedError as reason:
+                record.skipped = str(reason)
             except Exception as error:
                 record.lost += 1
                 record.remarks.append(f"{type(error).__name__}: {error}")

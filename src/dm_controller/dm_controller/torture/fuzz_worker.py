@@ -40,6 +40,7 @@ def map_reader(file: Intact, folder: Path) -> Reader:
             found = read_map(path, xyz_unit=XYZ_UNIT)
         except MapFileError as error:
             return _refused(error)
+        f"{found.instrument}{found.serial}{found.part_name}".encode()  # they are published: must be text
         return judge(file, whole, mutation, found), ""
 
     return read

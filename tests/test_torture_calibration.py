@@ -1,0 +1,20 @@
+"""Faults around all real processes of a calibration, judged by the monitor in the emulated electronics."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dm_controller.torture.calibration_faults import FAULTS
+from dm_controller.torture.faults import run_faults
+
+#: Those that nothing else in the tests shows; `./dm torture` runs all.
+NAMES = ("calibration_power_cut", "calibration_interferometer_killed")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_is_harmed_lost_or_measured_twice(name: str, tmp_path: Path, domain: int) -> None:
+    chosen = [fault for fault in FAULTS if fault.name == name]
+    (record,) = run_faults(chosen, tmp_path, domain, seed=2011)
+    assert record.harmless, record.figures()

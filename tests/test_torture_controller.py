@@ -1,0 +1,56 @@
+"""Faults around a real focus controller, between a real driver and many clients."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from dm_controller.torture.faults import FaultRecord, run_faults
+from dm_controller.torture.focus_rig import FocusRig
+from dm_controller.torture.registry import GROUPS, OTHERS, select
+
+#: Those that nothing else in the tests shows; `./dm torture` runs all.
+FAULTS = (
+    "foreign_calibration",
+    "calibration_vanishes",
+    "driver_inactive",
+    "driver_dies_in_move",
+    "driver_stopped",
+    "driver_gone_in_conditioning",
+    "hundred_clients",
+    "move_cancelled",
+    "move_preempted",
+    "cancel_after_newer_request",
+    "conditioned_move_ended",
+    "loop_cancelled",
+)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_request_is_carried_out_or_refused_and_the_mirror_kept(name: str, tmp_path: Path, domain: int) -> None:
+    (record,) = run_faults(select([name]), tmp_path, domain, seed=2012)
+    assert record.harmless, record.figures()
+    assert len(record.recovery_s) == record.injected
+
+
+def test_a_request_that_a_dead_driver_swallows_counts_as_lost(tmp_path: Path, domain: int) -> None:
+    """What `driver_timeout` is for; and a loss that must be counted."""
+    random, record = Random(1), FaultRecord("dead driver")
+    with FocusRig(tmp_path, domain, driver_timeout=0.0) as rig:
+        rig.refocus(random)
+        rig.kill()
+        rig.account_for(rig.set_focus(rig.curvature(random)), record, patience_s=4.0)
+    assert record.lost == 1
+    assert "neither carried out nor told of" in record.remarks[0]
+
+
+def test_groups_stand_for_their_faults() -> None:
+    assert select(["network"]) == list(GROUPS["network"])
+    assert select([]) == [fault for faults in GROUPS.values() for fault in faults]
+    assert select(["move_cancelled", "controller"])[0].name == "move_cancelled"
+    assert len({fault.name for fault in select([])}) == len(select([]))
+    assert not {fault.name for fault in select([])} & {*GROUPS, *OTHERS}
+    with pytest.raises(ValueError, match=r"faults = flood: must be groups \(driver, .*soak\) or among .*late_joiner"):
+        select(["flood"])
