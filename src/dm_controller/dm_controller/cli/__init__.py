@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from dm_controller.cli.audit import audit
 from dm_controller.cli.bench import bench
 from dm_controller.cli.calibrate import calibrate
 from dm_controller.cli.check import check as check_calibration
@@ -21,6 +22,7 @@ from dm_controller.cli.recipes import recipes
 from dm_controller.cli.record import record
 from dm_controller.cli.replay import replay
 from dm_controller.cli.report import report
+from dm_controller.cli.security import security
 from dm_controller.cli.torture import torture
 from dm_controller.cli.up import up
 
@@ -46,6 +48,8 @@ for command in (
     record,
     replay,
     torture,
+    security,
+    audit,
     doctor,
 ):
     app.command()(command)

@@ -1,0 +1,148 @@
+"""What every node of the suite publishes, subscribes to, offers and calls: the one source of all policies.
+
+`tests/test_security_profile.py` starts the nodes and compares this table with their ROS graph: nothing may be missing,
+and nothing may stand here that no node uses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+#: Of every node.
+PARAMETER_SERVICES = (
+    "~/describe_parameters",
+    "~/get_parameter_types",
+    "~/get_parameters",
+    "~/get_type_description",
+    "~/list_parameters",
+    "~/set_parameters",
+    "~/set_parameters_atomically",
+)
+LIFECYCLE_SERVICES = (
+    "~/change_state",
+    "~/get_available_states",
+    "~/get_available_transitions",
+    "~/get_state",
+    "~/get_transition_graph",
+)
+LOGS = ("/parameter_events", "/rosout")
+#: Whoever may publish it turns the time of all others.
+CLOCK = "/clock"
+_HEALTH = ("/diagnostics",)
+_TRANSITIONS = ("~/transition_event",)
+#: What an operator's program calls.
+_OPERATION = ("degauss", "flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
+_LONG_OPERATION = ("calibrate", "converge", "move_focus")
+#: Enclaves of nodes that go by simulated time on a twin.
+_TIMED = frozenset({"pdm_driver", "interferometer", "calibration", "focus_controller", "autofocus"})
+
+
+@dataclass(frozen=True)
+class NodeInterface:
+    """One node's interfaces. Names are relative to the mirror's namespace, `~` is the node, `/` begins a global name.
+
+    Attributes:
+        name: of the node; `*` where the process number stands.
+        enclave: last part of the enclave's path.
+        publish, subscribe: topics.
+        reply, request: services that the node offers and calls.
+        execute, call: actions that it offers and calls.
+    """
+
+    name: str
+    enclave: str
+    publish: tuple[str, ...] = ()
+    subscribe: tuple[str, ...] = ()
+    reply: tuple[str, ...] = ()
+    request: tuple[str, ...] = ()
+    execute: tuple[str, ...] = ()
+    call: tuple[str, ...] = ()
+
+
+#: The nodes of a bench, and the programs that talk to them.
+_DECLARED = (
+    NodeInterface(
+        "pdm_driver",
+        "pdm_driver",
+        publish=(*_HEALTH, *_TRANSITIONS, "actuator_state", "mirror_info"),
+        subscribe=("actuator_command",),
+        reply=(*LIFECYCLE_SERVICES, "degauss", "set_signals"),
+    ),
+    NodeInterface(
+        "interferometer",
+        "interferometer",
+        publish=(*_HEALTH, *_TRANSITIONS, "surface_map", "surface_map_info", "surface_samples", "zernike"),
+        reply=(*LIFECYCLE_SERVICES, "ingest_file", "measure"),
+    ),
+    NodeInterface(
+        "calibration",
+        "calibration",
+        publish=(*_HEALTH, "calibration"),
+        subscribe=("actuator_state", "mirror_info", "surface_samples", "zernike"),
+        reply=(
+            *("fit_influence_function", "fit_regression", "list_calibrations", "load_calibration"),
+            *("predict_error", "store_recipes", "update_calibration"),
+        ),
+        request=("degauss", "measure", "set_signals"),
+        execute=("calibrate",),
+    ),
+    # The way back to mid range when the node ends in a run: the same process, over a node of its own.
+    NodeInterface("calibration_exit", "calibration", request=("set_signals",)),
+    NodeInterface(
+        "focus_controller",
+        "focus_controller",
+        publish=(*_HEALTH, "actuator_command", "capabilities", "focus_state"),
+        subscribe=("actuator_state", "calibration", "focus_request", "mirror_info"),
+        reply=("flatten", "set_focus"),
+        request=("degauss", "measure", "predict_error", "set_signals", "store_recipes"),
+        execute=("converge", "move_focus"),
+    ),
+    NodeInterface(
+        "autofocus",
+        "autofocus",
+        publish=(*_HEALTH, "autofocus_state", "focus_request"),
+        subscribe=("actuator_state", "capabilities", "focus_state", "image_raw"),
+        reply=("get_focus_range", "set_focus_distance"),
+        request=("set_focus",),
+        execute=("autofocus",),
+    ),
+    NodeInterface(
+        "dm_console_*",
+        "console",
+        subscribe=(
+            *("/diagnostics", "/rosout", "actuator_state", "calibration", "capabilities", "focus_state"),
+            *("mirror_info", "surface_map", "surface_map_info", "zernike"),
+        ),
+        request=_OPERATION,
+        call=_LONG_OPERATION,
+    ),
+    NodeInterface(
+        "dm_client_*",
+        "cli",
+        subscribe=("actuator_state", "calibration", "capabilities", "mirror_info", "surface_map", "surface_map_info"),
+        request=(*_OPERATION, "ingest_file", "update_calibration"),
+        call=_LONG_OPERATION,
+    ),
+)
+#: Only where there is a twin instead of hardware: whoever holds this enclave sets the time of all others.
+_TWIN = NodeInterface(
+    "virtual_bench",
+    "virtual_bench",
+    publish=(*_HEALTH, CLOCK, "image_raw", "~/endpoints"),
+    reply=("~/power", "~/trigger"),
+)
+
+
+def interfaces(twin: bool = False) -> tuple[NodeInterface, ...]:
+    """The interfaces of all nodes, with what every node has; of a bench with a `twin`, its own and its clock's too."""
+    nodes = (*_DECLARED, _TWIN) if twin else _DECLARED
+    return tuple(
+        replace(
+            node,
+            publish=tuple(sorted({*node.publish, *LOGS})),
+            subscribe=tuple(sorted({*node.subscribe, *((CLOCK,) if twin and node.enclave in _TIMED else ())})),
+            reply=tuple(sorted({*node.reply, *PARAMETER_SERVICES})),
+            request=tuple(sorted(node.request)),
+        )
+        for node in nodes
+    )

@@ -1,0 +1,157 @@
+"""The hardened profile beside the real nodes, and keystores that do not keep to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree as xml
+
+import pytest
+from typer.testing import CliRunner
+
+from dm_controller.cli import app
+from dm_controller.cli.demo import bench_config
+from dm_controller.client import DeformableMirrorClient
+from dm_controller.console.ros_side import RosSide
+from dm_controller.security.graph import declaration_of, differences
+from dm_controller.security.interfaces import interfaces
+from dm_controller.security.keystore import check_keystore, keys_missing
+from dm_controller.security.policy import Profile, dds_topics, write_profile
+from dm_controller.suite import Suite, own_domain
+from support import wait_until
+
+PROFILE = Profile(twin=True)
+#: Nodes that live for a moment only.
+SHORT_LIVED = {"calibration_exit"}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirrorClient]:
+    """All nodes, a client and a console."""
+    folder = tmp_path_factory.mktemp("bench")
+    config = bench_config(folder, "off", 0.0, 1, speed=20.0)
+    config["virtual_bench"]["camera.rate"] = 1.0
+    config["autofocus"] = {"use_sim_time": True}
+    with own_domain() as domain, Suite(config, folder, domain), DeformableMirrorClient(domain=domain) as client:
+        side = RosSide(domain=domain)
+        try:
+            client.wait_until_active(60.0)
+            wait_until(lambda: client.node.count_publishers("surface_map"), 60.0)
+            client.measure_map()  # its subscriptions are made when they are needed
+            yield client
+        finally:
+            side.close()
+
+
+DECLARED = [node for node in interfaces(twin=True) if node.name not in SHORT_LIVED]
+
+
+@pytest.mark.parametrize("declared", DECLARED, ids=[node.name for node in DECLARED])
+def test_the_policy_is_what_the_node_uses_and_nothing_more(bench: DeformableMirrorClient, declared: object) -> None:
+    def running() -> str:
+        names = bench.node.get_node_names()
+        return next((name for name in names if declaration_of(name, PROFILE) == declared), "")
+
+    name = wait_until(running, 60.0, f"a node {declared}")
+    found: dict[str, list[str]] = {}
+
+    def agrees() -> bool:
+        found.update(differences(bench.node, name, PROFILE, declared))  # type: ignore[arg-type]
+        return found == {"more": [], "less": []}
+
+    try:
+        wait_until(agrees, 20.0)
+    except AssertionError:
+        raise AssertionError(f"{name}: {found}") from None
+
+
+def test_nobody_but_the_twin_may_set_the_time() -> None:
+    for profile in (Profile(), PROFILE):
+        may = [enclave for enclave in profile.enclaves() if "rt/clock" in dds_topics(profile, enclave)["publish"]]
+        assert may == (["virtual_bench"] if profile.twin else [])
+
+
+def test_only_the_controller_may_publish_commands_and_nobody_may_set_parameters() -> None:
+    profile = Profile()
+    topics = {enclave: dds_topics(profile, enclave)["publish"] for enclave in profile.enclaves()}
+    assert [enclave for enclave in topics if "rt/actuator_command" in topics[enclave]] == ["focus_controller"]
+    assert not [topic for names in topics.values() for topic in names if "set_parameters" in topic and "rq" in topic]
+
+
+def test_names_carry_the_namespace() -> None:
+    topics = dds_topics(Profile("left", 5), "pdm_driver")
+    assert {"rt/left/actuator_state", "rt/diagnostics", "rr/left/pdm_driver/get_stateReply"} <= topics["publish"]
+
+
+def signed(folder: Path, profile: Profile, enclave: str) -> Path:
+    """Permissions as sros2 writes them, a key, and something in place of the signature."""
+    place = folder / "enclaves" / profile.path(enclave).lstrip("/")
+    place.mkdir(parents=True)
+    grant = "<validity><not_after>2099-01-01T00:00:00</not_after></validity><allow_rule>"
+    for rule, topics in dds_topics(profile, enclave).items():
+        listed = "".join(f"<topic>{topic}</topic>" for topic in sorted(topics))
+        grant += f"<{rule}><topics>{listed}</topics></{rule}>"
+    text = f"<dds><permissions><grant>{grant}</allow_rule><default>DENY</default></grant></permissions></dds>"
+    (place / "permissions.xml").write_text(text)
+    for name in ("permissions.p7s", "governance.p7s", "cert.pem"):
+        (place / name).write_text(text)
+    key = place / "key.pem"
+    key.touch(0o600)
+    return place
+
+
+def test_a_keystore_that_keeps_to_the_profile(tmp_path: Path) -> None:
+    profile = Profile()
+    write_profile(profile, tmp_path)
+    assert check_keystore(tmp_path, profile) == []
+    assert len(keys_missing(tmp_path, profile)) == len(profile.enclaves())
+    for enclave in profile.enclaves():
+        signed(tmp_path, profile, enclave)
+    assert check_keystore(tmp_path, profile) == []
+    assert keys_missing(tmp_path, profile) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        ("permissions.xml", "rt/actuator_state", "rt/actuator_command", "publish: more than the policy: rt/actuator"),
+        ("permissions.xml", "rt/actuator_state", "rt/actuator_command", "publish: missing: rt/actuator_state"),
+        ("permissions.xml", "DENY", "ALLOW", "the default must be DENY"),
+        ("permissions.xml", "2099", "2019", "not valid any more since 2019-01-01"),
+        ("permissions.p7s", "rt/mirror_info", "rt/others", "holds other permissions"),
+    ],
+)
+def test_permissions_that_do_not_keep_to_it(tmp_path: Path, file: str, old: str, new: str, words: str) -> None:
+    profile = Profile()
+    write_profile(profile, tmp_path)
+    path = signed(tmp_path, profile, "pdm_driver") / file
+    path.write_text(path.read_text().replace(old, new))
+    assert words in " ".join(check_keystore(tmp_path, profile))
+
+
+def test_a_private_key_that_others_may_read_and_a_policy_that_was_changed(tmp_path: Path) -> None:
+    folder = tmp_path / "keystore"
+    assert CliRunner().invoke(app, ["security", "--out", str(folder)]).exit_code == 0
+    assert CliRunner().invoke(app, ["security", "--check", str(folder)]).exit_code == 0
+    key = folder / "private" / "ca.key.pem"
+    key.touch(0o640)
+    policy = folder / "policies" / "cli.policy.xml"
+    policy.write_text(policy.read_text().replace("mirror_info", "actuator_command"))
+    found = check_keystore(folder, Profile())
+    assert any("0640: a private key must be 0600" in line for line in found)
+    assert any("cli.policy.xml: differs" in line and "actuator_command" in line for line in found)
+    assert CliRunner().invoke(app, ["security", "--check", str(folder)]).exit_code == 1
+
+
+def test_policies_have_the_form_that_sros2_reads(tmp_path: Path) -> None:
+    """The rules of sros2's policy.xsd (version 0.2.0) that a generated file could break."""
+    for path in write_profile(PROFILE, tmp_path):
+        if not path.name.endswith(".policy.xml"):
+            continue
+        policy = xml.parse(path).getroot()
+        assert (policy.tag, policy.attrib) == ("policy", {"version": "0.2.0"})
+        profiles = policy.findall("enclaves/enclave[@path]/profiles/profile")
+        assert profiles and all(set(profile.attrib) == {"ns", "node"} for profile in profiles)
+        for group in (group for profile in profiles for group in profile):
+            assert group.tag in ("topics", "services", "actions") and set(group.attrib.values()) == {"ALLOW"}
+            assert len(group) and {entry.tag for entry in group} == {group.tag[:-1]}
