@@ -2,160 +2,67 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import functools
-import os
-import shutil
 import socket
 import subprocess
 import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from selenium import webdriver
 from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from dm_controller.cli.demo import bench_config, free_ports
+from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
+from dm_controller.cli.demo import bench_config
 from dm_controller.suite import Suite
 from support import own_domain, wait_until
 
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = pytest.mark.skipif(
-    not (CHROMIUM and DRIVER),
-    reason="no chromium and chromedriver in PATH; on Debian: sudo apt-get install chromium chromium-driver",
-)
-DESKTOP, PHONE = (1440, 1000), (390, 844)
+pytestmark = needs_browser
 
 
-@contextlib.contextmanager
-def served(domain: int, folder: Path) -> Iterator[str]:
-    """The console as a process; yields its address."""
-    (port,) = free_ports(1)
-    address = f"http://127.0.0.1:{port}/"
-    with (folder / "console.log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "dm_controller.cli", "console", "--port", str(port)],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env=outside_pytest() | {"ROS_DOMAIN_ID": str(domain)},
-        )
-    try:
-        wait_until(lambda: answers(address), 60, "the console to answer")
-        yield address
-    finally:
-        process.terminate()
-        process.wait(20)
+@dataclass
+class Bench:
+    """A bench of its own with its console; `suite` may be replaced."""
 
-
-def outside_pytest() -> dict[str, str]:
-    """The environment without the variable by which NiceGUI would take the console for a test of its own."""
-    return {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
-
-
-def answers(address: str) -> bool:
-    with contextlib.suppress(urllib.error.URLError, TimeoutError), urllib.request.urlopen(address, timeout=5) as answer:
-        return bool(answer.status == 200)
-    return False
-
-
-class Browser:
-    """A page in headless Chromium, read as a person would: by names and visible text."""
-
-    def __init__(self, address: str, width: int, height: int) -> None:
-        options = webdriver.ChromeOptions()
-        options.binary_location = str(CHROMIUM)
-        for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--disable-gpu"):
-            options.add_argument(argument)
-        self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(str(DRIVER)))
-        self.resize(width, height)
-        self.driver.get(address)
-        self.wait_for("Deformable mirror console")
-
-    def resize(self, width: int, height: int) -> None:
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
-        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-
-    @property
-    def text(self) -> str:
-        return str(self.driver.execute_script("return document.body.innerText"))
-
-    def wait_for(self, words: str, timeout_s: float = 30.0) -> None:
-        """Wait until the page shows `words`; fail with what it shows instead."""
-        try:
-            wait_until(lambda: words in self.text, timeout_s)
-        except AssertionError:
-            raise AssertionError(f"{words!r} not shown within {timeout_s:g} s, but:\n{self.text}") from None
-
-    def find(self, name: str, kind: str = "*") -> Any:
-        """The element with that accessible name, or that text."""
-        quoted = f'"{name}"'
-        path = f"//{kind}[@aria-label={quoted} or normalize-space(.)={quoted}]"
-        return wait_until(lambda: self.driver.find_elements(By.XPATH, path), 20, f"{kind} named {name}")[0]
-
-    def press(self, name: str) -> None:
-        """Press a button once it is enabled."""
-        wait_until(lambda: self.find(name, "button").is_enabled(), 60, f"button {name} to be enabled")
-        button = self.find(name, "button")
-        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
-        button.click()
-
-    def enter(self, name: str, value: str) -> None:
-        """Type over the content of a field."""
-        field = self.find(name, "input")
-        field.send_keys(Keys.CONTROL, "a")
-        field.send_keys(value)
-
-    def pictures(self, begin: str) -> list[str]:
-        """Descriptions of the drawings that begin with these words."""
-        found = self.driver.find_elements(By.CSS_SELECTOR, f'svg[aria-label^="{begin}"]')
-        with contextlib.suppress(StaleElementReferenceException):
-            return [str(picture.get_attribute("aria-label")) for picture in found]
-        return []
-
-    def alerts(self) -> str:
-        return str(self.driver.execute_script("return document.querySelector('[role=alert]').innerText")).strip()
-
-    def chosen(self) -> int:
-        return int(self.find("Number", "input").get_attribute("value"))
-
-    def shoot(self, path: Path) -> None:
-        """The whole page as a PNG."""
-        width, height = self.driver.execute_script(
-            "return [innerWidth, Math.min(document.documentElement.scrollHeight, 8000)]"
-        )
-        clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
-        self.driver.execute_script("scrollTo(0, 0)")
-        shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})
-        path.write_bytes(base64.b64decode(shot["data"]))
+    config: dict[str, dict[str, Any]]
+    folder: Path
+    domain: int
+    address: str
+    suite: Suite
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """The console of a bench of its own; the tests run in order and find what the ones before left."""
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     folder = tmp_path_factory.mktemp("console")
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 3, 20.0)
-    with own_domain() as domain, Suite(config, folder, domain) as suite, served(domain, folder) as address:
-        browser = Browser(address, *DESKTOP)
+    with own_domain() as domain, served(domain, folder) as address:
+        bench = Bench(config, folder, domain, address, Suite(config, folder, domain).__enter__())
         try:
-            yield browser
+            yield bench
+            bench.suite.check()
         finally:
-            browser.driver.quit()
-            suite.check()
+            bench.suite.stop()
+
+
+@pytest.fixture(scope="module")
+def page(bench: Bench) -> Iterator[Browser]:
+    """Its page; the tests run in order and find what the ones before left."""
+    browser = Browser(bench.address, *DESKTOP)
+    yield browser
+    browser.driver.quit()
 
 
 @pytest.fixture(scope="module")
 def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where screenshots go: DM_SCREENSHOTS when it is set."""
-    named = os.environ.get("DM_SCREENSHOTS")
-    return Path(named) if named else tmp_path_factory.mktemp("shots")
+    return shots_folder(tmp_path_factory.mktemp("shots"))
 
 
 def test_before_a_calibration_the_page_says_why_nothing_can_be_focused(page: Browser) -> None:
@@ -173,17 +80,33 @@ def test_nothing_is_fetched_from_elsewhere(page: Browser) -> None:
     assert names and all(name.startswith(own) for name in names)
 
 
+def test_a_calibration_that_is_cancelled_says_so(page: Browser) -> None:
+    page.choose("Plan", "Pokes only")
+    page.press("Calibrate")
+    page.wait_for("Step ", 30)
+    page.press("Cancel calibration")
+    wait_until(lambda: "cancel" in page.alerts(), 60, "the sentence of the node")
+    assert "the mirror is back at mid range" in page.alerts()
+    page.press("Dismiss: Calibration")
+    wait_until(lambda: page.alerts() == "", 10, "the dismissal")
+
+
 def test_a_calibration_shows_progress_and_residual_and_is_used(page: Browser, shots: Path) -> None:
-    page.find("Plan", "input").click()
-    page.find("Pokes only", "div").click()
     page.press("Calibrate")
     page.wait_for("Step ", 30)
     wait_until(lambda: page.pictures("residual of"), 60, "residuals of the run")
     assert page.find("Cancel calibration", "button").is_enabled()
     page.shoot(shots / "console-calibrating.png")
-    page.wait_for(": held-out residual ", 240)
+    page.wait_for(": held-out residual ", 900)
     page.wait_for("Reachable ")
     assert page.alerts() == ""
+
+
+def test_what_the_calibration_cannot_predict_is_logged_once(page: Browser, bench: Bench) -> None:
+    log = bench.folder / "calibration.log"
+    wait_until(lambda: "none of the surfaces p01 to p58" in log.read_text(), 60, "the warning")
+    page.wait_for("Predicted residual", 60)
+    assert log.read_text().count("none of the surfaces p01 to p58") == 1
 
 
 def test_a_move_is_predicted_first_then_taken_and_measured(page: Browser, shots: Path) -> None:
@@ -245,6 +168,21 @@ def test_a_click_on_a_hexagon_chooses_it(page: Browser) -> None:
         return page.chosen() == 12
 
     wait_until(clicked, 15, "actuator 12")
+
+
+def test_nodes_that_are_started_again_are_found_again(page: Browser, bench: Bench) -> None:
+    bench.suite.stop()
+    page.wait_for("No node of the suite is heard.", 60)
+    assert not page.find("Move", "button").is_enabled()
+    bench.config["calibration"]["load_on_start"] = "newest"
+    bench.suite = Suite(bench.config, bench.folder, bench.domain).__enter__()
+    page.wait_for("driver: active", 90)
+    page.wait_for(": approximate", 60)
+    page.enter("Curvature, 1/m", "0.01")
+    page.press("Move")
+    page.wait_for("Move: +0.0100 1/m stands after", 60)
+    page.press("Measure")
+    page.wait_for("Measure: rms", 60)
 
 
 def test_without_nodes_the_page_says_what_is_missing(domain: int, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ from dm_controller.recording.recorder import Recorder
 from dm_controller.recording.session import COMPARED, differences, read_session, recalibrate
 from dm_runtime import qos
 from recorded_bench import recorded
+from rosbag2_metadata import read_metadata
 from support import Observer, wait_until
 
 FEEDBACK_TYPE = "dm_msgs/action/Calibrate_FeedbackMessage"
@@ -252,6 +253,7 @@ def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain
     assert all(0 <= state.log_time - state.publish_time < 10**10 for state in states)
     assert bag.topics["/mirror_info"].qos[0]["durability"] == "transient_local"
     assert bag.topics["/mirror_info"].type_hash.startswith("RIHS01_")
+    assert read_metadata(tmp_path / "bag" / METADATA_FILE)["message_count"] == sum(bag.counts.values())
 
 
 def test_parameters_of_the_nodes_are_recorded(

@@ -18,12 +18,14 @@ from dm_controller.console import status, view_models
 from dm_controller.console.drawing.charts import loop_chart, residual_chart, zernike_chart
 from dm_controller.console.drawing.command_map import command_map
 from dm_controller.console.drawing.heat_map import SAG_COLOURS, heat_map
+from dm_controller.console.drawing.hexagons import outlines, sizes
 from dm_controller.console.drawing.svg import nice_ticks
 from dm_controller.console.following import Following
 from dm_controller.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_controller.console.ros_side import Snapshot
 from dm_controller.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
 from dm_controller.console.widgets.actuators import towards
+from dm_controller.console.widgets.recipes import evenly
 from dm_driver.geometry import hexagonal_positions, neighbour_pairs
 
 COUNT = 7
@@ -94,8 +96,8 @@ def test_the_command_map_has_every_actuator_where_it_is() -> None:
     svg = command_map(found, 3, 11.0)
     assert sorted(map(int, re.findall(r'data-actuator="(\d+)"', svg))) == list(range(1, COUNT + 1))
     places = {
-        int(n): (float(x), float(y))
-        for n, x, y in re.findall(r'data-actuator="(\d+)".*?points="([\d.]+),([\d.]+)', svg)
+        int(n): np.mean([[float(value) for value in corner.split(",")] for corner in corners.split()], axis=0)
+        for n, corners in re.findall(r'data-actuator="(\d+)".*?points="([^"]+)"', svg)
     }
     # Actuator 2 lies to the right of 1, and a larger y is further up.
     assert places[2][0] > places[1][0]
@@ -257,6 +259,18 @@ def test_following_tells_what_stood_when_a_map_was_taken() -> None:
     assert following.at(0.5).effective is None and following.at(0.5).doubt
 
 
+def test_a_calibration_that_is_published_again_loses_nothing() -> None:
+    message, _ = calibration()
+    message.memory.law = "play"
+    following = Following()
+    following.use(message, 0.0)
+    shape = state([0.5] * COUNT, turns=1)
+    shape.header.stamp.sec = 1
+    following.observe(shape)
+    following.use(message, 0.0)
+    assert following.at(1.5).effective == pytest.approx([0.5] * COUNT)
+
+
 def test_pictures_are_described_and_keep_hostile_text_out() -> None:
     surface = measured_surface(*map_of_terms(np.eye(21)[3] * 4e-7))
     svg = heat_map(surface, surface.extent, SAG_COLOURS, '<script>"x"')
@@ -274,3 +288,62 @@ def test_ticks_are_round_and_inside(low: float, high: float) -> None:
     ticks = nice_ticks(low, high)
     assert 3 <= len(ticks) <= 8
     assert low - 1e-12 <= ticks[0] and ticks[-1] <= high + 1e-12
+
+
+def areas(cells: list[np.ndarray]) -> np.ndarray:
+    """Areas of polygons, by the shoelace formula."""
+    after = [np.roll(cell, -1, axis=0) for cell in cells]
+    return np.array([abs(np.sum(c[:, 0] * a[:, 1] - c[:, 1] * a[:, 0])) / 2 for c, a in zip(cells, after, strict=True)])
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.3, np.pi / 6])
+def test_cells_of_a_hexagonal_grid_fill_it_however_it_is_turned(turned: float) -> None:
+    x, y = hexagonal_positions(19, pitch=4.0, start_angle=turned)
+    cells = outlines(tuple(zip(x.tolist(), y.tolist(), strict=True)))
+    assert [len(cell) for cell in cells] == [6] * 19
+    assert areas(cells) == pytest.approx(np.sqrt(3) / 2 * 4.0**2)
+
+
+def test_cells_of_scattered_actuators_do_not_cover_each_other() -> None:
+    places = np.random.default_rng(3).uniform(-10.0, 10.0, size=(40, 2))
+    cells = outlines(tuple(map(tuple, places.tolist())))
+    for number, cell in enumerate(cells):
+        middle = cell.mean(axis=0)
+        inside = middle + 0.99 * (cell - middle)
+        distance = np.hypot(*(inside[:, None, :] - places).transpose(2, 0, 1))
+        assert (distance.argmin(axis=1) == number).all()
+    assert min(sizes(cells, places.tolist())) > 0.0
+
+
+def test_a_lone_actuator_has_a_cell() -> None:
+    assert len(outlines(((1.0, 2.0),))[0]) == 6
+
+
+@pytest.mark.parametrize("grey", range(0, 256, 15))
+def test_the_ink_stands_out_from_every_colour(grey: int) -> None:
+    colour = f"#{grey:02x}{255 - grey:02x}{grey:02x}"
+    light, ink = view_models.luminance(colour), view_models.luminance(view_models.ink_on(colour))
+    assert (max(light, ink) + 0.05) / (min(light, ink) + 0.05) >= 4.5
+
+
+def test_paths_are_shortened_and_topics_are_not() -> None:
+    words = "map /home/lab/bench/maps/m_1.dat on /mirror_a/surface_map, see (/tmp/x/y.log)"
+    assert status.shortened(words) == "map …/m_1.dat on /mirror_a/surface_map, see (…/y.log)"
+
+
+def test_recipes_are_spread_evenly() -> None:
+    assert evenly(-0.02, 0.02, 5) == [-0.02, -0.01, 0.0, 0.01, 0.02]
+    assert evenly(0.01, 0.05, 1) == [0.01]
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "number", "words"),
+    [
+        (0.0, 0.1, 2.5, r"number = 2\.5: must be a whole number, 1 to 1000"),
+        (0.0, 0.1, None, "number: must be a number"),
+        (0.02, 0.02, 3, r"first = last = 0\.02 1/m: must differ"),
+    ],
+)
+def test_recipes_that_make_no_sense_are_refused(first: float, last: float, number: float | None, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        evenly(first, last, number)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibration_messages import memory_law_from, stamp_ns
 from dm_calibration.memory.law import MemoryLaw, MemoryState
-from dm_controller.memory_watch import Look, MemoryWatch
+from dm_controller.memory_watch import Look, MemoryWatch, same_law
 
 Floats = NDArray[np.float64]
 
@@ -61,7 +61,8 @@ class Following:
         with self._lock:
             before = self._watch.law
             self._watch.use(law if law is not None else MemoryLaw.linear(), middle)
-            if self._watch.law is not before:
+            # Maps that update a calibration publish it again with the same law: what was followed still holds.
+            if not same_law(self._watch.law, before):
                 self._looks.clear()
 
     def observe(self, message: Any) -> None:

@@ -10,6 +10,7 @@ from dm_msgs.action import Calibrate, Converge, MoveFocus
 from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import Degauss, Flatten, LoadCalibration, Measure, SetFocus, SetSignals
 
+from dm_controller.console.feedback import calibration_step, converge_step
 from dm_controller.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_controller.console.ros_side import RefusedError
 from dm_controller.console.session import Session
@@ -23,7 +24,6 @@ PLANS = {
     Calibrate.Goal.PLAN_SURFACES: "Surfaces of Table 1 only",
     Calibrate.Goal.PLAN_POKE_CHECK: "Poke check: wiring and orientation, nothing is stored",
 }
-PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "memory")
 #: Longest waits, s of wall time.
 DEGAUSS_S, MEASURE_S, MOVE_S = 300.0, 120.0, 60.0
 
@@ -52,7 +52,7 @@ async def converge(session: Session, request: FocusRequest) -> str:
 
     def show(feedback: Any) -> None:
         session.progress.step = feedback.step
-        session.progress.words = f"map {feedback.step}: largest coefficient {feedback.max_zernike * NM:.1f} nm"
+        session.progress.words = converge_step(feedback)
 
     result = await session.ros.run("converge", Converge.Goal(request=request), show)
     session.base = None
@@ -83,18 +83,10 @@ async def measure(session: Session, label: str = "console") -> str:
 
 async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
     """Measure and store a calibration."""
-    session.residuals_nm.clear()
-    seen = 0
 
     def show(feedback: Any) -> None:
-        nonlocal seen
-        dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
-        phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
         session.progress.step, session.progress.steps = feedback.step, feedback.steps
-        session.progress.words = f"{phase} {feedback.label}{dropped}"
-        if feedback.step != seen and feedback.residual_rms > 0:
-            session.residuals_nm.append(feedback.residual_rms * NM)
-        seen = feedback.step
+        session.progress.words = calibration_step(feedback)
 
     result = await session.ros.run("calibrate", goal, show)
     findings = "".join(f" Poke check: {sentence}." for sentence in result.poke_findings)
@@ -102,6 +94,27 @@ async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
         findings = " Poke check passed: wiring and orientation are as configured."
     made = f"{result.id}: held-out residual {result.held_out_rms * NM:.1f} nm rms. " if result.id else ""
     return f"{made}{result.maps} maps, {result.maps_dropped} dropped.{findings}"
+
+
+async def estimate(session: Session, goal: Calibrate.Goal) -> str:
+    """How long a calibration would take, and how good it would be; nothing moves."""
+    goal.dry_run = True
+    return str((await session.ros.run("calibrate", goal, lambda _feedback: None, MOVE_S)).message)
+
+
+async def build_recipes(session: Session, curvatures: list[float]) -> str:
+    """Condition the mirror, then converge, for every curvature (1/m); stored with the calibration in use."""
+    order = sorted(curvatures)
+
+    def show(feedback: Any) -> None:
+        done = sum(curvature < feedback.curvature - 1e-9 for curvature in order)
+        session.progress.step, session.progress.steps = done, len(order)
+        session.progress.words = f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"
+
+    goal = Converge.Goal(curvatures=curvatures)
+    result = await session.ros.run("converge", goal, show)
+    session.base = None
+    return str(result.message)
 
 
 async def load(session: Session, name: str) -> str:

@@ -13,6 +13,7 @@ from dm_controller.console.widgets.actuators import ActuatorCards
 from dm_controller.console.widgets.calibration import CalibrationCard
 from dm_controller.console.widgets.focus import FocusCard
 from dm_controller.console.widgets.messages import DiagnosticsCard, LogCard
+from dm_controller.console.widgets.recipes import RecipesCard
 from dm_controller.console.widgets.surfaces import SurfaceCard, ZernikeCard
 from dm_controller.console.widgets.top import Top
 
@@ -59,12 +60,13 @@ def build(session: Session, view: SurfaceView) -> None:
     top = Top(session)
     with ui.element("main").classes("grid"):
         with ui.element("div").classes("column side"):
-            left = (FocusCard(session), CalibrationCard(session), DiagnosticsCard())
+            left = (FocusCard(session), CalibrationCard(session), RecipesCard(session))
         with ui.element("div").classes("column wide"):
             right = (SurfaceCard(session, view), ActuatorCards(session))
             with ui.element("div").classes("pair"):
                 below = (ZernikeCard(view), LogCard(session))
-    cards = (top, *left, *right, *below)
+            health = DiagnosticsCard()
+    cards = (top, *left, *right, *below, health)
 
     def refresh() -> None:
         snapshot = session.snapshot()

@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import os
 import time
+import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,14 +24,15 @@ from dm_msgs.msg import (
     ZernikeCoefficients,
 )
 from dm_msgs.srv import Degauss, Flatten, ListCalibrations, LoadCalibration, Measure, SetFocus, SetSignals
-from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
 from dm_calibration.calibration_messages import stamp_ns
+from dm_controller.console.elsewhere import ActionWatch
 from dm_controller.console.following import Following
 from dm_runtime import qos
+from dm_runtime.action_client import ThreadedActionClient
 from dm_runtime.executor import BackgroundExecutor
 from dm_runtime.rosout import LogTail
 from dm_runtime.worker import ServiceCallError, answers_arrive, call
@@ -56,10 +58,15 @@ SERVICES = {
 }
 ACTIONS = {"calibrate": Calibrate, "converge": Converge, "move_focus": MoveFocus}
 
+#: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
+WATCHED = ("calibrate", "converge")
+
 #: A node whose diagnostics were not heard for so long counts as missing, s. Nodes publish once a second.
 SILENCE_S = 5.0
 #: Time for an answer that comes at once, s.
 ANSWER_S = 10.0
+#: Time that runs back by more than this is another time: a simulator that was started again, s.
+TIME_JUMP_S = 60.0
 _NUMBERS = itertools.count(1)
 
 
@@ -115,7 +122,8 @@ class RosSide:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
         # Early, so that the nodes have discovered them all by the time the first is used.
         self._services = {name: self.node.create_client(kind, name) for name, kind in SERVICES.items()}
-        self._actions = {name: ActionClient(self.node, kind, name) for name, kind in ACTIONS.items()}
+        self._actions = {name: ThreadedActionClient(self.node, kind, name) for name, kind in ACTIONS.items()}
+        self.watched = {name: ActionWatch(self.node, ACTIONS[name], name) for name in WATCHED}
         self._background = BackgroundExecutor(self.node)
 
     def _subscribe(self, message_type: Any, topic: str, profile: Any) -> None:
@@ -131,7 +139,9 @@ class RosSide:
                 self.following.use(calibration, 0.5 * (mirror.signal_min + mirror.signal_max))
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
-        self._bench_time = max(self._bench_time, 1e-9 * stamp_ns(message.header.stamp))
+        time_s = 1e-9 * stamp_ns(message.header.stamp)
+        restarted = time_s < self._bench_time - TIME_JUMP_S
+        self._bench_time = time_s if restarted else max(self._bench_time, time_s)
         for status in message.status:
             self._diagnostics[status.name] = status
             self._heard[status.name] = time.monotonic()
@@ -179,7 +189,11 @@ class RosSide:
         client = self._actions[name]
         if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
             raise RefusedError(f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
-        accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
+        identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
+        identity.uuid = list(uuid.uuid4().bytes)
+        if name in self.watched:
+            self.watched[name].own(identity)
+        accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
         if not await _until(accepted.done, ANSWER_S):
             raise RefusedError(f"{name}: no answer to the goal within {ANSWER_S:g} s")
         handle = accepted.result()
@@ -199,14 +213,21 @@ class RosSide:
         return result
 
     @staticmethod
-    def _server_is_gone(client: ActionClient) -> bool:
+    def _server_is_gone(client: ThreadedActionClient) -> bool:
         return not client.server_is_ready()
 
+    @property
+    def busy_elsewhere(self) -> str:
+        """Name of an action that runs and was not started here; "" = none."""
+        return next((name for name, watch in self.watched.items() if watch.elsewhere), "")
+
     async def cancel(self, name: str) -> None:
-        """Ask the goal that runs for `name` to stop; nothing when none runs."""
+        """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs."""
         handle = self._goals.get(name)
         if handle is not None:
             await _until(handle.cancel_goal_async().done, ANSWER_S)
+        elif name in self.watched:
+            self.watched[name].cancel()
 
 
 async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[[], bool] = lambda: False) -> bool:

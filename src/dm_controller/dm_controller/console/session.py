@@ -9,11 +9,17 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from dm_controller.console.feedback import calibration_step, converge_step
 from dm_controller.console.loops import Loop
 from dm_controller.console.ros_side import RefusedError, RosSide, Snapshot
 
 #: Failures that are kept until somebody dismisses them.
 FAILURES_KEPT = 50
+#: What an action that was not started here is called.
+ELSEWHERE = {
+    "calibrate": "A calibration that was started elsewhere",
+    "converge": "A closed loop that was started elsewhere",
+}
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,6 @@ class Session:
 
     Attributes:
         outcome: the last success, in words.
-        residuals_nm: 21-term residual of every map of the last run.
         chosen: number of the actuator that is looked at.
         base: signals to go back to when a poke is released; None = nothing is poked.
         poked: signals of the last poke.
@@ -61,7 +66,6 @@ class Session:
     failures: list[Failure] = field(default_factory=list)
     progress: Progress = field(default_factory=Progress)
     outcome: str = ""
-    residuals_nm: list[float] = field(default_factory=list)
     chosen: int = 1
     base: list[float] | None = None
     poked: list[float] = field(default_factory=list)
@@ -77,8 +81,29 @@ class Session:
 
     @property
     def running(self) -> str:
-        """Title of the operation under way, "" = none."""
-        return self.progress.title
+        """Title of the operation under way, here or elsewhere; "" = none."""
+        return self.progress.title or ELSEWHERE.get(self.ros.busy_elsewhere, "")
+
+    @property
+    def calibrating(self) -> bool:
+        """Whether a calibration is under way, here or elsewhere."""
+        return self.progress.title == "Calibration" or self.ros.busy_elsewhere == "calibrate"
+
+    @property
+    def shown_progress(self) -> Progress:
+        """The operation under way here, else the one elsewhere."""
+        name = self.ros.busy_elsewhere
+        if self.progress.title or not name:
+            return self.progress
+        feedback = self.ros.watched[name].feedback
+        shown = Progress(ELSEWHERE[name], can_cancel=True)
+        if feedback is None:
+            shown.words = "no word of it yet"
+        elif name == "calibrate":
+            shown.step, shown.steps, shown.words = feedback.step, feedback.steps, calibration_step(feedback)
+        else:
+            shown.words = converge_step(feedback)
+        return shown
 
     def fail(self, title: str, sentence: str) -> None:
         """Show a sentence until it is dismissed."""
@@ -120,8 +145,10 @@ class Session:
             self.progress = Progress()
 
     async def cancel(self) -> None:
-        """Ask the operation under way to stop."""
-        if self._cancel is not None and self.running:
+        """Ask the operation under way to stop, here or elsewhere."""
+        if not self.progress.title and (name := self.ros.busy_elsewhere):
+            await self.ros.cancel(name)
+        elif self._cancel is not None and self.progress.title:
             self.cancelled = True
             self.progress.words = "cancelling"
             await self._cancel()
@@ -130,7 +157,8 @@ class Session:
         """How work that looks at `cancelled` between its steps is cancelled."""
 
     async def end(self) -> None:
-        """Cancel what is under way and wait for its end, for a shutdown in order."""
-        await self.cancel()
+        """Cancel what is under way here and wait for its end, for a shutdown in order."""
+        if self.progress.title:
+            await self.cancel()
         if self._task is not None and not self._task.done():
             await asyncio.wait([self._task], timeout=10.0)

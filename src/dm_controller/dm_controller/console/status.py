@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +32,14 @@ LEVELS = {
     DiagnosticStatus.ERROR: "error",
     DiagnosticStatus.STALE: "stale",
 }
+
+#: Paths of files, as nodes tell them: at least two folders deep below a folder of the system or a home.
+_PATH = re.compile(r"(?<![\w/.])/(?:home|root|tmp|var|opt|mnt|media|srv|data|work|Users)(?:/[^\s/,;:'\"()]+)+")
+
+
+def shortened(words: str) -> str:
+    """`words` with only the last part of every path in them: who looks at the page knows the folders."""
+    return _PATH.sub(lambda match: f"…/{match[0].rsplit('/', 1)[-1]}", words)
 
 
 @dataclass(frozen=True)
@@ -119,7 +128,7 @@ def why_not(need: str, snapshot: Any, running: str) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One status of `/diagnostics`."""
+    """One status of `/diagnostics`; `figures` in full."""
 
     level: str
     node: str
@@ -135,7 +144,7 @@ def diagnostic_rows(statuses: dict[str, Any]) -> list[Row]:
             LEVELS.get(bytes(status.level), "?"),
             status.name,
             status.message,
-            ", ".join(f"{pair.key} {pair.value}" for pair in status.values),
+            ", ".join(f"{pair.key} {pair.value}" for pair in status.values if pair.value),
         )
         for status in worst_first
     ]

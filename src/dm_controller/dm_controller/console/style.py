@@ -38,6 +38,9 @@ h2 { font-size: 1.02rem; line-height: 1.4rem; font-weight: 650; margin: 0; }
 .scroll td { white-space: nowrap; }
 .scroll td:first-child { font-weight: 600; }
 .scroll td:last-child { white-space: normal; width: 100%; }
+.numbers th { text-align: right; font-weight: 600; padding: 1px 8px 1px 0; }
+.numbers td, .numbers td:first-child, .numbers td:last-child { text-align: right; width: auto; font-weight: 400;
+  font-variant-numeric: tabular-nums; }
 .map:focus-visible, .scroll:focus-visible { outline: 3px solid #1a5a96; outline-offset: 2px; }
 button:focus-visible, .q-slider:focus-within { outline: 3px solid #1a5a96; outline-offset: 2px; }
 .q-btn { min-height: 40px; }
@@ -45,7 +48,6 @@ button:focus-visible, .q-slider:focus-within { outline: 3px solid #1a5a96; outli
 @media (max-width: 1000px) {
   .grid, .pair { grid-template-columns: minmax(0, 1fr); }
   .column { display: contents; }
-  .last { order: 1; }
 }
 @media (max-width: 760px) {
   .panels { grid-template-columns: minmax(0, 1fr); }

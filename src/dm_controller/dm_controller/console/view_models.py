@@ -66,6 +66,19 @@ class Cell:
         return ", ".join([f"actuator {self.number}", at, *self.remarks])
 
 
+def luminance(colour: str) -> float:
+    """Relative luminance of a colour "#rrggbb", 0 to 1, as WCAG 2 defines it."""
+    channels = np.frombuffer(bytes.fromhex(colour[1:7]), dtype=np.uint8) / 255.0
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def ink_on(colour: str) -> str:
+    """Black or white, whichever stands out more; the contrast is at least 4.5 to 1 on any colour."""
+    # (L + 0.05) / 0.05 against 1.05 / (L + 0.05)
+    return "#000000" if (luminance(colour) + 0.05) ** 2 > 0.05 * 1.05 else "#ffffff"
+
+
 def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
     """The actuators of a dm_msgs/MirrorInfo with a dm_msgs/ActuatorState and the grades of a Calibration, or None."""
     count = int(mirror.actuators)
@@ -88,7 +101,7 @@ def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
                 y=mirror.actuator_y[index] * 1e3,
                 signal=float(applied[index]) if known else None,
                 fill=fill,
-                ink="#000000" if not known or share[index] > 0.5 else "#ffffff",
+                ink=ink_on(fill),
                 remarks=tuple(words for _sign, words in marks),
                 mark=marks[0][0] if marks else "",
             )
@@ -196,6 +209,22 @@ def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: fl
     return signals
 
 
+def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:
+    """Recipes of a dm_msgs/Calibration: curvature, conic constant, re-measured errors in nm, maps."""
+    if calibration is None or not calibration.id:
+        return []
+    return [
+        (
+            f"{recipe.curvature:+.4f}",
+            f"{recipe.conic_constant:g}",
+            f"{recipe.max_zernike * NM:.2f}",
+            f"{recipe.rms * NM:.2f}",
+            str(recipe.maps),
+        )
+        for recipe in calibration.recipes.recipes
+    ]
+
+
 def calibration_words(calibration: Any) -> list[str]:
     """A dm_msgs/Calibration in lines: what it is, how good, and its limitations."""
     if calibration is None or not calibration.id:
@@ -212,7 +241,7 @@ def calibration_words(calibration: Any) -> list[str]:
             f"moves to {calibration.memory.held_out_max_zernike * NM:.2f} nm."
         )
     if calibration.recipes.recipes:
-        lines.append(f"{len(calibration.recipes.recipes)} conditioned recipes.")
+        lines.append(f"Conditioned recipes: {len(calibration.recipes.recipes)}.")
     if calibration.revision:
         lines.append(f"Maps that updated it since: {calibration.revision}.")
     return lines + [f"Limitation: {sentence}" for sentence in calibration.known_limitations]

@@ -2,46 +2,45 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from html import escape
 
+import numpy as np
+
 from dm_calibration.report.colours import VERMILION
+from dm_controller.console.drawing.hexagons import Floats, outlines, sizes
 from dm_controller.console.drawing.svg import INK, picture
 from dm_controller.console.view_models import Cell
 
-#: User units per mm.
-SCALE = 14.0
+#: Width and height of the picture, user units, and what is left free around it.
+WIDTH, MARGIN = 440.0, 6.0
 
 
 def command_map(cells: Sequence[Cell], chosen: int, aperture_radius_mm: float) -> str:
-    """SVG of the cells; every hexagon carries its number as `data-actuator`."""
-    side = _side(cells)
-    reach = (max(max(abs(cell.x), abs(cell.y)) for cell in cells) + side) * SCALE + 6.0
-    corners = [(side * math.sin(k * math.pi / 3), side * math.cos(k * math.pi / 3)) for k in range(6)]
-    in_order = sorted(cells, key=lambda cell: cell.number == chosen)  # its outline must not be covered
-    parts = [_hexagon(cell, corners, reach, cell.number == chosen) for cell in in_order]
+    """SVG of the cells where the actuators stand; every cell carries its number as `data-actuator`."""
+    places = tuple((cell.x, cell.y) for cell in cells)
+    shapes = outlines(places)
+    reach = max(aperture_radius_mm, max(float(np.abs(shape).max()) for shape in shapes))
+    scale = (WIDTH / 2 - MARGIN) / reach
+
+    def drawn(shape: Floats) -> Floats:
+        return WIDTH / 2 + scale * shape * (1.0, -1.0)
+
+    in_order = sorted(range(len(cells)), key=lambda k: cells[k].number == chosen)  # its outline must not be covered
+    parts = [_hexagon(cells[k], drawn(shapes[k]), cells[k].number == chosen) for k in in_order]
     parts.append(
-        f'<circle cx="{reach:.1f}" cy="{reach:.1f}" r="{aperture_radius_mm * SCALE:.1f}" fill="none" '
+        f'<circle cx="{WIDTH / 2}" cy="{WIDTH / 2}" r="{aperture_radius_mm * scale:.1f}" fill="none" '
         f'stroke="{VERMILION}" stroke-width="1.5" stroke-dasharray="6 4" pointer-events="none"/>'
     )
-    parts += [_words(cell, reach, side * SCALE) for cell in cells]
+    for cell, place, size in zip(cells, places, sizes(shapes, places), strict=True):
+        parts.append(_words(cell, drawn(np.array(place)), scale * size))
     flagged = [cell.words for cell in cells if cell.remarks]
     description = f"command map of {len(cells)} actuators; " + ("; ".join(flagged) if flagged else "no flags")
-    return picture(2 * reach, 2 * reach, parts, description)
+    return picture(WIDTH, WIDTH, parts, description)
 
 
-def _side(cells: Sequence[Cell]) -> float:
-    """Side of the hexagons, mm, that fills the plane at the smallest distance of two actuators."""
-    if len(cells) < 2:
-        return 2.0
-    gaps = (math.hypot(a.x - b.x, a.y - b.y) for k, a in enumerate(cells) for b in cells[:k])
-    return min(gaps) / math.sqrt(3.0)
-
-
-def _hexagon(cell: Cell, corners: Sequence[tuple[float, float]], reach: float, chosen: bool) -> str:
-    x, y = reach + cell.x * SCALE, reach - cell.y * SCALE
-    outline = " ".join(f"{x + dx * SCALE:.1f},{y + dy * SCALE:.1f}" for dx, dy in corners)
+def _hexagon(cell: Cell, corners: Floats, chosen: bool) -> str:
+    outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
     stroke, width = (VERMILION, 4) if chosen else ("#ffffff", 1.5)
     return (
         f'<polygon data-actuator="{cell.number}" style="cursor:pointer" points="{outline}" fill="{cell.fill}" '
@@ -49,15 +48,16 @@ def _hexagon(cell: Cell, corners: Sequence[tuple[float, float]], reach: float, c
     )
 
 
-def _words(cell: Cell, reach: float, size: float) -> str:
-    x, y = reach + cell.x * SCALE, reach - cell.y * SCALE
+def _words(cell: Cell, place: Floats, size: float) -> str:
+    """Number, sign and signal; `size` is the distance to the nearest side."""
+    x, y = place
     value = "" if cell.signal is None else f"{cell.signal:+.2f}".replace("-", "−")
     mark = f" {cell.mark}" if cell.mark else ""
     return (
         f'<g text-anchor="middle" fill="{cell.ink}" pointer-events="none">'
-        f'<text x="{x:.1f}" y="{y - 0.1 * size:.1f}" font-size="{0.46 * size:.1f}" font-weight="600">'
+        f'<text x="{x:.1f}" y="{y - 0.11 * size:.1f}" font-size="{0.53 * size:.1f}" font-weight="600">'
         f"{cell.number}{mark}</text>"
-        f'<text x="{x:.1f}" y="{y + 0.42 * size:.1f}" font-size="{0.4 * size:.1f}">{value}</text></g>'
+        f'<text x="{x:.1f}" y="{y + 0.48 * size:.1f}" font-size="{0.46 * size:.1f}">{value}</text></g>'
     )
 
 

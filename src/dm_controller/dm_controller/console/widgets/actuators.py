@@ -66,6 +66,7 @@ class ActuatorCards:
                     )
                     self._number.classes("w-20")
                     self._amplitude = ui.number("Amplitude", value=0.3, min=-2.0, max=2.0, step=0.1).classes("w-24")
+                with ui.element("div").classes("line"):
                     self._on_click = ui.switch("Poke by click")
                     self._with_map = ui.switch("Map after a poke", value=True)
                 with ui.element("div").classes("line"):

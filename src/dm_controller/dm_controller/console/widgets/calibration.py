@@ -14,7 +14,7 @@ from dm_controller.console.drawing.charts import residual_chart
 from dm_controller.console.ros_side import RefusedError, Snapshot
 from dm_controller.console.session import Session
 from dm_controller.console.status import why_not
-from dm_controller.console.view_models import calibration_words
+from dm_controller.console.view_models import NM, calibration_words
 from dm_controller.console.widgets.parts import ActionButton, Line, Picture, card
 
 
@@ -23,26 +23,57 @@ class CalibrationCard:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._listed: str | None = None
+        #: What the list of the store depends on; None = it must be asked for.
+        self._listed: tuple[Any, ...] | None = None
         with card("Calibration"):
             self._words = ui.html("", sanitize=False).classes("words figures")
             self._shown = ""
             self._plan = ui.select(operations.PLANS, value=Calibrate.Goal.PLAN_MEMORY, label="Plan").classes("w-full")
+            self._maps = ui.number("Length: commands of the memory plan", min=0, step=10, format="%d")
+            self._maps.classes("w-full").props('placeholder="as configured"')
+            self._maps.bind_visibility_from(self._plan, "value", value=Calibrate.Goal.PLAN_MEMORY)
             self._note = ui.input("Note, stored with it").classes("w-full")
             with ui.element("div").classes("line"):
                 self._start = ActionButton("Calibrate", self._begin)
+                self._estimate = ActionButton("How long?", self._begin_estimate, True)
                 self._cancel = ActionButton("Cancel calibration", session.cancel, True)
             self._why = Line("why")
             self._progress = Line("words figures", live=True)
             self._residuals = Picture()
             self._choice = ui.select({}, label="In the store").classes("w-full")
+            self._choice.on("popup-show", self._forget_list)
             self._load = ActionButton("Load", self._begin_load, True)
+
+    def _goal(self) -> Calibrate.Goal:
+        """What the fields ask for. Raises ValueError naming the field."""
+        goal = Calibrate.Goal(plan=int(self._plan.value), note=str(self._note.value or ""), activate=True)
+        if goal.plan == Calibrate.Goal.PLAN_MEMORY and self._maps.value is not None:
+            length = float(self._maps.value)
+            if not (length.is_integer() and 0 <= length <= 100_000):
+                raise ValueError(
+                    f"length = {length:g}: must be a whole number of commands, 0 (as configured) to 100000"
+                )
+            goal.memory_maps = int(length)
+        return goal
 
     def _begin(self) -> None:
         session = self._session
-        goal = Calibrate.Goal(plan=int(self._plan.value), note=str(self._note.value or ""), activate=True)
+        try:
+            goal = self._goal()
+        except ValueError as error:
+            session.fail("Calibration", str(error))
+            return
         work = lambda: operations.calibrate(session, goal)  # noqa: E731
         session.begin("Calibration", work, lambda: session.ros.cancel("calibrate"))
+
+    def _begin_estimate(self) -> None:
+        session = self._session
+        try:
+            goal = self._goal()
+        except ValueError as error:
+            session.fail("Estimate", str(error))
+            return
+        session.begin("Estimate", lambda: operations.estimate(session, goal))
 
     def _begin_load(self) -> None:
         session, name = self._session, str(self._choice.value or "")
@@ -52,12 +83,14 @@ class CalibrationCard:
         session = self._session
         why = why_not("calibrate", snapshot, session.running)
         self._start.allow(why)
+        self._estimate.allow(why)
         self._why.show(f"Not possible now: {why}" if why else "")
-        running = session.running == "Calibration"
-        self._cancel.allow("" if running else "No calibration that was started here is under way.")
-        progress = session.progress
+        running = session.calibrating
+        self._cancel.allow("" if running else "No calibration is under way.")
+        progress = session.shown_progress
         self._progress.show(f"Step {progress.step} of {progress.steps}: {progress.words}" if running else "")
-        self._residuals.show(residual_chart(session.residuals_nm) if session.residuals_nm else "")
+        residuals_nm = [NM * residual for residual in list(session.ros.watched["calibrate"].residuals)]
+        self._residuals.show(residual_chart(residuals_nm) if residuals_nm else "")
         lines = "".join(f"<div>{escape(line)}</div>" for line in calibration_words(snapshot.calibration))
         if lines != self._shown:
             self._shown = lines
@@ -66,9 +99,14 @@ class CalibrationCard:
             why_not("store", snapshot, session.running) or ("" if self._choice.value else "Choose a calibration first.")
         )
         in_use = snapshot.calibration.id if snapshot.calibration is not None else ""
-        if in_use != self._listed and "calibration" in snapshot.present and not running:
-            self._listed = in_use
+        # Also after runs that were not started here, and after the node was started again.
+        key = (in_use, session.ros.watched["calibrate"].goals, "calibration" in snapshot.present)
+        if key != self._listed and key[-1] and not running:
+            self._listed = key
             background_tasks.create(self._list())
+
+    def _forget_list(self) -> None:
+        self._listed = None
 
     async def _list(self) -> None:
         try:
@@ -80,4 +118,5 @@ class CalibrationCard:
             name: f"{name} ({residual * 1e9:.1f} nm held out){f', {remark}' if remark else ''}"
             for name, residual, remark in zip(answer.ids, answer.held_out_rms, answer.remarks, strict=True)
         }
-        self._choice.set_options(options, value=self._choice.value if self._choice.value in options else None)
+        if options != self._choice.options:
+            self._choice.set_options(options, value=self._choice.value if self._choice.value in options else None)

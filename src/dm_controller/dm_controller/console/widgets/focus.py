@@ -29,7 +29,8 @@ class FocusCard:
         self._range: tuple[float, float] | None = None
         self._changed_at = 0.0
         self._asked = self._asking = self._typing = False
-        self._calibration = ""
+        #: What a prediction depends on beside the wish.
+        self._basis: tuple[object, ...] = ()
         with card("Focus"):
             self._words = Line("words figures")
             self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
@@ -102,14 +103,21 @@ class FocusCard:
         self._take_range(snapshot)
         value = self._number.value
         self._power.show(f"= {2 * value:+.4f} dioptre" if value is not None else "")
-        identity = snapshot.capabilities.calibration_id if snapshot.capabilities is not None else ""
-        if identity != self._calibration:
-            self._calibration = identity
+        basis = self._prediction_basis(snapshot)
+        if basis != self._basis:
+            self._basis = basis
             self._touch()
         calm = time.monotonic() - self._changed_at > CALM_S
         if not why and calm and not self._asked and not self._asking:
             self._asked = self._asking = True
             background_tasks.create(self._predict())
+
+    def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
+        """Calibration, recipes, whether the history is known, and what runs: at its end the mirror may have moved."""
+        identity = snapshot.capabilities.calibration_id if snapshot.capabilities is not None else ""
+        recipes = len(snapshot.calibration.recipes.recipes) if snapshot.calibration is not None else 0
+        known = snapshot.actuator_state is not None and snapshot.actuator_state.history_known
+        return identity, recipes, known, self._session.running
 
     def _take_range(self, snapshot: Snapshot) -> None:
         found = reachable(snapshot.capabilities)

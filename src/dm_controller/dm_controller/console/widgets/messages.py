@@ -8,12 +8,24 @@ from nicegui import ui
 
 from dm_controller.console.ros_side import Snapshot
 from dm_controller.console.session import Session
-from dm_controller.console.status import diagnostic_rows, log_rows
+from dm_controller.console.status import diagnostic_rows, log_rows, shortened
 from dm_controller.console.widgets.parts import card
 
 
+def _short(words: str) -> str:
+    """HTML of a sentence with its paths shortened; the whole of it is the tooltip."""
+    short = shortened(words)
+    return escape(short) if short == words else f'<span title="{escape(words)}">{escape(short)}</span>'
+
+
+def _empty(words: str) -> str:
+    return f'<div class="empty">{escape(words)}</div>'
+
+
 def _table(rows: list[tuple[str, ...]]) -> str:
-    cells = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows)
+    if not rows:
+        return _empty("Nothing was logged yet.")
+    cells = ("".join(f"<td>{_short(cell)}</td>" for cell in row) for row in rows)
     return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
 
 
@@ -22,16 +34,16 @@ class DiagnosticsCard:
 
     def __init__(self) -> None:
         self._shown = ""
-        with card("Diagnostics", "last"):
+        with card("Diagnostics"):
             self._place = ui.html("", sanitize=False).classes("scroll")
             self._place.props('tabindex="0" role="region" aria-label="Diagnostics"')
 
     def refresh(self, snapshot: Snapshot) -> None:
         content = "".join(
-            f'<div class="status"><b>{escape(row.level)}: {escape(row.node)}</b> {escape(row.message)}'
-            f'<div class="faint">{escape(row.figures)}</div></div>'
+            f'<div class="status"><b>{escape(row.level)}: {escape(row.node)}</b> {_short(row.message)}'
+            f'<div class="faint">{_short(row.figures)}</div></div>'
             for row in diagnostic_rows(snapshot.diagnostics)
-        )
+        ) or _empty("No node has told its health yet.")
         if content != self._shown:
             self._shown = content
             self._place.set_content(content)

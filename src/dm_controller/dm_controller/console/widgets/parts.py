@@ -16,9 +16,9 @@ def heading(words: str, level: int = 2) -> None:
 
 
 @contextlib.contextmanager
-def card(title: str, classes: str = "") -> Iterator[None]:
-    """A card with a heading; the class "last" puts it at the end of a narrow page."""
-    with ui.element("section").classes(f"card {classes}").props(f'aria-label="{title}"'):
+def card(title: str) -> Iterator[None]:
+    """A card with a heading."""
+    with ui.element("section").classes("card").props(f'aria-label="{title}"'):
         heading(title)
         yield
 

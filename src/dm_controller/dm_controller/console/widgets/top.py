@@ -33,7 +33,7 @@ class Top:
             self._failures.props('role="alert" aria-live="assertive" aria-label="Errors"')
 
     def refresh(self, snapshot: Snapshot) -> None:
-        progress = self._session.progress
+        progress = self._session.shown_progress
         shown = badges(snapshot, self._session.ros.following.now(snapshot.bench_time).doubt)
         content = "".join(f'<span class="badge {badge.kind}">{escape(badge.words)}</span>' for badge in shown)
         if content != self._badges_shown:

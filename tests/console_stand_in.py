@@ -1,0 +1,87 @@
+"""The nodes of a suite as the console meets them: any number of actuators, a calibration at once, no waiting."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
+from dm_msgs.srv import ListCalibrations, SetFocus, SetSignals
+from numpy.typing import NDArray
+
+from dm_calibration.optics.sampling import edge_clustered_points
+from dm_calibration.optics.zernike import basis
+from dm_controller.console.status import NODES
+from dm_driver.geometry import neighbour_pairs
+from dm_runtime import qos
+
+RADIUS = 8e-3
+
+
+class StandIn:
+    """Driver, calibration and controller on one node.
+
+    Args:
+        node: publishes and serves.
+        x, y: (N,) places of the actuators, m.
+    """
+
+    def __init__(self, node: Any, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
+        self.node, self.signals = node, [0.0] * x.size
+        self._state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+        self._health = node.create_publisher(DiagnosticArray, "/diagnostics", qos.STATE)
+        for message, topic in (
+            (mirror_info(x, y), "mirror_info"),
+            (calibration(x.size), "calibration"),
+            (Capabilities(calibration_id="c19", curvature_min=-0.05, curvature_max=0.05), "capabilities"),
+        ):
+            publisher = node.create_publisher(type(message), topic, qos.LATCHED)
+            publisher.publish(message)
+        node.create_service(SetSignals, "set_signals", self._on_set_signals)
+        node.create_service(ListCalibrations, "list_calibrations", lambda _request, response: response)
+        node.create_service(SetFocus, "set_focus", self._on_set_focus)
+        node.create_timer(0.2, self._publish)
+
+    def _publish(self) -> None:
+        now = self.node.get_clock().now().to_msg()
+        state = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE, history_known=True)
+        state.header.stamp = now
+        state.applied = state.requested = array("d", self.signals)
+        state.volts, state.flags = array("d", [150.0] * len(self.signals)), bytes(len(self.signals))
+        self._state.publish(state)
+        health = DiagnosticArray(status=[DiagnosticStatus(name=name, message="well") for name in NODES])
+        health.header.stamp = now
+        self._health.publish(health)
+
+    def _on_set_signals(self, request: Any, response: Any) -> Any:
+        self.signals = list(request.signals)
+        self._publish()
+        return response
+
+    def _on_set_focus(self, request: Any, response: Any) -> Any:
+        response.state = FocusState(curvature=request.request.curvature, predicted_rms=5e-9, history_known=True)
+        return response
+
+
+def mirror_info(x: NDArray[np.float64], y: NDArray[np.float64]) -> MirrorInfo:
+    a, b = neighbour_pairs(x, y)
+    return MirrorInfo(
+        name="MIRROR", serial="7", actuators=x.size, actuator_x=array("d", x), actuator_y=array("d", y),
+        neighbour_a=array("I", a.tolist()), neighbour_b=array("I", b.tolist()), working_aperture_diameter=2 * RADIUS,
+        signal_min=-1.0, signal_max=1.0, neighbour_difference_max=2.0,
+    )  # fmt: skip
+
+
+def calibration(actuators: int) -> Calibration:
+    """Of random surfaces made of the 21 terms."""
+    points = edge_clustered_points(200)
+    influence = np.random.default_rng(5).normal(size=(21, actuators)) * 1e-7
+    sag = basis(points.x, points.y) @ influence
+    return Calibration(
+        id="c19", actuators=actuators, terms=21, points=200, aperture_radius=RADIUS, quality=Calibration.CALIBRATED,
+        influence_zernike=array("d", influence.ravel()), zernike_offset=array("d", np.zeros(21)),
+        sample_x=array("d", points.x), sample_y=array("d", points.y), sample_weight=array("d", points.weight),
+        influence_sag=array("d", sag.ravel()), sag_offset=array("d", np.zeros(200)),
+    )  # fmt: skip

@@ -1,0 +1,185 @@
+"""The bench console with another mirror, with nodes that come later, and by the rules of accessibility."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from selenium.common.exceptions import StaleElementReferenceException
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+
+from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
+from console_stand_in import StandIn
+from dm_driver.geometry import hexagonal_positions
+from support import Observer, own_domain, wait_until
+
+pytestmark = needs_browser
+
+#: 19 actuators on a grid turned by 20 degrees.
+X, Y = hexagonal_positions(19, pitch=3.5e-3, start_angle=np.radians(20.0))
+#: Text with less contrast than WCAG 2.2 asks for: 4.5 to 1, 3 to 1 for large text; disabled controls are excepted.
+LOW_CONTRAST = """
+const parse = (text) => { const n = text.match(/[\\d.]+/g).map(Number); return n.length < 4 ? [...n, 1] : n; };
+const over = (top, below) => [0, 1, 2].map((k) => top[3] * top[k] + (1 - top[3]) * below[k]);
+const linear = (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
+const light = (c) => [0.2126, 0.7152, 0.0722].reduce((sum, share, k) => sum + share * linear(c[k] / 255), 0);
+const poor = [];
+let seen = 0;
+const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+while (texts.nextNode()) {
+  const element = texts.currentNode.parentElement, words = texts.currentNode.textContent.trim();
+  if (!words || element.closest('svg, style, script, [disabled], .disabled, .q-field--disabled, [aria-hidden=true]'))
+    continue;
+  if (!element.checkVisibility({opacityProperty: true, visibilityProperty: true})) continue;
+  const chain = [];
+  for (let at = element; at; at = at.parentElement) chain.unshift(at);
+  let back = [255, 255, 255], opacity = 1;
+  for (const at of chain) {
+    const style = getComputedStyle(at);
+    back = over(parse(style.backgroundColor), back);
+    opacity *= Number(style.opacity);
+  }
+  const style = getComputedStyle(element), colour = parse(style.color);
+  const front = over([...colour.slice(0, 3), colour[3] * opacity], back);
+  const [high, low] = [light(front), light(back)].sort((a, b) => b - a);
+  const contrast = (high + 0.05) / (low + 0.05), size = parseFloat(style.fontSize);
+  const large = size >= 24 || (size >= 18.66 && Number(style.fontWeight) >= 700);
+  seen += 1;
+  if (contrast < (large ? 3 : 4.5)) poor.push(`${words}: ${contrast.toFixed(2)}`);
+}
+return [seen, poor];
+"""
+#: What has the focus: its name or words, and where it is.
+FOCUSED = """
+const at = document.activeElement, box = at.getBoundingClientRect();
+return [at.tagName, at.getAttribute('aria-label') || at.innerText || '', box.width * box.height];
+"""
+CONTROLS = {"button", "textbox", "spinbutton", "combobox", "slider", "radio", "switch", "checkbox", "image", "img"}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, StandIn, str]]:
+    """A page that was opened before the nodes were there; then they come."""
+    with own_domain() as domain, served(domain, tmp_path_factory.mktemp("other")) as address:
+        browser = Browser(address, *DESKTOP)
+        try:
+            browser.wait_for("No node of the suite is heard.")
+            with Observer(domain, "stand_in") as observer:
+                yield browser, StandIn(observer.node, X, Y), address
+        finally:
+            browser.driver.quit()
+
+
+def named_nodes(browser: Browser) -> list[tuple[str, str]]:
+    """(role, name) of every control and picture, as Chromium tells them to a screen reader."""
+    browser.driver.execute_cdp_cmd("Accessibility.enable", {})
+    nodes = browser.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    told = [(n.get("role", {}).get("value", ""), n.get("name", {}).get("value", "")) for n in nodes if not n["ignored"]]
+    return [(role, name) for role, name in told if role in CONTROLS]
+
+
+def test_nodes_that_start_after_the_page_are_shown(bench: tuple[Browser, StandIn, str]) -> None:
+    page = bench[0]
+    page.wait_for("driver: active")
+    page.wait_for("c19: calibrated")
+    page.wait_for("Reachable -0.0500 to +0.0500 1/m")
+    wait_until(lambda: "No node" not in page.alerts(), 10, "the nodes to be heard")
+
+
+def test_nineteen_actuators_stand_where_the_driver_says(
+    bench: tuple[Browser, StandIn, str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    page = bench[0]
+    (words,) = wait_until(lambda: page.pictures("command map of"), 20, "the map")
+    assert words.startswith("command map of 19 actuators")
+
+    def centres() -> Any:
+        return page.driver.execute_script(
+            "return [...document.querySelectorAll('[data-actuator]')].map((cell) => {"
+            "const at = cell.getBBox(); return [+cell.dataset.actuator, at.x + at.width / 2, at.y + at.height / 2]})"
+        )
+
+    found = np.array(sorted(wait_until(lambda: len(centres()) == 19 and centres(), 20, "19 cells")))[:, 1:]
+    # One scale and one origin take the places to the picture, y downwards.
+    wanted = np.column_stack([X, -Y])
+    scale = np.linalg.norm(found - found[0]) / np.linalg.norm(wanted - wanted[0])
+    np.testing.assert_allclose(found - found[0], scale * (wanted - wanted[0]), atol=1.0)
+    page.shoot(shots_folder(tmp_path_factory.mktemp("shots")) / "console-19.png")
+
+
+def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, StandIn, str]) -> None:
+    page, stand_in, _ = bench
+    page.find("Map after a poke", "*").click()
+    page.enter("Number", "19")
+    page.press("Poke")
+    wait_until(lambda: stand_in.signals == [0.0] * 18 + [0.3], 30, "the poke")
+    page.wait_for("Poke 19: actuator 19 at +0.300")
+    page.press("Release (Esc)")
+    wait_until(lambda: stand_in.signals == [0.0] * 19, 30, "the release")
+
+
+def test_every_control_has_a_name(bench: tuple[Browser, StandIn, str]) -> None:
+    told = named_nodes(bench[0])
+    assert {"button", "spinbutton", "slider", "radio", "switch", "combobox"} <= {role for role, _name in told}
+    assert [role for role, name in told if not name.strip()] == []
+
+
+def test_errors_are_announced_at_once_and_progress_when_there_is_time(bench: tuple[Browser, StandIn, str]) -> None:
+    find = bench[0].driver.find_element
+    assert find(By.CSS_SELECTOR, ".failures").get_attribute("aria-live") == "assertive"
+    assert find(By.CSS_SELECTOR, ".failures").get_attribute("role") == "alert"
+    assert {e.get_attribute("aria-live") for e in bench[0].driver.find_elements(By.CSS_SELECTOR, "[role=status]")} <= {
+        "polite",
+        None,
+    }
+    assert bench[0].driver.execute_script("return document.documentElement.lang").startswith("en")
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_all_text_stands_out_from_its_ground(bench: tuple[Browser, StandIn, str], size: tuple[int, int]) -> None:
+    page = bench[0]
+    page.resize(*size)
+    page.enter("Recipes", "0")
+    page.press("Build recipes")
+    wait_until(lambda: "number = 0: must be a whole number" in page.alerts(), 20, "a refusal")
+    seen, poor = page.driver.execute_script(LOW_CONTRAST)
+    assert seen > 40
+    assert poor == []
+    page.dismiss_all()
+    page.resize(*DESKTOP)
+
+
+def test_the_focus_goes_through_the_page_in_order_and_is_seen(bench: tuple[Browser, StandIn, str]) -> None:
+    page = bench[0]
+    page.driver.execute_script("document.activeElement.blur(); scrollTo(0, 0)")
+    names: list[str] = []
+    for _press in range(80):
+        ActionChains(page.driver).send_keys(Keys.TAB).perform()
+        with contextlib.suppress(StaleElementReferenceException):
+            tag, name, area = page.driver.execute_script(FOCUSED)
+            if tag == "BODY":
+                break
+            assert area > 0 or tag == "INPUT", f"{name} has the focus and is not seen"
+            names.append(" ".join(name.split()))
+    order = ["Curvature, 1/m", "Move", "Degauss", "Plan", "Calibrate", "Build recipes", "Poke"]
+    reached = [names.index(name) for name in order]
+    assert reached == sorted(reached)
+    assert len(names) > 25
+
+
+def test_the_phone_page_needs_no_scrolling_sideways(bench: tuple[Browser, StandIn, str]) -> None:
+    page = bench[0]
+    page.resize(*PHONE)
+    width, inner = page.driver.execute_script("return [document.documentElement.scrollWidth, innerWidth]")
+    small = page.driver.execute_script(
+        "return [...document.querySelectorAll('button')].filter((b) => b.checkVisibility() && "
+        "b.getBoundingClientRect().height < 24).map((b) => b.innerText)"
+    )
+    page.resize(*DESKTOP)
+    assert width <= inner == PHONE[0]
+    assert small == []
