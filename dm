@@ -22,6 +22,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
+#: Set by the shell's completion script, which asks for words and must get nothing else.
+COMPLETION = "_DM_COMPLETE"
 #: Raise when this script sets the environment up in another way, so that existing ones are made anew.
 RECIPE = 1
 ENVIRONMENT_STAMP = VENV / "dm-environment.json"
@@ -55,6 +57,7 @@ On the twin, with figures
   exec       run any command inside the environment: ./dm exec python my_script.py
 
 Every command has --help, and --json FILE where it yields figures. Set-up runs by itself when it is needed.
+--install-completion makes the Tab key complete commands and options in your shell; --show-completion prints the script.
 """
 
 
@@ -319,6 +322,10 @@ def only_one() -> Iterator[None]:
 
 
 def main(arguments: list[str]) -> int:
+    if COMPLETION in os.environ:
+        if not (environment_is_ready() and workspace_is_ready()):
+            return 0  # no set-up at the press of a Tab key
+        return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_controller.cli"], run_environment())
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if arguments else 2

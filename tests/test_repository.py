@@ -70,7 +70,7 @@ def test_packages_declare_the_ros_packages_they_use(package: str) -> None:
     assert used - {package} <= declared
 
 
-@pytest.mark.parametrize("name", ["bench.yaml", "hardware.yaml"])
+@pytest.mark.parametrize("name", ["bench.yaml", "hardware.yaml", "mirror_19.yaml"])
 def test_shipped_configurations_name_only_parameters_that_exist(name: str) -> None:
     config = load_config(SOURCE / "dm_controller" / "config" / name)
     for node, values in config.items():

@@ -1,0 +1,166 @@
+"""What the documentation tells to type: its blocks, and how each command of them is tried."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from markdown_it import MarkdownIt
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of code.
+
+    Attributes:
+        page: file name.
+        line: of its beginning, from 1.
+        text: without indentation.
+        language: of a fenced block; "" = none told.
+    """
+
+    page: str
+    line: int
+    text: str
+    language: str
+
+    def __str__(self) -> str:
+        return f"{self.page}:{self.line}"
+
+    @property
+    def kind(self) -> str:
+        """python, yaml, shell, or text (see TEXTS)."""
+        first = self.text.split("\n", 1)[0]
+        if self.language in ("python", "yaml"):
+            return self.language
+        if first.startswith(("from ", "import ")):
+            return "python"
+        if first.startswith("/**/"):
+            return "yaml"
+        return "text" if first in TEXTS else "shell"
+
+    @property
+    def commands(self) -> list[str]:
+        """Of a shell block, one each, without comments."""
+        lines = (re.sub(r"\s+#\s.*$", "", line).strip() for line in self.text.splitlines())
+        return [part.strip() for line in lines if line for part in line.split(" && ")]
+
+
+def blocks() -> list[Block]:
+    """All blocks of all pages."""
+    found = []
+    for page in PAGES:
+        for token in MarkdownIt().parse(page.read_text()):
+            if token.type in ("fence", "code_block"):
+                assert token.map is not None
+                found.append(Block(page.name, token.map[0] + 1, token.content.rstrip("\n"), token.info.strip()))
+    return found
+
+
+def inline_commands() -> Iterator[tuple[str, str]]:
+    """(page, command) of every `./dm ...` within the text."""
+    for page in PAGES:
+        for token in MarkdownIt().enable("table").parse(page.read_text()):
+            for child in token.children or []:
+                if child.type == "code_inline" and child.content.startswith("./dm "):
+                    yield page.name, child.content
+
+
+#: Blocks that are nothing to type, by their first line.
+TEXTS = {
+    "header | one word per channel | check sum | terminator": "layout of a frame",
+    "dm_msgs          messages, services, actions; nothing else": "the packages",
+}
+
+#: Run to their end on the scene, in this order; they must succeed.
+RUN = (
+    "./dm calibrate --plan pokes",
+    "./dm calibrate --memory 300 --dry-run",
+    "./dm focus 0.02",
+    "./dm focus 0.03",
+    "./dm check --dry-run",
+    "./dm check",
+    "./dm check --forget",
+    "./dm recipes --list",
+)
+#: Never end by themselves: started, watched for these words, interrupted.
+WATCHED = {
+    "./dm up": "Ctrl-C stops them",
+    "./dm console": "http://127.0.0.1:8037",
+    "./dm console --port 9000 --namespace mirror_a": "http://127.0.0.1:9000",
+    "./dm record --out runs/monday": "recording",
+    "./dm record": "recording",
+}
+#: The scene itself.
+SCENE = "./dm up --config my_bench.yaml"
+#: Run behind `./dm record --out runs/monday`, on a domain of their own.
+REPLAYED = ("./dm replay runs/monday --rate 10",)
+
+_LONG = "takes minutes; "
+#: Only their names, options and values are checked, against the command itself; why, and what runs them.
+PARSED = {
+    "./dm demo": _LONG + "test_end_to_end.py runs it",
+    "./dm demo --camera": _LONG + "its parts run in test_autofocus_node.py",
+    "./dm demo --config src/dm_controller/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
+    "./dm test": "would run this test again",
+    "./dm calibrate": _LONG + "test_end_to_end.py runs the plan",
+    "./dm calibrate --fresh": _LONG + "test_end_to_end.py runs the plan",
+    "./dm calibrate --memory 300": _LONG + "test_calibration_node.py and the demo run the plan",
+    "./dm calibrate --plan memory": _LONG + "the same plan",
+    "./dm calibrate --plan surfaces --surfaces p06,p07,pz02": _LONG + "test_calibration_node.py runs the plan",
+    "./dm calibrate --plan poke-check": _LONG + "test_end_to_end.py runs the plan",
+    "./dm recipes": _LONG + "test_recipe_action.py runs the action",
+    "./dm recipes --curvatures=-0.02,0,0.02": "needs a memory plan first; test_recipe_action.py runs the action",
+    "./dm recipes --conic=-1 --curvatures=-0.05:0.05:11": "needs a memory plan first",
+    "./dm report": "the Python block of read-the-report.md writes the same; test_report_command.py runs it",
+    "./dm report PDM30-37_virtual-1_20261121T112233Z --store ~/.ros/dm_bench/calibrations": "an example of an id",
+    "./dm report path/to/calibration.h5 --out reports --json figures.json": "an example of a path",
+    "./dm replay FILE": "a placeholder; run with a real file",
+    "./dm replay runs/monday": "in its own time; run with --rate 10",
+    "./dm replay runs/monday --recalibrate": "needs a recorded calibration; test_recording.py runs it",
+    "./dm compare --plant preisach --seed 5": _LONG + "test_compare.py runs its parts",
+    "./dm compare --plant preisach --seed 5 --json runs/compare.json": _LONG + "test_compare.py runs its parts",
+    "./dm compare --history --plant all": _LONG + "test_ablation.py runs its parts",
+    "./dm compare --history --plant preisach --seed 41 --seed 42 --seed 43": _LONG + "test_ablation.py runs its parts",
+    "./dm bench": _LONG + "test_benchmark_ratios.py runs its jobs",
+    "./dm bench --json runs/bench.json --plot runs/growth.png": _LONG + "test_benchmark_ratios.py runs its jobs",
+    "./dm bench --only focus": _LONG + "test_benchmark_ratios.py runs its jobs",
+    "./dm torture": _LONG + "test_torture_driver.py runs its faults",
+    "./dm paper --out runs/paper": _LONG + "test_paper.py runs it",
+    "./dm paper --out runs/paper --json runs/paper.json": _LONG + "test_paper.py runs it",
+    "./dm doctor --config my_bench.yaml": "must complain while the scene runs; test_doctor.py runs it",
+    "./dm exec python -m dm_driver.virtual.plot --output twin.png": "draws for a minute",
+    "./dm exec python -m pytest -q src/dm_driver/test/test_electronics_contract.py": "is a test of its own",
+}
+#: Need another machine, its package manager or the network; what is named in them is checked by hand.
+ELSEWHERE = {
+    "git clone <this repository>": "placeholder",
+    "cd <its folder>": "placeholder",
+    "rosdep install --from-paths src --ignore-src -r -y": "needs apt and root",
+    "sudo apt-get install python3-statsmodels": "needs apt and root",
+    "colcon build": "needs ROS 2 from apt; ./dm builds with colcon",
+    "source install/setup.bash": "the same",
+    'ln -s "$PWD/dm" ~/.local/bin/dm': "test_completion.py makes such a link and completes through it",
+    "dm --install-completion": "test_completion.py runs it",
+}
+#: What Python blocks take for granted, by page and number of the block on it.
+PRELUDES = {
+    ("README.md", 1): "",
+    ("add-a-drive-unit.md", 1): "",
+    ("focus-from-my-node.md", 1): "import rclpy\nfrom rclpy.node import Node\nrclpy.init()\nnode = Node('mine')\n",
+    ("read-the-report.md", 1): "from pathlib import Path\nfolder = Path('reports')\nfolder.mkdir(exist_ok=True)\n",
+}
+#: Run by other tests.
+PYTHON_ELSEWHERE = {("camera.md", 1): "is examples/camera_focus.py, which test_autofocus_node.py runs"}
+
+
+def classified(command: str) -> bool:
+    """Whether somebody has said how `command` is tried; commands of ROS 2 always are, by their parts."""
+    known = (*RUN, *WATCHED, SCENE, *REPLAYED, *PARSED, *ELSEWHERE)
+    return command in known or shlex.split(command)[0] == "ros2"

@@ -1,0 +1,257 @@
+"""`dm doctor` names what is wrong on a machine or a bench, and the cure."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
+
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.influence.fit import FitOptions
+from dm_calibration.plan import PlanKind, PlanOptions
+from dm_calibration.store import CalibrationStore
+from dm_controller.cli import doctor_bench, doctor_machine
+from dm_controller.cli.doctor_finding import Finding
+from dm_controller.cli.up import shared_config
+from dm_controller.suite import load_config
+from recorded_bench import recorded
+from remembering_mirror import MIRROR
+from support import wait_until
+
+GOOD: dict[str, Any] = load_config(shared_config("bench.yaml"))
+
+
+def bench(changes: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {node: values | changes.get(node, {}) for node, values in GOOD.items()}
+
+
+@pytest.mark.parametrize("name", ["bench.yaml", "mirror_19.yaml"])
+def test_the_shipped_benches_are_well(name: str) -> None:
+    config = load_config(shared_config(name))
+    for check in (
+        doctor_bench.required_parameters,
+        doctor_bench.own_values,
+        doctor_bench.parameters,
+        doctor_bench.driver_configuration,
+    ):
+        assert check(config) is None
+
+
+@pytest.mark.parametrize(
+    ("node", "name", "value", "words"),
+    [
+        ("pdm_driver", "volts.mx", 300.0, "parameter 'volts.mx' is unknown; did you mean volts.max"),
+        ("pdm_driver", "volts.max", 300, "volts.max = 300: must be a float; write 300.0"),
+        ("pdm_driver", "limits.step", 7.0, "limits.step = 7.0: must be float, 0.0001 to 2"),
+        ("pdm_driver", "electronics.kind", "edac41", "electronics.kind = 'edac41': must be one of edac40_tcp"),
+        ("interferometer", "trigger_command", "run", "trigger_command = 'run': must be a str"),
+        ("calibration", "settle_time", True, "settle_time = True: must be float"),
+    ],
+)
+def test_wrong_parameters_are_named(node: str, name: str, value: Any, words: str) -> None:
+    finding = doctor_bench.parameters(bench({node: {name: value}}))
+    assert finding is not None and words in finding.problem and not finding.note
+
+
+def test_values_that_contradict_each_other_are_named() -> None:
+    finding = doctor_bench.driver_configuration(bench({"pdm_driver": {"mirror.actuators": 19}}))
+    assert finding is not None
+    assert "lists 37 channels: must be 19" in finding.problem
+
+
+def test_what_is_left_of_the_template_is_named() -> None:
+    config = load_config(shared_config("hardware.yaml"))
+    finding = doctor_bench.own_values(config)
+    assert finding is not None and "pdm_driver.mirror.serial" in finding.problem
+    del config["pdm_driver"]["volts.max"]
+    missing = doctor_bench.required_parameters(config)
+    assert missing is not None and missing.problem == "pdm_driver lacks volts.max"
+
+
+def test_a_port_in_use_is_named() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as holder:
+        port = holder.getsockname()[1]
+        assert doctor_bench.tcp("127.0.0.1", port) is None
+        finding = doctor_bench.free_ports(GOOD["virtual_bench"] | {"trigger.port": port})
+    assert finding is not None and f"trigger.port = {port}: Address already in use" in finding.problem
+    gone = doctor_bench.tcp("127.0.0.1", port)
+    assert gone is not None and "Connection refused" in gone.problem
+
+
+def test_serial_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leader, follower = os.openpty()
+    device = Path(os.ttyname(follower))
+    absent = doctor_bench.serial_port(tmp_path / "ttyUSB0")
+    assert absent is not None and "does not exist" in absent.problem
+    busy = doctor_bench.serial_port(device)
+    assert busy is not None and busy.note and f"(process {os.getpid()})" in busy.problem
+    os.close(follower)
+    assert doctor_bench.serial_port(device) is None
+    monkeypatch.setattr(os, "access", lambda *_arguments: False)  # tests may run as root, who may all
+    forbidden = doctor_bench.serial_port(device)
+    assert forbidden is not None and f"sudo usermod -aG {device.group()} $USER" in forbidden.cure
+    os.close(leader)
+
+
+def test_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    for folder, words in ((tmp_path / "maps", "does not exist"), (file, "is not a folder")):
+        finding = doctor_bench.watched_folder(folder, written=True, made=False)
+        assert finding is not None and words in finding.problem
+    assert doctor_bench.watched_folder(tmp_path / "maps", written=True, made=True) is None
+    assert doctor_bench.watched_folder(tmp_path, written=True, made=False) is None
+    inside_a_file = doctor_bench.writable_folder(file / "calibrations")
+    assert inside_a_file is not None and f"{file} is not a folder" in inside_a_file.problem
+    monkeypatch.setattr(os, "access", lambda _path, mode: mode != os.W_OK)
+    finding = doctor_bench.watched_folder(tmp_path, written=True, made=False)
+    assert finding is not None and "cannot be written to" in finding.problem
+    assert doctor_bench.watched_folder(tmp_path, written=False, made=False) is None
+
+
+def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor_machine, "DISK_MIN", 0.0)
+    assert doctor_machine.disk(tmp_path) is None
+    monkeypatch.setattr(doctor_machine, "DISK_MIN", 1e30)
+    finding = doctor_machine.disk(tmp_path)
+    assert finding is not None and str(tmp_path) in finding.problem
+
+
+def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
+    none = doctor_bench.stored_calibration(tmp_path, "T-1")
+    assert none is not None and none.note and "no calibration of the mirror T-1" in none.problem
+    outcome = recorded(PlanKind.POKES, PlanOptions())[1]
+    calibration, _check = evaluate(outcome, MIRROR, FitOptions(), Provenance("PDM_1", 10**18, ""))
+    CalibrationStore(tmp_path).save(calibration)
+    serial = calibration.mirror_serial
+    foreign = doctor_bench.stored_calibration(tmp_path, "other")
+    assert foreign is not None and f"those there are of {serial}" in foreign.problem
+    file = tmp_path / f"{calibration.id}.h5"
+    now = time.time()
+    os.utime(file, (now, now))
+    assert doctor_bench.stored_calibration(tmp_path, serial) is None
+    long_ago = calibration.created_ns * 1e-9
+    os.utime(file, (long_ago, long_ago))
+    old = doctor_bench.stored_calibration(tmp_path, serial)
+    assert old is not None and old.note and "days old" in old.problem and "./dm check" in old.cure
+    file.write_bytes(b"nothing of that kind")
+    damaged = doctor_bench.stored_calibration(tmp_path, serial)
+    assert damaged is not None and not damaged.note and calibration.id in damaged.problem
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(None, "cannot be read"), ("<dds", "is no XML"), ("<dds/>", "does not set maxInitialPeersRange, segment_size")],
+)
+def test_dds_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str | None, words: str) -> None:
+    path = tmp_path / "profile.xml"
+    if content is not None:
+        path.write_text(content)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(path))
+    finding = doctor_machine.profile()
+    assert finding is not None and words in finding.problem
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(shared_config("fastdds.xml")))
+    assert doctor_machine.profile() is None
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE")
+    finding = doctor_machine.profile()
+    assert finding is not None and "no Fast DDS profile" in finding.problem
+
+
+@pytest.mark.parametrize(("value", "well"), [("7", True), ("102", False), ("-1", False), ("bench", False)])
+def test_domains(monkeypatch: pytest.MonkeyPatch, value: str, well: bool) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", value)
+    monkeypatch.delenv("ROS_LOCALHOST_ONLY", raising=False)
+    assert (doctor_machine.domain() is None) == well
+
+
+def test_a_clock_before_the_program_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "time", lambda: 1e9)
+    finding = doctor_machine.clock()
+    assert finding is not None and not finding.note and "the system clock says" in finding.problem
+
+
+def test_nodes_of_the_same_name(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    nodes = [Node("pdm_driver", context=context)]
+    try:
+        assert doctor_machine.running_nodes("elsewhere") is None
+        once = doctor_machine.running_nodes()
+        assert once is not None and once.note and f"pdm_driver: running in the domain {domain}" in once.problem
+        nodes.append(Node("pdm_driver", context=context))
+        twice = doctor_machine.running_nodes()
+        assert twice is not None and not twice.note and "pdm_driver: running more than once" in twice.problem
+    finally:
+        for node in nodes:
+            node.destroy_node()
+        context.try_shutdown()
+
+
+def test_a_node_on_a_machine_with_another_clock(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = Node("pdm_driver", context=context)
+    publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+    def wait_and_publish(condition: Any, _timeout_s: float) -> bool:
+        # In place of the once a second of a real node.
+        report = DiagnosticArray(status=[DiagnosticStatus(name="pdm_driver")])
+        report.header.stamp.sec = int(time.time()) - 60
+
+        def again() -> Any:
+            publisher.publish(report)
+            return condition()
+
+        return bool(wait_until(again, 20.0))
+
+    monkeypatch.setattr("dm_controller.client.DeformableMirrorClient.wait", lambda _self, *a: wait_and_publish(*a))
+    try:
+        from dm_controller.client import DeformableMirrorClient
+
+        with DeformableMirrorClient() as client:
+            finding = doctor_machine._skew(client)
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+    assert finding is not None and "the clock of pdm_driver and this one differ by 6" in finding.problem
+
+
+def test_the_command_tells_everything_and_fails_for_what_is_wrong(tmp_path: Path, domain: int) -> None:
+    config = bench({"interferometer": {"watch_folder": str(tmp_path / "missing")}, "pdm_driver": {"volts.max": 300}})
+    del config["virtual_bench"]
+    file, figures = tmp_path / "my_bench.yaml", tmp_path / "doctor.json"
+    file.write_text(yaml.safe_dump({f"/**/{node}": {"ros__parameters": values} for node, values in config.items()}))
+    done = subprocess.run(
+        [sys.executable, "-m", "dm_controller.cli", "doctor", "--config", str(file), "--json", str(figures)],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "volts.max = 300: must be a float; write 300.0" in done.stdout
+    assert "cure:" in done.stdout
+    findings = json.loads(figures.read_text())["doctor"]
+    assert findings["packages"] is None
+    assert Finding(**findings[f"watched folder {tmp_path / 'missing'}"]).problem.endswith("does not exist")
+
+
+def test_a_file_that_is_none_is_told(tmp_path: Path) -> None:
+    file = tmp_path / "bench.yaml"
+    file.write_text("pdm_drivr:\n  ros__parameters: {}\n")
+    [(_name, run)] = doctor_bench.bench_checks(file)
+    finding = run()
+    assert finding is not None and "no node of that name; known: virtual_bench, pdm_driver" in finding.problem
