@@ -105,13 +105,14 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         safe_shape = limiter.check_shape(values["safe_signals"] or np.full(actuators, -1.0), "safe_signals")
     except Refusal as refusal:
         raise ValueError(str(refusal)) from refusal
+    doubt = math.floor(limits.step / scale.resolution) if values["electronics.await_arrival"] else 0
     return DriverConfiguration(
         x=x,
         y=y,
         limiter=limiter,
         output=OutputStage(scale, channel_of_actuator, back_end.channels),
         safe_shape=safe_shape,
-        settings=replace(settings, doubt=math.floor(limits.step / scale.resolution)),
+        settings=replace(settings, doubt=doubt),
         kind=kind,
     )
 

@@ -58,6 +58,13 @@ PARAMETERS: Final = (
         high=65535,
     ),
     Parameter("electronics.serial_port", str, "", "USB DAC-40, framed_serial: device file, for example /dev/ttyUSB0."),
+    Parameter(
+        "electronics.await_arrival",
+        bool,
+        True,
+        "EDAC40 over TCP: large ramps go no faster than the unit acknowledges, so that a link that vanishes in a move "
+        "leaves at most one step. False = never wait: for a unit that acknowledges late, where speed counts more.",
+    ),
     Parameter("electronics.timeout", float, 1.0, "Longest wait for the electronics.", "s", 0.01, 60.0),
     Parameter("framed_serial.channels", int, _FRAME.channels, "Output channels of the unit.", low=1, high=4096),
     Parameter("framed_serial.bits", int, _FRAME.bits, "Bits of a code.", low=1, high=MOST_BITS),

@@ -91,11 +91,11 @@ def test_the_last_datagram_is_sent_three_times_in_all() -> None:
     assert arrived == 3 * [encode_frame(codes(7), WIRED)]
 
 
-def configured(kind: str) -> Any:
+def configured(kind: str, **more: Any) -> Any:
     values = {parameter.name: parameter.default for parameter in PARAMETERS}
     volts = {"volts.dac_at_zero": 0.0, "volts.dac_at_full": 5.0, "volts.amplifier_gain": 80.0}
     place = {"mirror.serial": "1", "electronics.kind": kind, "electronics.address": "127.0.0.1"}
-    return build_configuration(values | volts | place | {"volts.min": 0.0, "volts.max": 300.0})
+    return build_configuration(values | volts | place | {"volts.min": 0.0, "volts.max": 300.0} | more)
 
 
 def test_ramps_are_finer_where_frames_may_be_lost() -> None:
@@ -103,3 +103,7 @@ def test_ramps_are_finer_where_frames_may_be_lost() -> None:
     assert tcp.limiter.limits.step == pytest.approx(0.1)
     assert udp.limiter.limits.step == pytest.approx(0.1 / 3)
     assert tcp.settings.doubt == math.floor(0.1 / tcp.output.scale.resolution)
+
+
+def test_waiting_for_acknowledgements_can_be_switched_off() -> None:
+    assert configured("edac40_tcp", **{"electronics.await_arrival": False}).settings.doubt == 0
