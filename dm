@@ -54,6 +54,8 @@ On the twin, with figures
   torture    faults injected into real processes: harm, loss, time to recover
 
   doctor     say what is missing or wrong, and how to cure it
+  security   least-privilege policies of every node for SROS 2, written or checked
+  audit      pins of the dependencies, and known vulnerabilities
   exec       run any command inside the environment: ./dm exec python my_script.py
 
 Every command has --help, and --json FILE where it yields figures. Set-up runs by itself when it is needed.

@@ -5,12 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-
-from ..two_cores import both
 
 #: Counts from here up mean "no data" (MetroPro reference, phase data matrix).
 INVALID_COUNTS = 2147483640
@@ -157,36 +155,20 @@ def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> NDA
     Raises:
         NoValidPixelsError: every pixel is invalid.
     """
+    # In blocks of rows that stay in the processor's cache: intermediate maps would cost more than the arithmetic.
     sag = np.empty(counts.shape)
-    half = len(sag) // 2
-    upper, lower = both(
-        partial(_convert, counts[:half], metres_per_count, sag[:half]),
-        partial(_convert, counts[half:], metres_per_count, sag[half:]),
-        counts.size,
-    )
-    if not upper + lower:
-        raise no_valid_pixels(counts.shape)
-    return sag
-
-
-def _convert(counts: NDArray[np.integer], metres_per_count: float, sag: NDArray[np.float64]) -> int:
-    """Fill `sag`; the number of valid pixels.
-
-    In blocks of rows that stay in the processor's cache: intermediate maps would cost more than the arithmetic.
-    """
     rows = max(_BLOCK_PIXELS // max(counts.shape[1], 1), 1)
-    native = np.empty((min(rows, len(sag)), counts.shape[1]), counts.dtype.newbyteorder("="))
     valid = 0
     for start in range(0, len(sag), rows):
         block = sag[start : start + rows]
-        in_order = native[: len(block)]
-        in_order[...] = counts[start : start + rows]
-        invalid = in_order >= INVALID_COUNTS
+        block[...] = counts[start : start + rows]
+        invalid = block >= INVALID_COUNTS
         valid += invalid.size - int(np.count_nonzero(invalid))
-        block[...] = in_order
         block *= metres_per_count
-        np.copyto(block, math.nan, where=invalid)
-    return valid
+        block[invalid] = math.nan
+    if not valid:
+        raise no_valid_pixels(counts.shape)
+    return sag
 
 
 def no_valid_pixels(shape: tuple[int, ...]) -> NoValidPixelsError:

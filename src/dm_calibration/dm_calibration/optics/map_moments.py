@@ -6,7 +6,6 @@ first, which costs a copy of the map, and each further pass over the copy costs 
 taken in blocks of rows that fit in the processor's second-level cache. A block is copied, its unused pixels are set to
 0, and it is summed into the energy and into P^T Z while it is there; main memory is read once and never written. Whole
 rows are copied, also where the aperture fills only part of them, because memory is read ahead only along unbroken runs.
-The upper and the lower half of a large map are done side by side: one core alone cannot fetch as much as memory gives.
 
 **Of a mask.** A row of a mask is a few runs of pixels, and the sum of a polynomial over a run is a difference of two
 running sums. One look-up per end of a run replaces a product over all pixels. Scattered dropouts are runs too; from
@@ -17,13 +16,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dgemm
 from scipy.sparse import csr_array
-
-from ..two_cores import both
 
 Array = NDArray[np.float64]
 
@@ -44,7 +41,7 @@ class _Block:
     first: int
     last: int
     unused: NDArray[np.intp]
-    rows_basis: Array  # (d, stop - start)
+    rows_basis: Array  # (stop - start, d), column-major as BLAS takes it
 
 
 class MaskedMoments:
@@ -61,7 +58,7 @@ class MaskedMoments:
         height, width = mask.shape
         self._columns_basis = columns_basis
         size = max(_BLOCK_BYTES // (8 * max(width, 1)), 1)
-        self._work = [np.zeros((min(size, height), width)) for _half in range(2)]
+        self._work = np.zeros((min(size, height), width))
         self._blocks = []
         for start in range(0, height, size):
             stop = min(start + size, height)
@@ -70,7 +67,7 @@ class MaskedMoments:
             first, last = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (width, width)
             unused = ~part
             unused[:, :first] = unused[:, last:] = False
-            basis = np.ascontiguousarray(rows_basis[start:stop].T)
+            basis = np.asfortranarray(rows_basis[start:stop])
             self._blocks.append(_Block(start, stop, first, last, np.flatnonzero(unused), basis))
 
     def of(self, sag: Array) -> tuple[Array, float]:
@@ -83,33 +80,20 @@ class MaskedMoments:
             (d, d) moments [polynomial of the rows, of the columns], and the energy; the energy is not finite when a
             pixel under the mask is not.
         """
-        half = len(self._blocks) // 2
-        upper, lower = both(
-            partial(_sums, self._blocks[:half], self._work[0], sag),
-            partial(_sums, self._blocks[half:], self._work[1], sag),
-            sag.size,
-        )
-        energy = upper[1] + lower[1]
-        degree = self._columns_basis.shape[1]
+        sums = np.zeros((self._columns_basis.shape[0], self._columns_basis.shape[1]), order="F")
+        energy = 0.0
+        for block in self._blocks:
+            work = self._work[: block.stop - block.start]
+            flat = work.reshape(-1)
+            work[...] = sag[block.start : block.stop]
+            work[:, : block.first] = 0.0
+            work[:, block.last :] = 0.0
+            flat[block.unused] = 0.0
+            energy += float(np.dot(flat, flat))
+            sums = dgemm(1.0, work.T, block.rows_basis, 1.0, sums, overwrite_c=1)
         if not math.isfinite(energy):
-            return np.full((degree, degree), math.nan), energy
-        return np.asarray((upper[0] + lower[0]) @ self._columns_basis), energy
-
-
-def _sums(blocks: list[_Block], spare: Array, sag: Array) -> tuple[Array | float, float]:
-    """Products (d, w) of the polynomials of the rows with some blocks, and their sum of squares."""
-    products: Array | float = 0.0
-    energy = 0.0
-    for block in blocks:
-        work = spare[: block.stop - block.start]
-        flat = work.reshape(-1)
-        work[...] = sag[block.start : block.stop]
-        work[:, : block.first] = 0.0
-        work[:, block.last :] = 0.0
-        flat[block.unused] = 0.0
-        energy += float(np.dot(flat, flat))
-        products = products + block.rows_basis @ work
-    return products, energy
+            return np.full((sums.shape[1], sums.shape[1]), math.nan), energy
+        return sums.T @ self._columns_basis, energy
 
 
 def mask_moments(mask: NDArray[np.bool_], rows_basis: Array, columns_basis: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
@@ -102,7 +103,11 @@ def laboratory() -> Iterator[Laboratory]:
     """A laboratory on a ROS domain and in a folder of its own."""
     with own_domain() as domain, tempfile.TemporaryDirectory(prefix="dm-bench-") as folder:
         room = Laboratory(domain, Path(folder))
+        # A full collection through all that other jobs have imported would stall the client.
+        gc.collect()
+        gc.freeze()
         try:
             yield room
         finally:
+            gc.unfreeze()
             room.close()

@@ -83,17 +83,17 @@ def bench(
     root = Path(os.environ.get("DM_ROOT", Path.cwd()))
     effort = Effort(rounds=12, quick=True) if quick else Effort()
     found = others.load(root, rivals and not quick, console.print)
-    with progress_bar() as bar:
+    with progress_bar(steady=False) as bar:  # a thread that draws would take time from what is measured
         task = bar.add_task("bench", total=len(only or JOBS))
         done = -1
 
         def step(name: str) -> None:
             nonlocal done
             done += 1
-            bar.update(task, completed=done, description=f"bench: {name}")
+            bar.update(task, completed=done, description=f"bench: {name}", refresh=True)
 
         figures = run(only or [], effort, found, step)
-        bar.update(task, completed=len(only or JOBS), description="bench: done")
+        bar.update(task, completed=len(only or JOBS), description="bench: done", refresh=True)
     lines = rows(figures)
     show(lines, figures)
     if plot is not None and "scaling" in figures:

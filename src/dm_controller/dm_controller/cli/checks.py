@@ -27,7 +27,7 @@ def check(
         steps["ruff format"] = ["ruff", "format", "--check", "."]
         steps["mypy"] = ["mypy"]
     # Most of a node's test is waiting, so a few at once; modules stay whole for what their tests share.
-    workers = str(max(2, os.cpu_count() or 1))
+    workers = str(max(3, os.cpu_count() or 1))
     steps["pytest"] = ["pytest", "-n", workers, "--dist", "loadfile", *context.args]
     results: dict[str, dict[str, float | int]] = {}
     for name, command in steps.items():

@@ -28,8 +28,8 @@ def fail(message: str) -> None:
     errors.print(f"[bold red]error:[/] {message}", soft_wrap=True, markup=True)
 
 
-def progress_bar() -> Progress:
-    """A progress bar with step i of n and the time left."""
+def progress_bar(steady: bool = True) -> Progress:
+    """A progress bar with step i of n and the time left; not `steady` = drawn only when `refresh()` is called."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -38,6 +38,7 @@ def progress_bar() -> Progress:
         TimeRemainingColumn(),
         console=console,
         refresh_per_second=4,
+        auto_refresh=steady,
     )
 
 
