@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
+from rclpy.task import Future
 
 from dm_runtime import qos
 
@@ -67,14 +68,14 @@ class ActionWatch:
         with self._lock:
             return self._feedback
 
-    def cancel(self) -> None:
-        """Ask the goal that runs to stop; its status tells when it has."""
+    def cancel(self) -> Future | None:
+        """Ask the goal that runs to stop: the answer, None = no goal runs. Its status tells when it has stopped."""
         request = self._interface.Request()
         with self._lock:
             if not self._running:
-                return
+                return None
             request.goal_info.goal_id.uuid = list(self._running)
-        self._cancel.call_async(request)
+        return self._cancel.call_async(request)
 
     def _on_status(self, message: Any) -> None:
         running = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import os
 import time
@@ -26,6 +27,7 @@ from dm_msgs.msg import (
 from dm_msgs.srv import Degauss, Flatten, ListCalibrations, LoadCalibration, Measure, SetFocus, SetSignals
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from sensor_msgs.msg import Image
 
 from dm_calibration.calibration_messages import stamp_ns
@@ -203,7 +205,8 @@ class RosSide:
         finished = handle.get_result_async()
         try:
             if not await _until(finished.done, timeout_s, lambda: self._server_is_gone(client)):
-                await self.cancel(name)
+                with contextlib.suppress(RefusedError):
+                    await self.cancel(name)
                 raise RefusedError(f"{name}: no result: its node has gone, or it took longer than {timeout_s:g} s")
         finally:
             self._goals.pop(name, None)
@@ -222,12 +225,18 @@ class RosSide:
         return next((name for name, watch in self.watched.items() if watch.elsewhere), "")
 
     async def cancel(self, name: str) -> None:
-        """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs."""
+        """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs.
+
+        Raises:
+            RefusedError: no answer.
+        """
         handle = self._goals.get(name)
         if handle is not None:
-            await _until(handle.cancel_goal_async().done, ANSWER_S)
-        elif name in self.watched:
-            self.watched[name].cancel()
+            asked: Future | None = handle.cancel_goal_async()
+        else:
+            asked = self.watched[name].cancel() if name in self.watched else None
+        if asked is not None and not await _until(asked.done, ANSWER_S):
+            raise RefusedError(f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
 
 
 async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[[], bool] = lambda: False) -> bool:

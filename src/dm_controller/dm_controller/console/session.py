@@ -146,12 +146,15 @@ class Session:
 
     async def cancel(self) -> None:
         """Ask the operation under way to stop, here or elsewhere."""
-        if not self.progress.title and (name := self.ros.busy_elsewhere):
-            await self.ros.cancel(name)
-        elif self._cancel is not None and self.progress.title:
-            self.cancelled = True
-            self.progress.words = "cancelling"
-            await self._cancel()
+        try:
+            if not self.progress.title and (name := self.ros.busy_elsewhere):
+                await self.ros.cancel(name)
+            elif self._cancel is not None and self.progress.title:
+                self.cancelled = True
+                self.progress.words = "cancelling"
+                await self._cancel()
+        except RefusedError as error:
+            self.fail("Cancel", str(error))
 
     async def between_steps(self) -> None:
         """How work that looks at `cancelled` between its steps is cancelled."""
