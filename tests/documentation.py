@@ -132,6 +132,8 @@ PARSED = {
     "./dm bench --json runs/bench.json --plot runs/growth.png": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm bench --only focus": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm torture": _LONG + "test_torture_driver.py runs its faults",
+    "./dm security --out policies": "test_security_profile.py runs it",
+    "./dm audit": "asks the network; test_audit.py runs it without",
     "./dm paper --out runs/paper": _LONG + "test_paper.py runs it",
     "./dm paper --out runs/paper --json runs/paper.json": _LONG + "test_paper.py runs it",
     "./dm doctor --config my_bench.yaml": "must complain while the scene runs; test_doctor.py runs it",
