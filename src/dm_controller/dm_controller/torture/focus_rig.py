@@ -47,7 +47,7 @@ SERIAL = "torture"
 #: Curvatures asked for lie within ± this, 1/m; two in a row differ by at least the other.
 REACH, LEAST_CHANGE = 0.02, 0.004
 #: A held shape is corrected for creep: signals that differ less are the same shape.
-SAME_SHAPE = 0.02
+SAME_SHAPE = 0.04
 #: Half-swings of a degauss, few: faults are to meet it on its way.
 DEGAUSS_STEPS = 8
 #: The controller's own time-outs, short enough for a run; s.
