@@ -13,6 +13,7 @@ from typing import Any
 
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
@@ -34,7 +35,23 @@ def wait_until(condition: Callable[[], Any], timeout_s: float = 30.0, what: str 
     raise AssertionError(f"not within {timeout_s:g} s: {what or condition}")
 
 
-__all__ = ["NodeProcess", "Observer", "own_domain", "wait_until"]
+__all__ = ["NodeProcess", "Observer", "bench_figures", "own_domain", "wait_until"]
+
+
+def bench_figures(node: Node, timeout_s: float = 30.0) -> dict[str, str]:
+    """What `virtual_bench` next tells of itself on `/diagnostics`; somebody else serves `node`."""
+    received: list[DiagnosticArray] = []
+    node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
+
+    def figures() -> dict[str, str] | None:
+        for array in reversed(received):
+            for status in array.status:
+                if status.name == "virtual_bench":
+                    return {item.key: item.value for item in status.values}
+        return None
+
+    found: dict[str, str] = wait_until(figures, timeout_s, "the bench's diagnostics")
+    return found
 
 
 class NodeProcess:

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, ErrorCode, ZernikeCoefficients
 from std_srvs.srv import SetBool
@@ -31,7 +30,7 @@ from dm_controller.target import FocusTarget
 from dm_controller.verify import map_of, surface_error
 from dm_driver.virtual.parameters import TABLE
 from dm_runtime.action_client import ThreadedActionClient
-from support import wait_until
+from support import bench_figures, wait_until
 
 SEED = 20_11
 WAVELENGTH = 632.8e-9
@@ -176,17 +175,7 @@ def test_unplugged_electronics_are_noticed_and_their_return_too(
 
 def test_the_electronics_never_saw_a_jump(mirror: DeformableMirrorClient, calibrated: Calibrate.Result) -> None:
     """The monitor in the emulated electronics watched every frame of this module."""
-    received: list[Any] = []
-    mirror.node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
-
-    def figures() -> dict[str, str] | None:
-        for array in reversed(received):
-            for status in array.status:
-                if status.name == "virtual_bench":
-                    return {item.key: item.value for item in status.values}
-        return None
-
-    values = wait_until(figures)
+    values = bench_figures(mirror.node)
     assert int(values["frames"]) > 1000
     assert int(values["violations"]) == 0
     assert int(values["malformed_frames"]) == 0

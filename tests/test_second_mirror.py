@@ -6,11 +6,9 @@ Ideal actuators and a seed that nothing was tuned on: the bounds judge the chain
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode
 from scipy.optimize import lsq_linear
@@ -27,7 +25,7 @@ from dm_controller.suite import Suite, own_domain
 from dm_controller.target import FocusTarget
 from dm_controller.verify import map_of, surface_error
 from dm_driver.virtual.plate import Plate, PlateConfig, neighbour_pairs
-from support import wait_until
+from support import bench_figures
 
 SEED = 20_19
 MIRROR_19 = shared_config("mirror_19.yaml")
@@ -94,17 +92,7 @@ def test_open_loop_spheres(mirror: DeformableMirrorClient, calibrated: Calibrate
 
 
 def test_the_unit_understood_every_frame(mirror: DeformableMirrorClient, calibrated: Calibrate.Result) -> None:
-    received: list[Any] = []
-    mirror.node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
-
-    def figures() -> dict[str, str] | None:
-        for array in reversed(received):
-            for status in array.status:
-                if status.name == "virtual_bench":
-                    return {item.key: item.value for item in status.values}
-        return None
-
-    values = wait_until(figures, 30.0)
+    values = bench_figures(mirror.node)
     assert int(values["frames"]) > 500
     assert int(values["violations"]) == 0
     assert int(values["malformed_frames"]) == 0

@@ -49,11 +49,10 @@ from dm_runtime.worker import WorkerActionServer, WorkerService
 class CalibrationNode(Node):
     """Topics, services and the action of the calibration; what they do is in CalibrationDesk and CalibrateAction."""
 
-    _forecast_warned = ""
-
     def __init__(self) -> None:
         super().__init__("calibration")
         self._values = declare(self, PARAMETERS)
+        self._last_refusal = ""
         self._frame_id = ""
         self._start_pending = bool(self._values["load_on_start"])
         # Latched: a controller that starts later must know the calibration in use.
@@ -148,8 +147,8 @@ class CalibrationNode(Node):
 
     def _serve(self, work: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
         # The controller asks for many commands at once; one refusal is one line of the log.
-        self._answer(response, lambda: work(request, response), self._forecast_warned)
-        self._forecast_warned = response.message if response.error_code else ""
+        self._answer(response, lambda: work(request, response), self._last_refusal)
+        self._last_refusal = response.message if response.error_code else ""
         return response
 
     def _on_list(self, _request: Any, response: Any) -> Any:

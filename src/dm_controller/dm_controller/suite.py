@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -86,6 +86,20 @@ def own_domain() -> Iterator[int]:
             handle.close()
         return
     raise RuntimeError("no free ROS domain: 99 runs at once?")
+
+
+def stop_processes(processes: Collection[subprocess.Popen[bytes]], timeout_s: float = 15.0) -> None:
+    """Interrupt `processes` together and wait for all of them; one that does not end in time is killed."""
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+    deadline = time.monotonic() + timeout_s
+    for process in processes:
+        try:
+            process.wait(max(deadline - time.monotonic(), 0.0))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 class Suite:
@@ -166,16 +180,7 @@ class Suite:
         hardware = [process for name, process in self._processes.items() if name == "virtual_bench"]
         nodes = [process for process in self._processes.values() if process not in hardware]
         for group in (nodes, hardware):
-            for process in group:
-                if process.poll() is None:
-                    process.send_signal(signal.SIGINT)
-            deadline = time.monotonic() + timeout_s
-            for process in group:
-                try:
-                    process.wait(max(deadline - time.monotonic(), 0.0))
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            stop_processes(group, timeout_s)
 
     def __exit__(
         self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None

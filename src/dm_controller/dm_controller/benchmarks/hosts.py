@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from typing import Any
 from dm_controller.benchmarks.timing import Effort
 from dm_controller.cli.demo import bench_config
 from dm_controller.network_namespaces import NotPermittedError, command_on, one_host, received_bytes, two_hosts
-from dm_controller.suite import save_config
+from dm_controller.suite import save_config, stop_processes
 
 DRIVER_SIDE = ("dm_driver.virtual_bench_node", "dm_driver.pdm_driver_node")
 CONTROLLER = "dm_controller.focus_controller_node"
@@ -66,14 +65,7 @@ def _run(rounds: int, driver_host: str, controller_host: str) -> dict[str, float
             ask = [*command_on(controller_host), sys.executable, "-m", CLIENT, str(rounds), NAMESPACE]
             done = subprocess.run(ask, check=False, capture_output=True, text=True, env=environment, timeout=LONGEST_S)
         finally:
-            for process in reversed(processes):
-                process.send_signal(signal.SIGINT)
-            for process in processes:
-                try:
-                    process.wait(15.0)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            stop_processes(processes)
         if done.returncode != 0:
             logs = [
                 line for path in folder.glob("*.log") for line in path.read_text(errors="replace").splitlines()[-3:]

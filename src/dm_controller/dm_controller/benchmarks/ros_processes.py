@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from dm_controller.suite import own_domain, save_config
+from dm_controller.suite import own_domain, save_config, stop_processes
 from dm_runtime.executor import make_executor
 
 
@@ -84,15 +83,7 @@ class Laboratory:
 
     def close(self) -> None:
         """Stop all processes and leave the ROS graph."""
-        for process in self._processes:
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-        for process in self._processes:
-            try:
-                process.wait(15.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        stop_processes(self._processes)
         self._executor.shutdown(2.0)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -41,7 +40,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_controller.benchmarks import stand_in_mirror
 from dm_controller.cli.demo import bench_config
-from dm_controller.suite import Suite
+from dm_controller.suite import Suite, stop_processes
 from dm_runtime import qos
 from dm_runtime.executor import make_executor
 
@@ -306,12 +305,7 @@ def _relay(domain: int) -> Iterator[None]:
     try:
         yield
     finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(15.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        stop_processes([process])
 
 
 def _stream(
