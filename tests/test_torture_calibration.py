@@ -17,4 +17,4 @@ NAMES = ("calibration_power_cut", "calibration_interferometer_killed")
 def test_nothing_is_harmed_lost_or_measured_twice(name: str, tmp_path: Path, domain: int) -> None:
     chosen = [fault for fault in FAULTS if fault.name == name]
     (record,) = run_faults(chosen, tmp_path, domain, seed=2011)
-    assert record.harmless, record.figures()
+    assert record.harmless, str(record.figures())

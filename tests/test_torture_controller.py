@@ -31,7 +31,7 @@ FAULTS = (
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_request_is_carried_out_or_refused_and_the_mirror_kept(name: str, tmp_path: Path, domain: int) -> None:
     (record,) = run_faults(select([name]), tmp_path, domain, seed=2012)
-    assert record.harmless, record.figures()
+    assert record.harmless, str(record.figures())
     assert len(record.recovery_s) == record.injected
 
 

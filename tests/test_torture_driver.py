@@ -30,7 +30,7 @@ FAULTS = (
 @pytest.mark.parametrize("name", FAULTS)
 def test_no_frame_breaks_a_limit_and_the_driver_recovers(name: str, tmp_path: Path, domain: int) -> None:
     (record,) = run_faults(select(name), tmp_path, domain, seed=2011)
-    assert record.harmless, record.figures()
+    assert record.harmless, str(record.figures())
     assert len(record.recovery_s) == record.injected
 
 

@@ -76,7 +76,7 @@ def test_a_bad_network_harms_and_loses_nothing(name: str, tmp_path: Path, domain
     (record,) = run_faults(select([name]), tmp_path, domain, seed=2013)
     if record.skipped:
         pytest.skip(record.skipped)
-    assert record.harmless, record.figures()
+    assert record.harmless, str(record.figures())
     assert len(record.recovery_s) == record.injected > 0
 
 

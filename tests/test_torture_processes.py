@@ -37,7 +37,7 @@ def test_no_frame_breaks_a_limit_and_everything_works_again(name: str, tmp_path:
     (record,) = run_faults([FAULTS[name]], tmp_path, domain, seed=2011)
     if record.skipped:
         pytest.skip(record.skipped)
-    assert record.harmless, record.figures()
+    assert record.harmless, str(record.figures())
     assert len(record.recovery_s) >= 1
 
 

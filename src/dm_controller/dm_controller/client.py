@@ -266,23 +266,30 @@ class DeformableMirrorClient:
         if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
             raise DeformableMirrorError(503, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
-        if not self.wait(accepted.done):
-            raise DeformableMirrorError(503, f"{name}: no answer to the goal")
-        handle = accepted.result()
-        if not handle.accepted:
-            raise DeformableMirrorError(405, f"{name}: refused, another goal is running")
-        finished = handle.get_result_async()
+        finished = None
         try:
+            if not self.wait(accepted.done):
+                raise DeformableMirrorError(503, f"{name}: no answer to the goal")
+            if not accepted.result().accepted:
+                raise DeformableMirrorError(405, f"{name}: refused, another goal is running")
+            finished = accepted.result().get_result_async()
             if not self.wait(finished.done, timeout_s):
                 raise DeformableMirrorError(503, f"{name}: not finished within {timeout_s:g} s")
         except BaseException:
-            handle.cancel_goal_async()
-            self.wait(finished.done, 20.0)
+            self._cancel(accepted, finished)
             raise
         result = finished.result().result
         if result.error_code != 0:
             raise DeformableMirrorError(result.error_code, result.message, result)
         return result
+
+    def _cancel(self, accepted: Any, finished: Any) -> None:
+        """Cancel a goal that may not be accepted yet, and wait for its end."""
+        if not self.wait(accepted.done) or not accepted.result().accepted:
+            return
+        handle = accepted.result()
+        handle.cancel_goal_async()
+        self.wait((finished or handle.get_result_async()).done, 20.0)
 
     def move_focus(
         self,

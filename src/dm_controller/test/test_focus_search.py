@@ -133,12 +133,12 @@ def test_no_hill_is_told_from_a_hill() -> None:
 
 
 def test_noise_is_hardly_ever_taken_for_a_hill() -> None:
-    """Measured over 5000 sweeps of 11 and of 16 points: in 0.8 % and 0.3 % of them."""
+    """Measured over 12 000 searches from 11 points: in 0.14 % of them; in 0.8 % of the first sweeps alone."""
     noise = np.random.default_rng(7)
-    searches = [PeakSearch(CONFIG) for _ in range(200)]
+    searches = [PeakSearch(CONFIG) for _ in range(2000)]
     for search in searches:
         run(search, lambda _c: 1.0 + 0.1 * noise.standard_normal())
-    assert sum(search.peak is not None for search in searches) <= 10
+    assert sum(search.peak is not None for search in searches) <= 6
 
 
 @pytest.mark.parametrize("top", [LOW - 0.01, HIGH + 0.01])

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import rclpy
+from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from dm_msgs.action import Calibrate, Converge, MoveFocus
 from dm_msgs.msg import (
@@ -117,6 +118,7 @@ class RosSide:
         self._diagnostics: dict[str, DiagnosticStatus] = {}
         self._bench_time = 0.0
         self._goals: dict[str, Any] = {}
+        self._beginning: dict[str, bool] = {}  # goals that are not accepted yet; True = to be cancelled
         self.following = Following()
         self.log = LogTail(self.node)
         for topic, (message_type, profile) in TOPICS.items():
@@ -189,21 +191,16 @@ class RosSide:
             RefusedError: the goal was refused, ended with an error or was cancelled, with the node's sentence.
         """
         client = self._actions[name]
-        if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
-            raise RefusedError(f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
-        identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
-        identity.uuid = list(uuid.uuid4().bytes)
-        if name in self.watched:
-            self.watched[name].own(identity)
-        accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
-        if not await _until(accepted.done, ANSWER_S):
-            raise RefusedError(f"{name}: no answer to the goal within {ANSWER_S:g} s")
-        handle = accepted.result()
-        if not handle.accepted:
-            raise RefusedError(f"{name}: refused, another goal is running")
+        self._beginning[name] = False
+        try:
+            handle = await self._begin(name, goal, on_feedback)
+        finally:
+            cancelled = self._beginning.pop(name)
         self._goals[name] = handle
         finished = handle.get_result_async()
         try:
+            if cancelled:
+                await self.cancel(name)
             if not await _until(finished.done, timeout_s, lambda: self._server_is_gone(client)):
                 with contextlib.suppress(RefusedError):
                     await self.cancel(name)
@@ -214,6 +211,25 @@ class RosSide:
         if result.error_code != 0:
             raise RefusedError(f"{result.message} (error {result.error_code})")
         return result
+
+    async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
+        """The handle of a goal that was accepted."""
+        client = self._actions[name]
+        if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
+            raise RefusedError(f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
+        if self._beginning[name]:
+            raise RefusedError(f"{name}: cancelled before it began; nothing has changed")
+        identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
+        identity.uuid = list(uuid.uuid4().bytes)
+        if name in self.watched:
+            self.watched[name].own(identity)
+        accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
+        if not await _until(accepted.done, ANSWER_S):
+            raise RefusedError(f"{name}: no answer to the goal within {ANSWER_S:g} s")
+        handle = accepted.result()
+        if not handle.accepted:
+            raise RefusedError(f"{name}: refused, another goal is running")
+        return handle
 
     @staticmethod
     def _server_is_gone(client: ThreadedActionClient) -> bool:
@@ -228,15 +244,25 @@ class RosSide:
         """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs.
 
         Raises:
-            RefusedError: no answer.
+            RefusedError: no answer, or the node does not know the goal.
         """
         handle = self._goals.get(name)
+        if handle is None and name in self._beginning:
+            self._beginning[name] = True  # whoever begins it cancels it as soon as it is accepted
+            return
         if handle is not None:
             asked: Future | None = handle.cancel_goal_async()
         else:
             asked = self.watched[name].cancel() if name in self.watched else None
-        if asked is not None and not await _until(asked.done, ANSWER_S):
+        if asked is None:
+            return
+        if not await _until(asked.done, ANSWER_S):
             raise RefusedError(f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
+        if asked.result().return_code not in (
+            CancelGoal.Response.ERROR_NONE,
+            CancelGoal.Response.ERROR_GOAL_TERMINATED,
+        ):
+            raise RefusedError(f"{name}: its node does not cancel the goal (code {asked.result().return_code})")
 
 
 async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[[], bool] = lambda: False) -> bool:

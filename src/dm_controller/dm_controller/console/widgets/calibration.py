@@ -88,7 +88,8 @@ class CalibrationCard:
         running = session.calibrating
         self._cancel.allow("" if running else "No calibration is under way.")
         progress = session.shown_progress
-        self._progress.show(f"Step {progress.step} of {progress.steps}: {progress.words}" if running else "")
+        step = f"Step {progress.step} of {progress.steps}: {progress.words}" if progress.steps else "The run begins."
+        self._progress.show(step if running else "")
         residuals_nm = [NM * residual for residual in list(session.ros.watched["calibrate"].residuals)]
         self._residuals.show(residual_chart(residuals_nm) if residuals_nm else "")
         lines = "".join(f"<div>{escape(line)}</div>" for line in calibration_words(snapshot.calibration))

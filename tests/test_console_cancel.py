@@ -1,0 +1,77 @@
+"""Cancelling from the console while a goal is only about to begin: on the way to its node, or its node is not there."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import rclpy
+from dm_msgs.action import Calibrate
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from dm_controller.console.ros_side import RefusedError, RosSide
+from dm_runtime.executor import BackgroundExecutor
+from dm_runtime.worker import WorkerActionServer
+from support import own_domain
+
+LONGEST_S = 20.0
+
+
+def until_cancelled(goal_handle: ServerGoalHandle) -> tuple[str, Any]:
+    deadline = time.monotonic() + LONGEST_S
+    while time.monotonic() < deadline:
+        if goal_handle.is_cancel_requested:
+            return "canceled", Calibrate.Result(error_code=1, message="canceled by the node")
+        time.sleep(0.01)
+    return "succeed", Calibrate.Result()
+
+
+@pytest.fixture
+def bench() -> Iterator[tuple[RosSide, Node]]:
+    """The console's side, and a node of the action `calibrate` that nobody serves yet."""
+    with own_domain() as domain:
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        node = Node("played_calibration", context=context)
+        WorkerActionServer(node, Calibrate, "calibrate", until_cancelled)
+        side = RosSide(domain=domain)
+        yield side, node
+        side.close()
+        context.try_shutdown()
+
+
+def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tuple[RosSide, Node]) -> None:
+    side, node = bench
+
+    async def scene() -> BackgroundExecutor:
+        run = asyncio.create_task(side.run("calibrate", Calibrate.Goal(), lambda _feedback: None))
+        while not side._actions["calibrate"]._pending_goal_requests:
+            await asyncio.sleep(0.01)
+        await side.cancel("calibrate")
+        served = BackgroundExecutor(node)  # only now does the node take the goal
+        with pytest.raises(RefusedError, match="canceled by the node"):
+            await run
+        return served
+
+    asyncio.run(asyncio.wait_for(scene(), LONGEST_S)).destroy_node()
+
+
+def test_a_goal_that_is_not_sent_yet_never_begins(bench: tuple[RosSide, Node]) -> None:
+    side, node = bench
+    served = BackgroundExecutor(node)
+
+    async def scene() -> None:
+        run = asyncio.create_task(side.run("calibrate", Calibrate.Goal(), lambda _feedback: None))
+        await asyncio.sleep(0.0)  # it looks for the node
+        await side.cancel("calibrate")
+        with pytest.raises(RefusedError, match="cancelled before it began"):
+            await run
+
+    asyncio.run(asyncio.wait_for(scene(), LONGEST_S))
+    assert side.watched["calibrate"].goals == 0
+    served.destroy_node()
