@@ -81,7 +81,7 @@ def test_without_a_recipe_a_conditioned_move_is_refused(page: Browser) -> None:
     page.press("Move")
     wait_until(lambda: "holds no recipes" in page.alerts(), 30, "the refusal")
     page.press("Dismiss: Move")
-    wait_until(lambda: page.alerts() == "", 10, "the dismissal")
+    wait_until(lambda: page.alerts() == "", 30, "the dismissal")
 
 
 def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser) -> None:
@@ -134,7 +134,7 @@ def test_two_pages_show_the_same_and_either_dismisses(page: Browser, bench: tupl
         for browser in (page, other):
             wait_until(browser.alerts, 30, "the refusal on both pages")
         other.press("Dismiss: Move")
-        wait_until(lambda: page.alerts() == "", 10, "the dismissal on both pages")
+        wait_until(lambda: page.alerts() == "", 30, "the dismissal on both pages")
         assert other.chosen() == page.chosen() == 8
     finally:
         other.driver.quit()

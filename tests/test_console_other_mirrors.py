@@ -88,7 +88,7 @@ def test_nodes_that_start_after_the_page_are_shown(bench: tuple[Browser, StandIn
     page.wait_for("driver: active")
     page.wait_for("c19: calibrated")
     page.wait_for("Reachable -0.0500 to +0.0500 1/m")
-    wait_until(lambda: "No node" not in page.alerts(), 10, "the nodes to be heard")
+    wait_until(lambda: "No node" not in page.alerts(), 30, "the nodes to be heard")
 
 
 def test_nineteen_actuators_stand_where_the_driver_says(

@@ -88,7 +88,7 @@ def test_a_calibration_that_is_cancelled_says_so(page: Browser) -> None:
     wait_until(lambda: "cancel" in page.alerts(), 60, "the sentence of the node")
     assert "the mirror is back at mid range" in page.alerts()
     page.press("Dismiss: Calibration")
-    wait_until(lambda: page.alerts() == "", 10, "the dismissal")
+    wait_until(lambda: page.alerts() == "", 30, "the dismissal")
 
 
 def test_a_calibration_shows_progress_and_residual_and_is_used(page: Browser, shots: Path) -> None:
@@ -127,7 +127,7 @@ def test_the_slider_follows_the_arrow_keys(page: Browser) -> None:
     field = page.find("Curvature, 1/m", "input")
     before = float(field.get_attribute("value"))
     page.driver.find_element(By.CSS_SELECTOR, '[role="slider"] [tabindex="0"]').send_keys(Keys.ARROW_RIGHT)
-    wait_until(lambda: before < float(field.get_attribute("value")) <= before + 0.001, 10, "a larger curvature")
+    wait_until(lambda: before < float(field.get_attribute("value")) <= before + 0.001, 30, "a larger curvature")
 
 
 def test_an_unreachable_curvature_is_refused_in_a_sentence_that_stays(page: Browser, shots: Path) -> None:
@@ -147,13 +147,13 @@ def test_an_unreachable_curvature_is_refused_in_a_sentence_that_stays(page: Brow
     page.shoot(shots / "console-phone.png")
     page.resize(*DESKTOP)
     page.press("Dismiss: Move")
-    wait_until(lambda: page.alerts() == "", 10, "the dismissal")
+    wait_until(lambda: page.alerts() == "", 30, "the dismissal")
 
 
 def test_actuators_are_chosen_poked_and_released_by_keyboard(page: Browser) -> None:
     group = page.find("Actuators. Arrow keys choose, Enter pokes, Escape releases", "div")
     group.send_keys(Keys.ARROW_RIGHT)
-    wait_until(lambda: page.chosen() != 1, 10, "another actuator")
+    wait_until(lambda: page.chosen() != 1, 30, "another actuator")
     chosen = page.chosen()
     page.find("Actuators. Arrow keys choose, Enter pokes, Escape releases", "div").send_keys(Keys.ENTER)
     page.wait_for(f"Poke {chosen}: actuator {chosen} at ", 60)

@@ -189,7 +189,7 @@ class Scene:
             process.wait()
             raise
         said = log.read_text(errors="replace")
-        assert status == 0, said
+        assert status == 0, f"{said}\nThe nodes:\n{(self.folder / 'up.log').read_text(errors='replace')[-3000:]}"
         return said
 
     def watch(self, command: str, words: str, domain: int | None = None) -> None:
@@ -236,7 +236,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
                 shlex.split(told.SCENE), cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT
             )
         try:
-            with DeformableMirrorClient(domain=domain) as client:
+            with DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
                 client.wait_until_active(90.0)
                 nodes = {"interferometer", "calibration", "focus_controller"}
                 wait_until(lambda: nodes <= set(client.node.get_node_names()), 90.0, "all nodes")

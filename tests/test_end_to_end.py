@@ -48,7 +48,7 @@ def mirror(folder: Path) -> Iterator[DeformableMirrorClient]:
     with (
         own_domain() as domain,
         Suite(config, folder, domain) as suite,
-        DeformableMirrorClient(domain=domain) as client,
+        DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
         try:
             client.wait_until_active()
@@ -190,7 +190,7 @@ def test_poke_check_tells_what_is_wired_wrongly(folder: Path) -> None:
     with (
         own_domain() as domain,
         Suite(config, folder / "miswired", domain),
-        DeformableMirrorClient(domain=domain) as client,
+        DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
         client.wait_until_active()
         with pytest.raises(DeformableMirrorError) as found:
@@ -223,7 +223,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
             stderr=subprocess.STDOUT,
         )
         try:
-            with DeformableMirrorClient(domain=domain) as client:
+            with DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
                 client.wait_until_active(30.0)
                 assert client.mirror_info.electronics == "edac40_tcp"
                 client.set_signals([0.1] * 37)

@@ -55,7 +55,10 @@ def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:
         stdout=subprocess.DEVNULL,
     )
     try:
-        with DeformableMirrorClient("left", domain) as left, DeformableMirrorClient("right", domain) as right:
+        with (
+            DeformableMirrorClient("left", domain, 60.0) as left,
+            DeformableMirrorClient("right", domain, 60.0) as right,
+        ):
             left.wait_until_active(60.0)
             right.wait_until_active(60.0)
             before = np.array(right.latest("actuator_state").applied)

@@ -28,7 +28,15 @@ from std_msgs.msg import Int32
 
 from dm_runtime.action_client import ThreadedActionClient
 from dm_runtime.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
-from dm_runtime.worker import ServiceCallError, WorkerActionServer, WorkerService, answers_arrive, call, sleep
+from dm_runtime.worker import (
+    ServiceCallError,
+    WorkerActionServer,
+    WorkerService,
+    answers_arrive,
+    call,
+    never_silent,
+    sleep,
+)
 from support import Observer, wait_until
 
 
@@ -79,9 +87,11 @@ def test_a_failing_service_callback_answers_with_the_reason(observer: Observer) 
         raise RuntimeError("the plate is bent")
 
     WorkerService(observer.node, SetSignals, "failing", failing)
-    response = observer.call(SetSignals, "failing")
-    assert response.error_code == ErrorCode.INTERNAL
-    assert "the plate is bent" in response.message
+    observer.node.create_service(SetSignals, "failing_at_once", never_silent(observer.node, "failing_at_once", failing))
+    for name in ("failing", "failing_at_once"):
+        response = observer.call(SetSignals, name)
+        assert response.error_code == ErrorCode.INTERNAL
+        assert "the plate is bent" in response.message
 
 
 def test_the_loop_survives_a_callback_that_raises(observer: Observer) -> None:
@@ -354,6 +364,6 @@ def test_nothing_of_a_client_stays_in_the_graph(kind: str, domain: int, watcher:
                 observer.call(Flatten, "flatten")
                 observer.run_goal(MoveFocus, "move", MoveFocus.Goal())
             wait_until(lambda: "observer" in watcher.get_node_names())
-        wait_until(lambda: "observer" not in watcher.get_node_names(), 5, "the node is still in the graph")
+        wait_until(lambda: "observer" not in watcher.get_node_names(), 30, "the node is still in the graph")
     finally:
         gc.enable()

@@ -32,7 +32,11 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
     config = bench_config(folder, "off", 0.0, 1, speed=20.0)
     config["virtual_bench"]["camera.rate"] = 1.0
     config["autofocus"] = {"use_sim_time": True}
-    with own_domain() as domain, Suite(config, folder, domain), DeformableMirrorClient(domain=domain) as client:
+    with (
+        own_domain() as domain,
+        Suite(config, folder, domain),
+        DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
+    ):
         side = RosSide(domain=domain)
         try:
             client.wait_until_active(60.0)

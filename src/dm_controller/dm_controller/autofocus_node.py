@@ -20,7 +20,7 @@ from dm_controller.camera.sharpness import check_region
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
 from dm_runtime.parameters import declare
-from dm_runtime.worker import ServiceCallError, WorkerService, call
+from dm_runtime.worker import ServiceCallError, WorkerService, call, never_silent
 
 
 class AutofocusNode(Node):
@@ -41,7 +41,8 @@ class AutofocusNode(Node):
         self._set_focus = self.create_client(SetFocus, "set_focus")
         self._action = AutofocusAction(self, self._view, self._values, self._optics, self._publish)
         WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance)
-        self.create_service(GetFocusRange, "get_focus_range", self._on_get_focus_range)
+        answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
+        self.create_service(GetFocusRange, "get_focus_range", answer)
         self._watched: Any = None
         self._trouble = ""
         if self._values["monitor_rate"] > 0:

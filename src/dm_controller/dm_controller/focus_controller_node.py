@@ -43,6 +43,7 @@ from dm_controller.target import FocusTarget
 from dm_runtime import diagnostics, qos
 from dm_runtime.executor import run_node
 from dm_runtime.parameters import declare
+from dm_runtime.worker import never_silent
 
 #: Time after a command until `focus_state` tells of it, s. Whoever waits for the command wakes up meanwhile: it may
 #: have to on this very core (measured: 0.2 ms sooner).
@@ -94,8 +95,8 @@ class FocusControllerNode(Node):
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         self.create_subscription(FocusRequest, "focus_request", self._on_focus_request, qos.COMMAND)
-        self.create_service(SetFocus, "set_focus", self._on_set_focus, qos_profile=qos.SERVICE)
-        self.create_service(Flatten, "flatten", self._on_flatten, qos_profile=qos.SERVICE)
+        for kind, name, answer in ((SetFocus, "set_focus", self._on_set_focus), (Flatten, "flatten", self._on_flatten)):
+            self.create_service(kind, name, never_silent(self, name, answer), qos_profile=qos.SERVICE)
         self.create_timer(self._values["hold.period"], self._correct_held_shape)
         self.create_timer(LOOK_S, self._look_for_untaken, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)

@@ -37,6 +37,25 @@ class ServiceCallError(Exception):
     """A service did not answer: not there, too slow, or the wait was cancelled."""
 
 
+def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """`callback(request, response) -> response` of service `name` that answers ErrorCode.INTERNAL instead of raising.
+
+    A service whose callback raises sends no answer: whoever called it waits until its patience ends.
+    """
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:
+            node.get_logger().error(f"service {name}:\n{traceback.format_exc()}")
+            if hasattr(response, "error_code"):
+                response.error_code = 599  # ErrorCode.INTERNAL
+                response.message = f"{type(error).__name__}: {error}"
+            return response
+
+    return answer
+
+
 class WorkerService:
     """A service whose callback runs in a worker thread.
 
@@ -45,7 +64,7 @@ class WorkerService:
 
     def __init__(self, node: Node, srv_type: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
         self._node = node
-        self._callback = callback
+        self._callback = never_silent(node, name, callback)
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name.replace("/", "_"))
         self._service: Service = node.create_service(
             srv_type, name, lambda request, response: (request, response), qos_profile=qos.SERVICE
@@ -59,13 +78,7 @@ class WorkerService:
         self._pool.submit(self._work, *request_and_response, header)
 
     def _work(self, request: Any, response: Any, header: Any) -> None:
-        try:
-            response = self._callback(request, response)
-        except Exception as error:
-            self._node.get_logger().error(f"service {self._service.srv_name}:\n{traceback.format_exc()}")
-            if hasattr(response, "error_code"):
-                response.error_code = 599  # ErrorCode.INTERNAL
-                response.message = f"{type(error).__name__}: {error}"
+        response = self._callback(request, response)
         if self._node.executor is not None:
             self._node.executor.create_task(self._send, response, header)
 

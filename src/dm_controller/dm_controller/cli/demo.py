@@ -42,7 +42,7 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
     nodes = ("interferometer",)
     with (
         Suite({"interferometer": {}}, folder / "ingest", domain, namespace="ingest", nodes=nodes),
-        DeformableMirrorClient("ingest", domain) as client,
+        DeformableMirrorClient("ingest", domain, 60.0) as client,
     ):
         answer = client.ingest(str(path.resolve()))
     console.print(
@@ -215,7 +215,7 @@ def demo(
             f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
             f"seed {seed}; logs in {os.path.relpath(folder)}"
         )
-        with Suite(config, folder, domain) as suite, DeformableMirrorClient(domain=domain) as client:
+        with Suite(config, folder, domain) as suite, DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
             try:
                 client.wait_until_active(20.0)
                 begun = time.monotonic()

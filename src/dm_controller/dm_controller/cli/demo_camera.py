@@ -201,7 +201,10 @@ def demo_camera(
     with own_domain() as domain:
         config = bench_config(folder, law, actual_creep, seed, speed)
         config["virtual_bench"]["interferometer.pixels"] = PIXELS
-        with Suite(config, folder / "calibration", domain) as suite, DeformableMirrorClient(domain=domain) as client:
+        with (
+            Suite(config, folder / "calibration", domain) as suite,
+            DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
+        ):
             try:
                 client.wait_until_active(20.0)
                 goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_MEMORY, memory_maps=MAPS, activate=True, note="camera")

@@ -47,7 +47,7 @@ class BenchRig:
     @contextmanager
     def running(self) -> Iterator[DeformableMirrorClient]:
         """All nodes, and a client of them."""
-        with DeformableMirrorClient(domain=self._domain) as self.client:
+        with DeformableMirrorClient(domain=self._domain, timeout_s=60.0) as self.client:
             self.client.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
             self.bench.__enter__()
             try:
