@@ -84,7 +84,7 @@ class Browser:
     def text(self) -> str:
         return str(self.driver.execute_script("return document.body.innerText"))
 
-    def wait_for(self, words: str, timeout_s: float = 30.0) -> None:
+    def wait_for(self, words: str, timeout_s: float = 60.0) -> None:
         """Wait until the page shows `words`; fail with what it shows instead."""
         try:
             wait_until(lambda: words in self.text, timeout_s)
@@ -95,7 +95,7 @@ class Browser:
         """The element with that accessible name, or that text."""
         quoted = f'"{name}"'
         path = f"//{kind}[@aria-label={quoted} or normalize-space(.)={quoted}]"
-        return wait_until(lambda: self.driver.find_elements(By.XPATH, path), 20, f"{kind} named {name}")[0]
+        return wait_until(lambda: self.driver.find_elements(By.XPATH, path), 60, f"{kind} named {name}")[0]
 
     def press(self, name: str) -> None:
         """Press a button once it is enabled."""
@@ -103,7 +103,7 @@ class Browser:
         button = self.find(name, "button")
         self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
         # A click goes to a place; what appears above the button meanwhile moves it away from there.
-        wait_until(lambda: self._stands_still(button), 20, f"button {name} to stand still")
+        wait_until(lambda: self._stands_still(button), 60, f"button {name} to stand still")
         button.click()
 
     @staticmethod

@@ -118,7 +118,7 @@ class Bench:
         """Mirror, calibration and an active driver are known to the controller."""
         self.info.publish(mirror_info())
         self.calibration.publish(message or calibration())
-        wait_until(lambda: self.capabilities and self.capabilities[-1].calibration_id == "known", 30.0)
+        wait_until(lambda: self.capabilities and self.capabilities[-1].calibration_id == "known", 60)
         self.activate()
         return self
 

@@ -24,7 +24,7 @@ from dm_runtime.executor import BackgroundExecutor
 from dm_runtime.worker import answers_arrive
 
 
-def wait_until(condition: Callable[[], Any], timeout_s: float = 30.0, what: str = "") -> Any:
+def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:
     """Return the first true value of `condition()`; fail the test when there is none in time."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
@@ -38,7 +38,7 @@ def wait_until(condition: Callable[[], Any], timeout_s: float = 30.0, what: str 
 __all__ = ["NodeProcess", "Observer", "bench_figures", "own_domain", "wait_until"]
 
 
-def bench_figures(node: Node, timeout_s: float = 30.0) -> dict[str, str]:
+def bench_figures(node: Node, timeout_s: float = 60.0) -> dict[str, str]:
     """What `virtual_bench` next tells of itself on `/diagnostics`; somebody else serves `node`."""
     received: list[DiagnosticArray] = []
     node.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
@@ -125,12 +125,12 @@ class Observer:
         self.node.create_subscription(message_type, topic, received.append, qos)
         return received
 
-    def call(self, service_type: Any, name: str, request: Any = None, timeout_s: float = 15.0) -> Any:
+    def call(self, service_type: Any, name: str, request: Any = None, timeout_s: float = 30.0) -> Any:
         """Call a service and return its response."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(service_type, name)
         client = self._clients[name]
-        wait_until(lambda: answers_arrive(client, client.service_is_ready), timeout_s, f"service {name}")
+        wait_until(lambda: answers_arrive(client, client.service_is_ready), max(timeout_s, 60.0), f"service {name}")
         message = request if request is not None else service_type.Request()
         future = client.call_async(message)
         try:
@@ -148,9 +148,9 @@ class Observer:
         if name not in self._clients:
             self._clients[name] = ThreadedActionClient(self.node, action_type, name)
         client = self._clients[name]
-        wait_until(lambda: answers_arrive(client, client.server_is_ready), 15, f"action {name}")
+        wait_until(lambda: answers_arrive(client, client.server_is_ready), 60, f"action {name}")
         accepted = client.send_goal_async(goal, feedback_callback=feedback)
-        wait_until(accepted.done, 15, f"acceptance by {name}")
+        wait_until(accepted.done, 60, f"acceptance by {name}")
         handle = accepted.result()
         return handle, handle.get_result_async() if handle.accepted else None
 

@@ -128,7 +128,7 @@ Start = Callable[..., NodeProcess]
 def bench(start: Start, observer: Observer) -> Iterator[Bench]:
     with Bench(observer, object_curvature=0.0173) as played:
         start("dm_controller", "autofocus", PARAMETERS)
-        wait_until(lambda: played.states, 20, "the first figure of an image")
+        wait_until(lambda: played.states, 60, "the first figure of an image")
         yield played
 
 
@@ -166,7 +166,7 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(bench: Bench, ob
     handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
     wait_until(lambda: bench.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
     bench.object_curvature = -0.03
-    wait_until(lambda: bench.states[-1].phase == AutofocusState.PHASE_COARSE, 20, "a new search")
+    wait_until(lambda: bench.states[-1].phase == AutofocusState.PHASE_COARSE, 60, "a new search")
 
     def on_it() -> bool:
         last = bench.states[-1]

@@ -40,9 +40,17 @@ RATIOS = [
 ]
 
 
+#: Runs that may be disturbed before one must not, and the pause between them [s].
+TRIES, PAUSE_S = 4, 5.0
+
+
+def short_run() -> dict[str, Any]:
+    return run(["fit", "read", "solve"], Effort(rounds=12, quick=True), {})
+
+
 @pytest.fixture(scope="module")
 def measured() -> dict[str, Any]:
-    return run(["fit", "read", "solve"], Effort(rounds=12, quick=True), {})
+    return short_run()
 
 
 @pytest.mark.parametrize(("part", "figure", "other_part", "other"), RATIOS)
@@ -50,7 +58,12 @@ def test_ratio_is_not_far_off(measured: dict[str, Any], part: str, figure: str, 
     def ratio(figures: dict[str, Any]) -> float:
         return float(figures[part][figure] / figures[other_part][other])
 
-    assert ratio(measured) < (FAR_READING if part == "read_dat" else FAR) * ratio(BASELINE)
+    most = (FAR_READING if part == "read_dat" else FAR) * ratio(BASELINE)
+    ratios = [ratio(measured)]
+    while ratios[-1] >= most and len(ratios) < TRIES:
+        time.sleep(PAUSE_S)  # what keeps the machine busy may end
+        ratios.append(ratio(short_run()))
+    assert ratios[-1] < most, ratios
 
 
 def test_fast_results_are_right(measured: dict[str, Any]) -> None:

@@ -57,7 +57,7 @@ def test_a_memory_calibration_shows_the_loops(page: Browser) -> None:
     wait_until(lambda: page.pictures("residual of"), 60, "residuals of the run")
     page.wait_for(": held-out residual ", 900)
     page.wait_for("history: known")
-    wait_until(lambda: page.pictures("hysteresis loop of actuator 1"), 20, "the loop")
+    wait_until(lambda: page.pictures("hysteresis loop of actuator 1"), 60, "the loop")
     assert page.alerts() == ""
 
 
@@ -79,9 +79,9 @@ def test_without_a_recipe_a_conditioned_move_is_refused(page: Browser) -> None:
     page.picked("Conditioned").click()
     page.wait_for("this calibration holds no recipes")
     page.press("Move")
-    wait_until(lambda: "holds no recipes" in page.alerts(), 30, "the refusal")
+    wait_until(lambda: "holds no recipes" in page.alerts(), 60, "the refusal")
     page.press("Dismiss: Move")
-    wait_until(lambda: page.alerts() == "", 30, "the dismissal")
+    wait_until(lambda: page.alerts() == "", 60, "the dismissal")
 
 
 def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser) -> None:
@@ -117,7 +117,7 @@ def test_the_loop_of_an_actuator_is_measured(page: Browser, shots: Path) -> None
     page.enter("Number", "8")
     page.press("Measure its loop")
     page.wait_for("actuator 8: model and maps differ by at most", 180)
-    wait_until(functools.partial(page.pictures, "hysteresis loop of actuator 8"), 20, "the loop")
+    wait_until(functools.partial(page.pictures, "hysteresis loop of actuator 8"), 60, "the loop")
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
     page.shoot(shots / "console-memory.png")
@@ -132,9 +132,9 @@ def test_two_pages_show_the_same_and_either_dismisses(page: Browser, bench: tupl
         page.enter("Curvature, 1/m", "0.9")
         page.press("Move")
         for browser in (page, other):
-            wait_until(browser.alerts, 30, "the refusal on both pages")
+            wait_until(browser.alerts, 60, "the refusal on both pages")
         other.press("Dismiss: Move")
-        wait_until(lambda: page.alerts() == "", 30, "the dismissal on both pages")
+        wait_until(lambda: page.alerts() == "", 60, "the dismissal on both pages")
         assert other.chosen() == page.chosen() == 8
     finally:
         other.driver.quit()
@@ -146,9 +146,9 @@ def test_a_calibration_started_elsewhere_is_shown_and_can_be_cancelled(page: Bro
         assert handle.accepted
         page.wait_for("A calibration that was started elsewhere", 30)
         page.wait_for("Step ", 30)
-        wait_until(lambda: "maps" in " ".join(page.pictures("residual of ")), 30, "its residuals")
+        wait_until(lambda: "maps" in " ".join(page.pictures("residual of ")), 60, "its residuals")
         assert not page.find("Move", "button").is_enabled()
         page.press("Cancel calibration")
         wait_until(result.done, 60, "its end")
         assert "cancel" in result.result().result.message
-        wait_until(lambda: "started elsewhere" not in page.text, 20, "its end on the page")
+        wait_until(lambda: "started elsewhere" not in page.text, 60, "its end on the page")

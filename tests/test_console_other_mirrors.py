@@ -88,14 +88,14 @@ def test_nodes_that_start_after_the_page_are_shown(bench: tuple[Browser, StandIn
     page.wait_for("driver: active")
     page.wait_for("c19: calibrated")
     page.wait_for("Reachable -0.0500 to +0.0500 1/m")
-    wait_until(lambda: "No node" not in page.alerts(), 30, "the nodes to be heard")
+    wait_until(lambda: "No node" not in page.alerts(), 60, "the nodes to be heard")
 
 
 def test_nineteen_actuators_stand_where_the_driver_says(
     bench: tuple[Browser, StandIn, str], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     page = bench[0]
-    (words,) = wait_until(lambda: page.pictures("command map of"), 20, "the map")
+    (words,) = wait_until(lambda: page.pictures("command map of"), 60, "the map")
     assert words.startswith("command map of 19 actuators")
 
     def centres() -> Any:
@@ -104,7 +104,7 @@ def test_nineteen_actuators_stand_where_the_driver_says(
             "const at = cell.getBBox(); return [+cell.dataset.actuator, at.x + at.width / 2, at.y + at.height / 2]})"
         )
 
-    found = np.array(sorted(wait_until(lambda: len(centres()) == 19 and centres(), 20, "19 cells")))[:, 1:]
+    found = np.array(sorted(wait_until(lambda: len(centres()) == 19 and centres(), 60, "19 cells")))[:, 1:]
     # One scale and one origin take the places to the picture, y downwards.
     wanted = np.column_stack([X, -Y])
     scale = np.linalg.norm(found - found[0]) / np.linalg.norm(wanted - wanted[0])
@@ -117,10 +117,10 @@ def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, Stan
     page.find("Map after a poke", "*").click()
     page.enter("Number", "19")
     page.press("Poke")
-    wait_until(lambda: stand_in.signals == [0.0] * 18 + [0.3], 30, "the poke")
+    wait_until(lambda: stand_in.signals == [0.0] * 18 + [0.3], 60, "the poke")
     page.wait_for("Poke 19: actuator 19 at +0.300")
     page.press("Release (Esc)")
-    wait_until(lambda: stand_in.signals == [0.0] * 19, 30, "the release")
+    wait_until(lambda: stand_in.signals == [0.0] * 19, 60, "the release")
 
 
 def test_every_control_has_a_name(bench: tuple[Browser, StandIn, str]) -> None:
@@ -146,7 +146,7 @@ def test_all_text_stands_out_from_its_ground(bench: tuple[Browser, StandIn, str]
     page.resize(*size)
     page.enter("Recipes", "0")
     page.press("Build recipes")
-    wait_until(lambda: "number = 0: must be a whole number" in page.alerts(), 20, "a refusal")
+    wait_until(lambda: "number = 0: must be a whole number" in page.alerts(), 60, "a refusal")
     seen, poor = page.driver.execute_script(LOW_CONTRAST)
     assert seen > 40
     assert poor == []

@@ -88,7 +88,7 @@ def test_a_calibration_that_is_cancelled_says_so(page: Browser) -> None:
     wait_until(lambda: "cancel" in page.alerts(), 60, "the sentence of the node")
     assert "the mirror is back at mid range" in page.alerts()
     page.press("Dismiss: Calibration")
-    wait_until(lambda: page.alerts() == "", 30, "the dismissal")
+    wait_until(lambda: page.alerts() == "", 60, "the dismissal")
 
 
 def test_a_calibration_shows_progress_and_residual_and_is_used(page: Browser, shots: Path) -> None:
@@ -119,7 +119,7 @@ def test_a_move_is_predicted_first_then_taken_and_measured(page: Browser, shots:
     page.wait_for("Measure: rms", 60)
     page.wait_for("The map is of the present shape.")
     for begin in ("measured surface", "predicted surface", "measured minus predicted", "Measured − predicted"):
-        wait_until(functools.partial(page.pictures, begin), 20, begin)
+        wait_until(functools.partial(page.pictures, begin), 60, begin)
     page.shoot(shots / "console-desktop.png")
 
 
@@ -127,13 +127,13 @@ def test_the_slider_follows_the_arrow_keys(page: Browser) -> None:
     field = page.find("Curvature, 1/m", "input")
     before = float(field.get_attribute("value"))
     page.driver.find_element(By.CSS_SELECTOR, '[role="slider"] [tabindex="0"]').send_keys(Keys.ARROW_RIGHT)
-    wait_until(lambda: before < float(field.get_attribute("value")) <= before + 0.001, 30, "a larger curvature")
+    wait_until(lambda: before < float(field.get_attribute("value")) <= before + 0.001, 60, "a larger curvature")
 
 
 def test_an_unreachable_curvature_is_refused_in_a_sentence_that_stays(page: Browser, shots: Path) -> None:
     page.enter("Curvature, 1/m", "0.9")
     page.press("Move")
-    wait_until(lambda: "curvature = +0.9000 1/m" in page.alerts(), 30, "the refusal")
+    wait_until(lambda: "curvature = +0.9000 1/m" in page.alerts(), 60, "the refusal")
     page.resize(*PHONE)
     width, inner = page.driver.execute_script("return [document.documentElement.scrollWidth, innerWidth]")
     assert width <= inner == PHONE[0]
@@ -147,13 +147,13 @@ def test_an_unreachable_curvature_is_refused_in_a_sentence_that_stays(page: Brow
     page.shoot(shots / "console-phone.png")
     page.resize(*DESKTOP)
     page.press("Dismiss: Move")
-    wait_until(lambda: page.alerts() == "", 30, "the dismissal")
+    wait_until(lambda: page.alerts() == "", 60, "the dismissal")
 
 
 def test_actuators_are_chosen_poked_and_released_by_keyboard(page: Browser) -> None:
     group = page.find("Actuators. Arrow keys choose, Enter pokes, Escape releases", "div")
     group.send_keys(Keys.ARROW_RIGHT)
-    wait_until(lambda: page.chosen() != 1, 30, "another actuator")
+    wait_until(lambda: page.chosen() != 1, 60, "another actuator")
     chosen = page.chosen()
     page.find("Actuators. Arrow keys choose, Enter pokes, Escape releases", "div").send_keys(Keys.ENTER)
     page.wait_for(f"Poke {chosen}: actuator {chosen} at ", 60)
@@ -167,7 +167,7 @@ def test_a_click_on_a_hexagon_chooses_it(page: Browser) -> None:
             page.driver.find_element(By.CSS_SELECTOR, '[data-actuator="12"]').click()
         return page.chosen() == 12
 
-    wait_until(clicked, 15, "actuator 12")
+    wait_until(clicked, 60, "actuator 12")
 
 
 def test_nodes_that_are_started_again_are_found_again(page: Browser, bench: Bench) -> None:

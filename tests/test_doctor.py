@@ -215,7 +215,7 @@ def test_a_node_on_a_machine_with_another_clock(domain: int, monkeypatch: pytest
             publisher.publish(report)
             return condition()
 
-        return bool(wait_until(again, 20.0))
+        return bool(wait_until(again, 60))
 
     monkeypatch.setattr("dm_controller.client.DeformableMirrorClient.wait", lambda _self, *a: wait_and_publish(*a))
     try:

@@ -84,7 +84,7 @@ class Driver:
         def find() -> ActuatorState | None:
             return next((state for state in self.states[seen:] if condition(state)), None)
 
-        return wait_until(find, 15, what)
+        return wait_until(find, 60, what)
 
     def wait_for_refusal(self, code: int, words: str) -> ActuatorState:
         return self.wait_for_state(lambda state: state.error_code == code and words in state.message, words)

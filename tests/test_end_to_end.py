@@ -230,11 +230,11 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
                 port = str(bench["virtual_bench"]["trigger.port"])
                 seen: list[Any] = []
                 client.node.create_subscription(ZernikeCoefficients, "zernike", seen.append, 10)
-                wait_until(lambda: client.node.count_publishers("zernike"), 20.0, what="the interferometer node")
+                wait_until(lambda: client.node.count_publishers("zernike"), 60, what="the interferometer node")
                 time.sleep(1.0)  # it must have discovered this subscription too
                 saved = tmp_path / "maps" / "from_instrument.datx"
                 subprocess.run([sys.executable, str(trigger), "--port", port, "--output", str(saved)], check=True)
-                zernike = wait_until(lambda: seen and seen[-1], 20.0, what="the watched folder's map")
+                zernike = wait_until(lambda: seen and seen[-1], 60, what="the watched folder's map")
                 assert zernike.radius == pytest.approx(0.011)
                 assert zernike.wavelength == pytest.approx(read_map(saved).wavelength)
         finally:

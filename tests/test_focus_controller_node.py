@@ -207,7 +207,7 @@ def test_a_command_that_the_driver_does_not_take_is_told_of(bench: Bench) -> Non
     bench.follow = False
     bench.ready()
     assert bench.set_focus(curvature=0.01).error_code == ErrorCode.OK
-    told = wait_until(lambda: [s for s in bench.focus_states if s.error_code != ErrorCode.OK], 20.0)[0]
+    told = wait_until(lambda: [s for s in bench.focus_states if s.error_code != ErrorCode.OK], 60)[0]
     assert told.curvature == 0.01 and not told.applied
     assert told.error_code == ErrorCode.PREEMPTED
     assert "has not taken the command" in told.message
@@ -216,7 +216,7 @@ def test_a_command_that_the_driver_does_not_take_is_told_of(bench: Bench) -> Non
 def test_requests_are_refused_when_the_driver_falls_silent(bench: Bench) -> None:
     bench.ready()
     bench.fall_silent()
-    wait_until(lambda: bench.set_focus(dry_run=False).error_code != ErrorCode.OK, 20.0)
+    wait_until(lambda: bench.set_focus(dry_run=False).error_code != ErrorCode.OK, 60)
     refused = bench.set_focus(curvature=0.01)
     assert refused.error_code == ErrorCode.DRIVER_UNAVAILABLE
     assert "has not reported for" in refused.message

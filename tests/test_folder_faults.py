@@ -37,7 +37,7 @@ def watched(start: Start, observer: Observer, folder: Path, **parameters: Any) -
         time.sleep(0.2)
         return bool(taken)
 
-    wait_until(comes, 20, "a first map")
+    wait_until(comes, 60, "a first map")
     taken.clear()
     return node, taken
 
@@ -75,12 +75,12 @@ def test_a_file_that_grows_is_renamed_and_copied_counts_by_its_content(
             time.sleep(0.02)
     assert taken == []
     (folder / "growing.dat.part").rename(folder / "grown.dat")
-    wait_until(lambda: len(taken) == 1, 20, "the map")
+    wait_until(lambda: len(taken) == 1, 60, "the map")
     (folder / "grown.dat").write_bytes(content)  # saved over itself: nothing new
     time.sleep(1.0)
     assert len(taken) == 1
     (folder / "grown.dat").write_bytes(map_bytes(2))
-    wait_until(lambda: len(taken) == 2, 20, "the replaced map")
+    wait_until(lambda: len(taken) == 2, 60, "the replaced map")
     assert "Traceback" not in node.output
 
 
@@ -101,12 +101,12 @@ def test_locked_files_links_out_and_pipes_are_told_and_the_next_map_is_taken(
     )
     assert "leads out of the watched folder" in node.output
     (folder / "good.dat").write_bytes(map_bytes(3))
-    wait_until(lambda: f"new file: {folder / 'good.dat'}" in node.output, 20, "the good map")
+    wait_until(lambda: f"new file: {folder / 'good.dat'}" in node.output, 60, "the good map")
     if os.geteuid() != 0:  # nothing is locked for root
         assert "locked.dat: Permission denied" in node.output
         locked.chmod(0o600)
         os.utime(locked)
-        wait_until(lambda: f"new file: {locked}" in node.output, 20, "the unlocked map")
+        wait_until(lambda: f"new file: {locked}" in node.output, 60, "the unlocked map")
     assert not any("secret" in line for line in node.output.splitlines() if "new file" in line)
     assert taken
 
@@ -116,11 +116,11 @@ def test_a_trigger_that_hangs_blocks_no_map_from_the_folder(observer: Observer, 
     command = [sys.executable, "-S", "-c", "import time; time.sleep(600)", "{path}"]
     _node, taken = watched(start, observer, folder, trigger_command=command, trigger_timeout=3.0)
     client = observer.node.create_client(Measure, "measure")
-    wait_until(client.service_is_ready, 20, "service measure")
+    wait_until(client.service_is_ready, 60, "service measure")
     future = client.call_async(Measure.Request())
     (folder / "by_hand.dat").write_bytes(map_bytes(1))
-    wait_until(lambda: len(taken) == 1, 20, "the map taken by hand")
-    wait_until(future.done, 30, "the answer")
+    wait_until(lambda: len(taken) == 1, 60, "the map taken by hand")
+    wait_until(future.done, 60, "the answer")
     assert future.result().error_code == ErrorCode.TRIGGER_FAILED
     assert "did not end within 3 s" in future.result().message
 

@@ -60,7 +60,7 @@ class Bench:
             answer = self.observer.call(GetState, "interferometer/get_state", timeout_s=30)
             return bool(answer.current_state.id == state)
 
-        wait_until(reached, 30, f"lifecycle state {state}")
+        wait_until(reached, 60, f"lifecycle state {state}")
 
     def change(self, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=transition))
@@ -74,7 +74,7 @@ class Bench:
 
     def wait_for_maps(self, count: int) -> None:
         kinds = (self.maps, self.infos, self.zernikes, self.samples)
-        wait_until(lambda: all(len(received) >= count for received in kinds), 20, f"{count} maps")
+        wait_until(lambda: all(len(received) >= count for received in kinds), 60, f"{count} maps")
 
 
 def test_ingested_map_is_published_whole(observer: Observer, start: Start, tmp_path: Path) -> None:
@@ -297,9 +297,9 @@ def test_deactivation_ends_a_measurement(observer: Observer, start: Start, tmp_p
     client = observer.node.create_client(Measure, "measure")
     wait_until(client.service_is_ready, what="service measure")
     future = client.call_async(Measure.Request(timeout=300.0))
-    wait_until(marker.exists, 20, "the trigger command runs")
+    wait_until(marker.exists, 60, "the trigger command runs")
     assert bench.change(Transition.TRANSITION_DEACTIVATE)
-    wait_until(future.done, 20, "the answer")
+    wait_until(future.done, 60, "the answer")
     assert future.result().error_code == ErrorCode.INTERFEROMETER_INACTIVE
 
 
@@ -315,7 +315,7 @@ def test_map_without_pitch_has_an_unknown_radius(observer: Observer, start: Star
 
 def test_settings_that_contradict_each_other_are_told_and_the_node_stays(observer: Observer, start: Start) -> None:
     node = start("dm_calibration", "interferometer", {"trigger_command": ["trigger"]})
-    wait_until(lambda: "trigger_command needs watch_folder" in node.output, 30, "the reason")
+    wait_until(lambda: "trigger_command needs watch_folder" in node.output, 60, "the reason")
     answer = observer.call(Measure, "measure", timeout_s=30)
     assert answer.error_code == ErrorCode.INTERFEROMETER_INACTIVE
     state = observer.call(GetState, "interferometer/get_state")

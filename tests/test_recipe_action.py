@@ -96,10 +96,10 @@ def test_a_cancel_keeps_whole_recipes_and_rests_the_mirror(
     observer: Observer, host: Host, bench: Bench, store: Store
 ) -> None:
     handle, future = observer.send_goal(Converge, "converge", goal(-0.02, 0.0, 0.01, 0.02, 0.03))
-    wait_until(lambda: bench.measured >= 5, 30)
+    wait_until(lambda: bench.measured >= 5, 60)
     bench.pause = 0.3
     handle.cancel_goal_async()
-    wait_until(future.done, 30)
+    wait_until(future.done, 60)
     ended = future.result()
     assert ended.status == GoalStatus.STATUS_CANCELED
     assert ended.result.error_code == ErrorCode.CANCELED
@@ -110,9 +110,9 @@ def test_a_cancel_keeps_whole_recipes_and_rests_the_mirror(
 
 def test_a_bench_that_fails_keeps_whole_recipes(observer: Observer, host: Host, bench: Bench, store: Store) -> None:
     _, future = observer.send_goal(Converge, "converge", goal(-0.02, 0.0, 0.02))
-    wait_until(lambda: bench.measured >= 4, 30)
+    wait_until(lambda: bench.measured >= 4, 60)
     bench.failures = 1000
-    wait_until(future.done, 30)
+    wait_until(future.done, 60)
     result = future.result().result
     assert result.error_code == ErrorCode.MAP_TIMEOUT
     assert result.recipes == len(store.requests[0].recipes.recipes) >= 1

@@ -242,10 +242,10 @@ def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain
     stream = observer.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
     latched.publish(MirrorInfo(serial="before the recording"))
     with Recorder(tmp_path / "bag", domain=domain) as recorder:
-        wait_until(lambda: stream.get_subscription_count() and recorder.counts.get("/mirror_info"), 20)
+        wait_until(lambda: stream.get_subscription_count() and recorder.counts.get("/mirror_info"), 60)
         for number in range(50):
             stream.publish(ActuatorState(sequence=number))
-        wait_until(lambda: recorder.counts["/actuator_state"] == 50, 30, "all states in the recording")
+        wait_until(lambda: recorder.counts["/actuator_state"] == 50, 60, "all states in the recording")
     bag = BagReader(tmp_path / "bag")
     states = list(bag.read(["/actuator_state"]))
     cls = message_class("dm_msgs/msg/ActuatorState")
@@ -261,7 +261,7 @@ def test_parameters_of_the_nodes_are_recorded(
 ) -> None:
     start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path / "store"), "poke_amplitude": 0.31})
     with Recorder(tmp_path / "bag", domain=domain) as recorder:
-        wait_until(lambda: "weak_share" in recorder.parameters.get("/calibration", {}), 30, "parameters")
+        wait_until(lambda: "weak_share" in recorder.parameters.get("/calibration", {}), 60, "parameters")
     assert BagReader(tmp_path / "bag").parameters["/calibration"]["poke_amplitude"] == 0.31
 
 
@@ -271,7 +271,7 @@ def test_a_recording_is_published_again(observer: Observer, domain: int, tmp_pat
     seen = observer.record(ActuatorState, "actuator_state", qos.STATE)
     commands = observer.record(ActuatorCommand, "actuator_command", qos.COMMAND)
     assert play(bag, replayed(list(bag.topics)), rate=0.1, domain=domain) == 10
-    wait_until(lambda: len(seen) == 10, 30, "all messages")
+    wait_until(lambda: len(seen) == 10, 60, "all messages")
     assert [message.sequence for message in seen] == list(range(10))
     assert not commands
     with pytest.raises(ValueError, match="rate = 0"):

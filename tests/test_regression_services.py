@@ -99,7 +99,7 @@ def load(observer: Observer, name: str) -> None:
         answer = observer.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=name))
         return bool(answer.error_code == ErrorCode.OK)
 
-    wait_until(loaded, 20, f"{name} loaded")
+    wait_until(loaded, 60, f"{name} loaded")
 
 
 def test_fit_and_predict(node: NodeProcess, observer: Observer) -> None:

@@ -364,6 +364,6 @@ def test_nothing_of_a_client_stays_in_the_graph(kind: str, domain: int, watcher:
                 observer.call(Flatten, "flatten")
                 observer.run_goal(MoveFocus, "move", MoveFocus.Goal())
             wait_until(lambda: "observer" in watcher.get_node_names())
-        wait_until(lambda: "observer" not in watcher.get_node_names(), 30, "the node is still in the graph")
+        wait_until(lambda: "observer" not in watcher.get_node_names(), 60, "the node is still in the graph")
     finally:
         gc.enable()

@@ -64,7 +64,7 @@ def test_the_policy_is_what_the_node_uses_and_nothing_more(bench: DeformableMirr
         return found == {"more": [], "less": []}
 
     try:
-        wait_until(agrees, 20.0)
+        wait_until(agrees, 60)
     except AssertionError:
         raise AssertionError(f"{name}: {found}") from None
 

@@ -32,7 +32,7 @@ def test_recipes_are_stored_and_published_again(
     bench = StandIn(observer.node, mirror, LinearMirror(mirror.x, mirror.y, noise=1e-9))
     received = observer.record(Calibration, "calibration", qos.LATCHED)
     node = start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path / "c"), "settle_time": 0.01})
-    wait_until(lambda: received, 20, node.output)
+    wait_until(lambda: received, 60, node.output)
     bench.publish_info(mirror)
 
     def store(calibration_id: str, actuators: int) -> Any:
@@ -45,7 +45,7 @@ def test_recipes_are_stored_and_published_again(
     goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True)
     made = observer.run_goal(Calibrate, "calibrate", goal, 60).result
     assert made.error_code == ErrorCode.OK, made.message
-    wait_until(lambda: received[-1].id == made.id, 30)
+    wait_until(lambda: received[-1].id == made.id, 60)
 
     refused = store("another", mirror.actuators)
     assert refused.error_code == ErrorCode.CALIBRATION_MISMATCH
@@ -55,7 +55,7 @@ def test_recipes_are_stored_and_published_again(
 
     answer = store(made.id, mirror.actuators)
     assert answer.error_code == ErrorCode.OK, answer.message
-    wait_until(lambda: received[-1].recipes.recipes, 30)
+    wait_until(lambda: received[-1].recipes.recipes, 60)
     for stored in (recipe_book_from(received[-1].recipes), CalibrationStore(tmp_path / "c").load(made.id).recipes):
         assert stored.degauss_steps == 100
         np.testing.assert_array_equal(stored.recipes[0].effective, book(mirror.actuators).recipes[0].effective)
