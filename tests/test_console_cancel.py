@@ -14,12 +14,13 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from dm_controller.console import ros_side
 from dm_controller.console.ros_side import RefusedError, RosSide
 from dm_runtime.executor import BackgroundExecutor
 from dm_runtime.worker import WorkerActionServer
 from support import own_domain
 
-LONGEST_S = 20.0
+LONGEST_S = 60.0
 
 
 def until_cancelled(goal_handle: ServerGoalHandle) -> tuple[str, Any]:
@@ -56,6 +57,28 @@ def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tu
         served = BackgroundExecutor(node)  # only now does the node take the goal
         with pytest.raises(RefusedError, match="canceled by the node"):
             await run
+        return served
+
+    asyncio.run(asyncio.wait_for(scene(), LONGEST_S)).destroy_node()
+
+
+def test_a_goal_whose_answer_was_lost_is_seen_and_can_be_cancelled(
+    bench: tuple[RosSide, Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    side, node = bench
+
+    async def scene() -> BackgroundExecutor:
+        # By then the node must have been found, and its answer not have come.
+        monkeypatch.setattr(ros_side, "ANSWER_S", 3.0)
+        with pytest.raises(RefusedError, match="no answer to the goal"):
+            await side.run("calibrate", Calibrate.Goal(), lambda _feedback: None)
+        monkeypatch.undo()
+        served = BackgroundExecutor(node)
+        while side.busy_elsewhere != "calibrate":
+            await asyncio.sleep(0.01)
+        await side.cancel("calibrate")
+        while side.busy_elsewhere:
+            await asyncio.sleep(0.01)
         return served
 
     asyncio.run(asyncio.wait_for(scene(), LONGEST_S)).destroy_node()

@@ -53,6 +53,11 @@ class ActionWatch:
         with self._lock:
             self._own.add(bytes(identity.uuid))
 
+    def disown(self, identity: Any) -> None:
+        """Tell that this console has lost sight of the goal `identity`: if it runs, it does as one of somebody else."""
+        with self._lock:
+            self._own.discard(bytes(identity.uuid))
+
     @property
     def elsewhere(self) -> bool:
         """Whether a goal runs that this console did not send."""

@@ -191,20 +191,28 @@ class RosSide:
             RefusedError: the goal was refused, ended with an error or was cancelled, with the node's sentence.
         """
         client = self._actions[name]
-        self._beginning[name] = False
+        identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
+        identity.uuid = list(uuid.uuid4().bytes)
+        if name in self.watched:
+            self.watched[name].own(identity)
         try:
-            handle = await self._begin(name, goal, on_feedback)
-        finally:
-            cancelled = self._beginning.pop(name)
-        self._goals[name] = handle
-        finished = handle.get_result_async()
-        try:
+            self._beginning[name] = False
+            try:
+                handle = await self._begin(name, goal, on_feedback, identity)
+            finally:
+                cancelled = self._beginning.pop(name, False)
+            self._goals[name] = handle
+            finished = handle.get_result_async()
             if cancelled:
                 await self.cancel(name)
             if not await _until(finished.done, timeout_s, lambda: self._server_is_gone(client)):
                 with contextlib.suppress(RefusedError):
                     await self.cancel(name)
                 raise RefusedError(f"{name}: no result: its node has gone, or it took longer than {timeout_s:g} s")
+        except RefusedError:
+            if name in self.watched:  # it may run all the same: then it must be seen, and be cancelled from here
+                self.watched[name].disown(identity)
+            raise
         finally:
             self._goals.pop(name, None)
         result = finished.result().result
@@ -212,17 +220,13 @@ class RosSide:
             raise RefusedError(f"{result.message} (error {result.error_code})")
         return result
 
-    async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
+    async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None], identity: Any) -> Any:
         """The handle of a goal that was accepted."""
         client = self._actions[name]
         if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
             raise RefusedError(f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
-        if self._beginning[name]:
+        if self._beginning.get(name):
             raise RefusedError(f"{name}: cancelled before it began; nothing has changed")
-        identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
-        identity.uuid = list(uuid.uuid4().bytes)
-        if name in self.watched:
-            self.watched[name].own(identity)
         accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
         if not await _until(accepted.done, ANSWER_S):
             raise RefusedError(f"{name}: no answer to the goal within {ANSWER_S:g} s")
