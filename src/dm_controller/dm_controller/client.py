@@ -56,6 +56,10 @@ ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus", Converge: "converge"
 _NUMBERS = itertools.count(1)
 
 
+#: `timeout_s` for nodes that the same program has only just started, s.
+STARTING_S = 60.0
+
+
 class DeformableMirrorError(Exception):
     """The suite refused or could not carry out a request.
 

@@ -37,6 +37,14 @@ class ServiceCallError(Exception):
     """A service did not answer: not there, too slow, or the wait was cancelled."""
 
 
+def _tell(node: Node, what: str, error: Exception, answer: Any) -> None:
+    """Log an exception of the body of `what`, and tell it in the answer as ErrorCode.INTERNAL if that has a place."""
+    node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
+    if hasattr(answer, "error_code"):
+        answer.error_code = 599  # ErrorCode.INTERNAL
+        answer.message = f"{type(error).__name__}: {error}"
+
+
 def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """`callback(request, response) -> response` of service `name` that answers ErrorCode.INTERNAL instead of raising.
 
@@ -47,10 +55,7 @@ def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> 
         try:
             return callback(request, response)
         except Exception as error:
-            node.get_logger().error(f"service {name}:\n{traceback.format_exc()}")
-            if hasattr(response, "error_code"):
-                response.error_code = 599  # ErrorCode.INTERNAL
-                response.message = f"{type(error).__name__}: {error}"
+            _tell(node, f"service {name}", error, response)
             return response
 
     return answer
@@ -160,11 +165,8 @@ class WorkerActionServer(ActionServer):
             with self._turn:
                 outcome, result = self._body(goal_handle)
         except Exception as error:
-            self._worker_node.get_logger().error(f"action:\n{traceback.format_exc()}")
             outcome, result = "abort", self._action_type.Result()
-            if hasattr(result, "error_code"):
-                result.error_code = 599  # ErrorCode.INTERNAL
-                result.message = f"{type(error).__name__}: {error}"
+            _tell(self._worker_node, "action", error, result)
         finally:
             with self._bookkeeping:
                 self._running -= 1

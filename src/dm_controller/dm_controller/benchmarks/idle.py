@@ -11,7 +11,7 @@ from typing import Any
 
 from dm_controller.benchmarks.timing import Effort
 from dm_controller.cli.demo import bench_config
-from dm_controller.client import DeformableMirrorClient
+from dm_controller.client import STARTING_S, DeformableMirrorClient
 from dm_controller.suite import Suite, own_domain
 
 #: Time for starts to be over, and time measured, s.
@@ -29,7 +29,7 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="dm-idle-") as folder, own_domain() as domain:
         config = bench_config(Path(folder), "prandtl_ishlinskii", 0.01, 1, 0.0)
         with Suite(config, Path(folder) / "logs", domain) as suite:
-            with DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
+            with DeformableMirrorClient(domain=domain, timeout_s=STARTING_S) as client:
                 client.wait_until_active(60.0)
             time.sleep(START_S)
             suite.check()

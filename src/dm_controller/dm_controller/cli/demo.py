@@ -36,13 +36,13 @@ def sample_map() -> Path | None:
 
 def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
     """Read a real map through an interferometer node of its own; returns the figures for JSON."""
-    from dm_controller.client import DeformableMirrorClient
+    from dm_controller.client import STARTING_S, DeformableMirrorClient
     from dm_controller.suite import Suite
 
     nodes = ("interferometer",)
     with (
         Suite({"interferometer": {}}, folder / "ingest", domain, namespace="ingest", nodes=nodes),
-        DeformableMirrorClient("ingest", domain, 60.0) as client,
+        DeformableMirrorClient("ingest", domain, STARTING_S) as client,
     ):
         answer = client.ingest(str(path.resolve()))
     console.print(
@@ -192,7 +192,7 @@ def demo(
     from dm_msgs.action import Calibrate
 
     from dm_controller.cli.calibrate import figures_of, run_calibration, show_result
-    from dm_controller.client import DeformableMirrorClient
+    from dm_controller.client import STARTING_S, DeformableMirrorClient
     from dm_controller.figures import save_sweep_figure
     from dm_controller.suite import Suite, own_domain
 
@@ -215,7 +215,10 @@ def demo(
             f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
             f"seed {seed}; logs in {os.path.relpath(folder)}"
         )
-        with Suite(config, folder, domain) as suite, DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
+        with (
+            Suite(config, folder, domain) as suite,
+            DeformableMirrorClient(domain=domain, timeout_s=STARTING_S) as client,
+        ):
             try:
                 client.wait_until_active(20.0)
                 begun = time.monotonic()

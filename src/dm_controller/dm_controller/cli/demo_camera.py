@@ -187,7 +187,7 @@ def demo_camera(
     from dm_controller.cli.calibrate import figures_of as calibration_figures
     from dm_controller.cli.calibrate import run_calibration, show_result
     from dm_controller.cli.demo import bench_config
-    from dm_controller.client import DeformableMirrorClient
+    from dm_controller.client import STARTING_S, DeformableMirrorClient
     from dm_controller.suite import Suite, own_domain
 
     started = time.monotonic()
@@ -203,7 +203,7 @@ def demo_camera(
         config["virtual_bench"]["interferometer.pixels"] = PIXELS
         with (
             Suite(config, folder / "calibration", domain) as suite,
-            DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
+            DeformableMirrorClient(domain=domain, timeout_s=STARTING_S) as client,
         ):
             try:
                 client.wait_until_active(20.0)

@@ -195,15 +195,11 @@ class RosSide:
         identity.uuid = list(uuid.uuid4().bytes)
         if name in self.watched:
             self.watched[name].own(identity)
+        self._beginning[name] = False
         try:
-            self._beginning[name] = False
-            try:
-                handle = await self._begin(name, goal, on_feedback, identity)
-            finally:
-                cancelled = self._beginning.pop(name, False)
-            self._goals[name] = handle
+            handle = self._goals[name] = await self._begin(name, goal, on_feedback, identity)
             finished = handle.get_result_async()
-            if cancelled:
+            if self._beginning.pop(name):
                 await self.cancel(name)
             if not await _until(finished.done, timeout_s, lambda: self._server_is_gone(client)):
                 with contextlib.suppress(RefusedError):
@@ -214,6 +210,7 @@ class RosSide:
                 self.watched[name].disown(identity)
             raise
         finally:
+            self._beginning.pop(name, None)
             self._goals.pop(name, None)
         result = finished.result().result
         if result.error_code != 0:
@@ -225,7 +222,7 @@ class RosSide:
         client = self._actions[name]
         if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
             raise RefusedError(f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
-        if self._beginning.get(name):
+        if self._beginning[name]:
             raise RefusedError(f"{name}: cancelled before it began; nothing has changed")
         accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
         if not await _until(accepted.done, ANSWER_S):
@@ -262,11 +259,9 @@ class RosSide:
             return
         if not await _until(asked.done, ANSWER_S):
             raise RefusedError(f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
-        if asked.result().return_code not in (
-            CancelGoal.Response.ERROR_NONE,
-            CancelGoal.Response.ERROR_GOAL_TERMINATED,
-        ):
-            raise RefusedError(f"{name}: its node does not cancel the goal (code {asked.result().return_code})")
+        code, codes = asked.result().return_code, CancelGoal.Response
+        if code not in (codes.ERROR_NONE, codes.ERROR_GOAL_TERMINATED):
+            raise RefusedError(f"{name}: its node does not cancel the goal (code {code})")
 
 
 async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[[], bool] = lambda: False) -> bool:

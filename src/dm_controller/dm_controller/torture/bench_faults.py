@@ -20,7 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.srv import Measure
 
 from dm_controller.cli.demo import bench_config
-from dm_controller.client import DeformableMirrorClient, DeformableMirrorError
+from dm_controller.client import STARTING_S, DeformableMirrorClient, DeformableMirrorError
 from dm_controller.suite import Suite
 from dm_controller.torture.driver_rig import ACTUATORS, PATIENCE_S, RigError
 from dm_controller.torture.faults import Fault, FaultRecord
@@ -47,7 +47,7 @@ class BenchRig:
     @contextmanager
     def running(self) -> Iterator[DeformableMirrorClient]:
         """All nodes, and a client of them."""
-        with DeformableMirrorClient(domain=self._domain, timeout_s=60.0) as self.client:
+        with DeformableMirrorClient(domain=self._domain, timeout_s=STARTING_S) as self.client:
             self.client.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
             self.bench.__enter__()
             try:
