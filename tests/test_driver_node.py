@@ -69,9 +69,9 @@ class Driver:
         self.diagnostics = observer.record(DiagnosticArray, "/diagnostics")
         self._publisher = observer.node.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
 
-    def command(self, signals: Any, age_s: float | None = None) -> None:
+    def command(self, signals: Any, age_s: float | None = None, if_turns: int = 0) -> None:
         wait_until(lambda: self._publisher.get_subscription_count() > 0, what="the driver's subscription")
-        message = ActuatorCommand(signals=[float(value) for value in signals])
+        message = ActuatorCommand(signals=[float(value) for value in signals], if_turns=if_turns)
         if age_s is not None:
             stamp_ns = self.observer.node.get_clock().now().nanoseconds - round(age_s * 1e9)
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
@@ -109,6 +109,22 @@ def driver(start: Start, observer: Observer, unit: Edac40TcpUnit) -> Driver:
     result = Driver(observer, unit)
     result.wait_active()
     return result
+
+
+def test_a_correction_counts_only_for_the_shape_that_it_corrects(driver: Driver) -> None:
+    def overtaken() -> bool:
+        values = {item.key: item.value for message in driver.diagnostics[-1:] for item in message.status[0].values}
+        return values.get("overtaken") == "1"
+
+    shape = np.full(37, -0.95)
+    driver.command(shape)
+    state = driver.wait_for_state(lambda state: state.sequence == 2, "the shape")
+    driver.command(-shape, if_turns=state.turns + 1)
+    wait_until(overtaken, what="a correction that was left out")
+    driver.command(shape + 0.01, if_turns=state.turns)
+    state = driver.wait_for_state(lambda state: state.sequence == 3, "the correction")
+    assert list(state.requested) == pytest.approx(list(shape + 0.01))
+    assert state.error_code == ErrorCode.OK
 
 
 def test_commands_reach_the_wire_and_the_state_tells(driver: Driver) -> None:

@@ -149,6 +149,9 @@ def test_a_held_shape_is_corrected_for_creep(observer: Observer, start: Start) -
     bench = holding(observer, start)
     assert bench.set_focus(curvature=0.03).state.creep_held
     wait_until(lambda: len(bench.commands) > 6)
+    asked, *corrected = [command.if_turns for command in bench.commands[:7]]
+    assert asked == 0
+    assert corrected == list(range(corrected[0], corrected[0] + 6))  # each counts only for the shape before it
     assert bench.surface_error(0.03) < 0.05 * bench.surface_error(0.03, bench.reached[0])
     assert bench.surface_error(0.03) < 2e-9
 

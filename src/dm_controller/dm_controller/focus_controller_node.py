@@ -291,8 +291,10 @@ class FocusControllerNode(Node):
         self._focus_state.publish(state)
         return state
 
-    def _send(self, signals: Any, request: FocusRequest | None = None, now_ns: int | None = None) -> Any:
-        command = ActuatorCommand(signals=doubles(signals))
+    def _send(
+        self, signals: Any, request: FocusRequest | None = None, now_ns: int | None = None, if_turns: int = 0
+    ) -> Any:
+        command = ActuatorCommand(signals=doubles(signals), if_turns=if_turns)
         command.header.stamp = time_message(self._now_ns() if now_ns is None else now_ns)
         self._command.publish(command)
         self._latency.sent(command)
@@ -343,7 +345,7 @@ class FocusControllerNode(Node):
             signals = self._hold.correction(self._watch.look(now), now)
             if signals is not None:
                 self._hold.sent(signals, now)
-                self._send(signals)
+                self._send(signals, if_turns=driver.turns)
 
     def _on_focus_request(self, request: FocusRequest) -> None:
         with self._turn:

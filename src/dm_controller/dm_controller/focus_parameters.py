@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from dm_controller.converge_action import CONVERGE_PARAMETERS
+from dm_controller.hold import PERIOD_S
+from dm_controller.open_loop import SETTLE_S
 from dm_runtime.parameters import Parameter
 
 PARAMETERS: Final = (
@@ -22,7 +24,7 @@ PARAMETERS: Final = (
     Parameter(
         "settle_time",
         float,
-        0.05,
+        SETTLE_S,
         "wait after the last write before a MoveFocus goal succeeds, and when a shape is to be right",
         "s",
         0.0,
@@ -62,7 +64,7 @@ PARAMETERS: Final = (
     ),
     Parameter("condition.timeout", float, 180.0, "longest wait for that degauss", "s", 0.1, 3600.0, live=True),
     Parameter("hold.enable", bool, True, "correct a shape for creep while it is held", live=True),
-    Parameter("hold.period", float, 1.0, "shortest time between two corrections", "s", 0.01, 3600.0),
+    Parameter("hold.period", float, PERIOD_S, "shortest time between two corrections", "s", 0.01, 3600.0),
     Parameter(
         "hold.tolerance",
         float,

@@ -26,6 +26,11 @@ Floats = NDArray[np.float64]
 
 #: Signals that differ less are the same command.
 SAME_SIGNAL = 1e-9
+#: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
+#: much from 0.05 to 0.5 s as from 1 to 10 s.
+PERIOD_S = 0.05
+#: A shape within its tolerance is looked at again after this share of the time since the last command.
+LOOK_SHARE = 0.1
 #: Time for the driver to report a command as its own, s; after it another publisher has overtaken it.
 CONFIRM_S = 1.0
 
@@ -38,6 +43,7 @@ class _Held:
     signals: Floats
     sent: float
     confirmed: bool = False
+    look_at: float = 0.0
 
 
 class Hold:
@@ -97,11 +103,12 @@ class Hold:
         if not values["hold.enable"]:
             self.end("hold.enable is false")
             return None
-        held.sent = min(held.sent, now)  # the clock was set back
-        period = values["hold.period"]
-        if now - held.sent < period:
+        if now < held.sent:  # the clock was set back
+            held.sent = held.look_at = now
+        if now - held.sent < values["hold.period"] or now < held.look_at:
             return None
         if held.loop.drift(look.state, now, held.effective) <= values["hold.tolerance"]:
+            held.look_at = now + LOOK_SHARE * (now - held.sent)
             return None
         # The interval to come is about as long as the one that ends; the shape is to be right in its middle.
         ahead = 0.5 * (now - held.sent)

@@ -24,6 +24,8 @@ from dm_controller.target import FocusTarget
 
 Floats = NDArray[np.float64]
 
+#: When a shape is to be right unless configured otherwise, s after the way.
+SETTLE_S = 0.05
 #: Draws for the 95 % quantile of the largest of many errors.
 DRAWS = 4000
 #: Shortest time after a move at which a calibration sees the surface, s: one map takes about that long. Creep of less

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dm_calibration.memory.law import CREEP_TIMES, MemoryLaw
-from dm_controller.hold import Hold
+from dm_controller.hold import PERIOD_S, Hold
 from dm_controller.memory_watch import Look
 from dm_controller.model import CalibratedMirror
 from dm_controller.open_loop import MemoryFigures, OpenLoop
@@ -54,6 +54,16 @@ def test_corrections_come_ever_more_rarely_and_keep_the_shape() -> None:
     assert times[-1] - times[-2] > 20 * (times[1] - times[0])
     assert shape.look.state is not None
     assert shape.loop.drift(shape.look.state, 3600.0, shape.effective) < 4e-10
+
+
+def test_a_shape_is_right_within_its_first_second() -> None:
+    shape = Shape(**{"hold.period": PERIOD_S})
+    left_alone = Shape(**{"hold.enable": False}).look.state
+    assert left_alone is not None and shape.look.state is not None
+    for now in np.arange(PERIOD_S, 1.0, PERIOD_S):
+        shape.correct(float(now))
+    assert shape.loop.drift(shape.look.state, 1.0, shape.effective) < 4e-10
+    assert shape.loop.drift(left_alone, 1.0, shape.effective) > 3e-9
 
 
 def test_a_correction_is_no_larger_than_allowed() -> None:

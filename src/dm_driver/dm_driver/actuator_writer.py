@@ -187,6 +187,17 @@ class ActuatorWriter:
         """
         return self._submit(Move(Kind.COMMAND, [shape], shape))
 
+    def correct(self, shape: Shape, turns: int) -> Move | None:
+        """As `command`, but only while the mirror rests after so many `turns`.
+
+        Returns None, and does nothing, when something else was asked for since: a correction must not undo it.
+        """
+        with self._change:
+            if self._mailbox is not None or self._current is not None or self._turns != turns:
+                self.counters.overtaken += 1
+                return None
+            return self.command(shape)
+
     def degauss(self, amplitude: float, steps: int, end: Shape) -> Move:
         """Run the decaying cycle about mid range, then go to `end` (checked, as for `command`).
 

@@ -29,6 +29,7 @@ def driver_health(writer: ActuatorWriter | None, complaint: Complaint, refused: 
         "frames written": counters.frames,
         "link losses": counters.link_losses,
         "reconnects": counters.reconnects,
+        "overtaken": counters.overtaken,
         "overruns": counters.overruns,
         "history known": state.history_known,
         "moving": state.moving.value if state.moving is not None else "no",

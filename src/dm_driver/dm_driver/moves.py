@@ -67,6 +67,7 @@ class Counters:
     frames: int = 0
     link_losses: int = 0
     reconnects: int = 0
+    overtaken: int = 0  #: corrections that were left out, since something else was asked for meanwhile
     overruns: int = 0  #: writes of a ramp that came more than one step interval late
 
 

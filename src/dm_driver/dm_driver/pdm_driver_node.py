@@ -186,11 +186,12 @@ class PdmDriver(LifecycleNode):
     # Commands
 
     def _on_command(self, message: ActuatorCommand) -> None:
-        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
+        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move | None:
             stamp = Time.from_msg(message.header.stamp, self.get_clock().clock_type)
             if stamp.nanoseconds:
                 configuration.limiter.check_age((self.get_clock().now() - stamp).nanoseconds * 1e-9)
-            return writer.command(configuration.limiter.check_shape(message.signals))
+            shape = configuration.limiter.check_shape(message.signals)
+            return writer.correct(shape, message.if_turns) if message.if_turns else writer.command(shape)
 
         self._attempt("actuator_command", carry_out)
 

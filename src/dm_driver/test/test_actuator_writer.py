@@ -131,6 +131,24 @@ def test_a_newer_command_takes_over_in_the_middle_of_a_ramp(unit: Edac40TcpUnit)
     assert on_wire[-1] == pytest.approx(-1.0, abs=CODE)
 
 
+def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=10.0) as (writer, _told):
+        assert writer.command(shape(-0.5)).wait(5) is Outcome.REACHED
+        turns = writer.state().turns
+        correction = writer.correct(shape(-0.49), turns)
+        assert correction is not None and correction.wait(5) is Outcome.REACHED
+        assert writer.correct(shape(-0.48), turns) is None  # decided before the last one stood
+
+        move = writer.command(shape(0.5))
+        assert writer.correct(shape(-0.48), turns + 1) is None  # decided before the move began
+        assert move.wait(5) is Outcome.REACHED
+        degauss = writer.degauss(0.0, 6, shape(0.0))
+        assert writer.correct(shape(0.49), turns + 2) is None
+        assert degauss.wait(20) is Outcome.REACHED
+        assert writer.counters.overtaken == 3
+        assert writer.state().requested == pytest.approx(shape(0.0))
+
+
 def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac40TcpUnit) -> None:
     generator = np.random.default_rng(7)
     limiter = SafetyLimiter(Limits(37, -1, 1, 1.0, A, B))

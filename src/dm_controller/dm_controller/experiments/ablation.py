@@ -19,7 +19,8 @@ from dm_controller.experiments.ablation_models import MODELS, Variant, make_vari
 from dm_controller.experiments.compare import peak_to_valley
 from dm_controller.experiments.true_surface import TrueSurface
 from dm_controller.experiments.twin_bench import Floats, TwinBench, TwinConfig, plan_steps
-from dm_controller.open_loop import Move
+from dm_controller.hold import PERIOD_S
+from dm_controller.open_loop import SETTLE_S, Move
 from dm_controller.recipes import find
 from dm_controller.target import FocusTarget
 
@@ -36,11 +37,9 @@ DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
 CURVATURE_MAX = 0.05
 #: The longest hold, from when its drift counts, and the curvature, s, s, 1/m.
 HOLD_S, HOLD_FROM_S, HOLD_CURVATURE = 3600.0, 1.0, 0.03
-#: A shape is to be right this long after the move, s.
-AHEAD_S = 0.1
-#: Shortest time between two corrections of a held shape, s, and how much longer each next one waits: creep slows down
-#: like that, and an experiment need not correct more often than it matters.
-CORRECTION_S, CORRECTION_GROWTH = 0.1, 0.07
+#: Share of the time since the move that the next correction of a held shape waits: creep slows down like that, and an
+#: experiment need not correct more often than it matters. The first ones come as the controller's do.
+CORRECTION_GROWTH = 0.07
 
 
 @dataclass(frozen=True)
@@ -192,18 +191,18 @@ class _Mirror:
             self.bench.degauss()
         self._follow()
         tracker, loop = self._tracker, self._variant.loop
-        move = loop.plan(target, tracker.state, self.bench.time, tracker.known, effective, AHEAD_S, error)
+        move = loop.plan(target, tracker.state, self.bench.time, tracker.known, effective, SETTLE_S, error)
         self.bench.apply(move.plan.signals)
         return move
 
     def hold(self, move: Move, dwell: float) -> None:
         """Let `dwell` s pass since the move, correcting what creep does."""
         began = self.bench.time
-        passed = CORRECTION_S
+        passed = PERIOD_S
         while self._variant.holds and passed < dwell:
             self.bench.time = began + passed
             self._follow()
-            wait = min(max(CORRECTION_S, CORRECTION_GROWTH * passed), dwell - passed)
+            wait = min(max(PERIOD_S, CORRECTION_GROWTH * passed), dwell - passed)
             assert self._tracker.state is not None
             self.bench.apply(
                 self._variant.loop.hold(self._tracker.state, self.bench.time, move.effective, 0.5 * wait)
