@@ -48,6 +48,8 @@ from dm_runtime.worker import never_silent
 #: Time after a command until `focus_state` tells of it, s. Whoever waits for the command wakes up meanwhile: it may
 #: have to on this very core (measured: 0.2 ms sooner).
 TELL_S = 1e-3
+#: How often a held shape is looked after while no correction can be due sooner, s.
+SELDOM_S = 1.0
 #: How often it is looked whether the driver took the last command, s.
 LOOK_S = 0.5
 
@@ -97,7 +99,8 @@ class FocusControllerNode(Node):
         self.create_subscription(FocusRequest, "focus_request", self._on_focus_request, qos.COMMAND)
         for kind, name, answer in ((SetFocus, "set_focus", self._on_set_focus), (Flatten, "flatten", self._on_flatten)):
             self.create_service(kind, name, never_silent(self, name, answer), qos_profile=qos.SERVICE)
-        self.create_timer(self._values["hold.period"], self._correct_held_shape)
+        self._often = self.create_timer(self._values["hold.period"], self._look_after_shape)
+        self.create_timer(SELDOM_S, self._look_after_shape)
         self.create_timer(LOOK_S, self._look_for_untaken, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         self._publish_capabilities()
@@ -277,6 +280,8 @@ class FocusControllerNode(Node):
         stamp = self._send(move.signals, request, now_ns)
         self._asked = move.signals
         self._hold.begin(self._use.loop, move.effective, move.signals, 1e-9 * now_ns, decision.look.known)
+        if self._hold.active and self._often.is_canceled():
+            self._often.reset()
         return stamp
 
     def _condition(self, request: FocusRequest, decision: Decision) -> Waiting:
@@ -333,19 +338,26 @@ class FocusControllerNode(Node):
             else:  # a correction, or the end of a move
                 self.get_logger().warning(str(refusal))
 
-    def _correct_held_shape(self) -> None:
+    def _look_after_shape(self) -> None:
         with self._turn:
-            driver = self._driver.latest
-            if not self._hold.active or driver is None or driver.moving:
-                return
-            if self._converge.busy:
-                self._hold.end("a closed loop is running")
-                return
             now = self._now()
-            signals = self._hold.correction(self._watch.look(now), now)
-            if signals is not None:
-                self._hold.sent(signals, now)
-                self._send(signals, if_turns=driver.turns)
+            self._correct_held_shape(now)
+            if self._hold.next_look - now > SELDOM_S:
+                self._often.cancel()
+            elif self._often.is_canceled():
+                self._often.reset()
+
+    def _correct_held_shape(self, now: float) -> None:
+        driver = self._driver.latest
+        if not self._hold.active or driver is None or driver.moving:
+            return
+        if self._converge.busy:
+            self._hold.end("a closed loop is running")
+            return
+        signals = self._hold.correction(self._watch.look(now), now)
+        if signals is not None:
+            self._hold.sent(signals, now)
+            self._send(signals, if_turns=driver.turns)
 
     def _on_focus_request(self, request: FocusRequest) -> None:
         with self._turn:

@@ -11,6 +11,7 @@ state says nothing of where the shape stands.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +29,7 @@ Floats = NDArray[np.float64]
 SAME_SIGNAL = 1e-9
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
 #: much from 0.05 to 0.5 s as from 1 to 10 s.
-PERIOD_S = 0.05
+PERIOD_S = 0.02
 #: A shape within its tolerance is looked at again after this share of the time since the last command.
 LOOK_SHARE = 0.1
 #: Time for the driver to report a command as its own, s; after it another publisher has overtaken it.
@@ -66,6 +67,12 @@ class Hold:
     @property
     def active(self) -> bool:
         return self._held is not None
+
+    @property
+    def next_look(self) -> float:
+        """When a correction can be due, s; infinite without a shape to hold."""
+        held = self._held
+        return max(held.sent + self._values["hold.period"], held.look_at) if held is not None else math.inf
 
     def would_keep(self, law: MemoryLaw) -> bool:
         """Whether a shape under `law` will be held."""
@@ -105,7 +112,7 @@ class Hold:
             return None
         if now < held.sent:  # the clock was set back
             held.sent = held.look_at = now
-        if now - held.sent < values["hold.period"] or now < held.look_at:
+        if now < self.next_look:
             return None
         if held.loop.drift(look.state, now, held.effective) <= values["hold.tolerance"]:
             held.look_at = now + LOOK_SHARE * (now - held.sent)
