@@ -64,8 +64,8 @@ def _variant(name: str, bench: TwinBench, calibration: Calibration, memory: Memo
     fit = fit_remembering(calibration.maps, memory, FitOptions(), bench.mirror)
     mirror = CalibratedMirror(influence_model(fit, calibration.aperture_radius), bench.limits)
     if memory is None:
-        return Variant(name, OpenLoop(mirror), holds)
+        return Variant(name, OpenLoop(mirror, slew_rate=bench.slew_rate), holds)
     # A law without creep was not what the held-out maps tested: then its influence function's own figure counts.
     held_out = memory.held_out_max_zernike if memory.law.creep_rate else fit.held_out_max_zernike
     figures = MemoryFigures(memory.law, memory.zernike_sigma, held_out, memory.unknown_sigma)
-    return Variant(name, OpenLoop(mirror, figures), holds)
+    return Variant(name, OpenLoop(mirror, figures, bench.slew_rate), holds)

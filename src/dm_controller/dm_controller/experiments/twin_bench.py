@@ -93,6 +93,8 @@ class TwinBench:
         self._written: Floats = self._drive.signals()
         self._turns = self._degausses = 0
         self._turned_at: Floats | None = None
+        #: Of the signals, 1/s.
+        self.slew_rate = self._limiter.limits.slew_rate
         self.time = self._moved = 0.0
         self.maps = 0
         self.reports: list[Applied] = []
@@ -124,12 +126,7 @@ class TwinBench:
         """Wipe the hysteresis memory as the driver does, and end at mid range."""
         rest = self.mirror.rest
         points = degauss_waypoints(len(rest), float(rest[0]), 1.0, self.config.degauss_steps, rest)
-        told = -REPORT_INTERVAL_S
-        for shape in list(self._limiter.path(self._written, points)):
-            self._write([shape])
-            if self.time - told >= REPORT_INTERVAL_S:
-                told = self.time
-                self._report(known=False)
+        self._follow(list(self._limiter.path(self._written, points)), known=False)
         self._turns, self._degausses = self._turns + 1, self._degausses + 1
         self._turned_at = self._drive.signals()
         self._report()
@@ -143,7 +140,7 @@ class TwinBench:
         target = self._limiter.check_shape(signals)
         if not np.array_equal(target, self._written):
             self._turns, self._turned_at = self._turns + 1, self._drive.signals()
-        self._write(list(self._limiter.ramp(self._written, target)))
+        self._follow(list(self._limiter.ramp(self._written, target)))
         self._report()
         return self._drive.signals()
 
@@ -153,23 +150,29 @@ class TwinBench:
         self._written = self._drive.signals()
         self._piezo.apply(self._written, self.time)
         self.time += off
+        self._moved = self.time
         self._turns = self._degausses = 0
         self._turned_at = None
         self._report()
 
-    def _report(self, known: bool = True) -> None:
+    def _report(self, known: bool = True, moving: bool = False) -> None:
         known = known and self._degausses > 0
         self.reports.append(
-            Applied(self.time, self._drive.signals(), self._turns, self._turned_at, self._degausses, known)
+            Applied(self._moved, self._drive.signals(), self._turns, self._turned_at, self._degausses, known, moving)
         )
 
-    def _write(self, shapes: list[Floats]) -> None:
+    def _follow(self, shapes: list[Floats], known: bool = True) -> None:
+        """Write a way, reporting as often as the driver does."""
+        told = -REPORT_INTERVAL_S
         for shape in shapes:
             self._drive.take_edac40(EdacFrame(EDAC40_VALUE, self._channels, self._scale.codes(shape)))
             self._piezo.apply(self._drive.signals(), self.time)
             self._moved = self.time
             self.time += self._limiter.pause_after(self._written, shape)
             self._written = shape
+            if self._moved - told >= REPORT_INTERVAL_S:
+                told = self._moved
+                self._report(known, moving=True)
 
     def settle(self, dwell: float = 0.0) -> bool:
         """Let the settle time and `dwell` s pass."""
