@@ -30,7 +30,7 @@ SAME_SIGNAL = 1e-9
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
 #: much from 0.05 to 0.5 s as from 1 to 10 s.
 PERIOD_S = 0.02
-#: A shape within its tolerance is looked at again after this share of the time since the last command.
+#: A shape that needs no correction is looked at again after this share of the time since the last command.
 LOOK_SHARE = 0.1
 #: Time for the driver to report a command as its own, s; after it another publisher has overtaken it.
 CONFIRM_S = 1.0
@@ -43,8 +43,8 @@ class _Held:
     known: bool
     signals: Floats
     sent: float
+    looked: float
     confirmed: bool = False
-    look_at: float = 0.0
 
 
 class Hold:
@@ -72,7 +72,9 @@ class Hold:
     def next_look(self) -> float:
         """When a correction can be due, s; infinite without a shape to hold."""
         held = self._held
-        return max(held.sent + self._values["hold.period"], held.look_at) if held is not None else math.inf
+        if held is None:
+            return math.inf
+        return max(held.sent + self._values["hold.period"], held.looked + LOOK_SHARE * (held.looked - held.sent))
 
     def would_keep(self, law: MemoryLaw) -> bool:
         """Whether a shape under `law` will be held."""
@@ -82,7 +84,7 @@ class Hold:
         """Hold `effective` (N,) after the command `signals` (N,) sent at `now` (s)."""
         self._held = None
         if self.would_keep(loop.law):
-            self._held = _Held(loop, effective, known, signals, now)
+            self._held = _Held(loop, effective, known, signals, now, now)
 
     def end(self, why: str) -> None:
         """Leave the shape as it stands."""
@@ -110,12 +112,11 @@ class Hold:
         if not values["hold.enable"]:
             self.end("hold.enable is false")
             return None
-        if now < held.sent:  # the clock was set back
-            held.sent = held.look_at = now
+        held.sent, held.looked = min(held.sent, now), min(held.looked, now)  # the clock was set back
         if now < self.next_look:
             return None
+        held.looked = now
         if held.loop.drift(look.state, now, held.effective) <= values["hold.tolerance"]:
-            held.look_at = now + LOOK_SHARE * (now - held.sent)
             return None
         # The interval to come is about as long as the one that ends; the shape is to be right in its middle.
         ahead = 0.5 * (now - held.sent)

@@ -118,6 +118,18 @@ def test_a_mirror_without_creep_is_not_held() -> None:
     assert not Shape(creep_rate=0.0).hold.active
 
 
+def test_it_is_looked_at_ever_more_rarely() -> None:
+    shape = Shape(**{"hold.period": PERIOD_S, "hold.tolerance": 1e-6})  # no correction is ever due
+    assert shape.hold.next_look == PERIOD_S
+    for now in (1.0, 10.0, 100.0):
+        assert shape.correct(now) is None
+        np.testing.assert_allclose(shape.hold.next_look, 1.1 * now)
+    assert shape.correct(50.0) is None  # the clock was set back
+    assert shape.hold.next_look < 56.0
+    shape.hold.end("a test says so")
+    assert shape.hold.next_look == np.inf
+
+
 def test_a_clock_that_is_set_back_stops_nothing_for_long() -> None:
     shape = Shape()
     assert shape.correct(1e6) is not None
