@@ -127,7 +127,7 @@ PARSED = {
     "./dm compare --plant preisach --seed 5": _LONG + "test_compare.py runs its parts",
     "./dm compare --plant preisach --seed 5 --json runs/compare.json": _LONG + "test_compare.py runs its parts",
     "./dm compare --history --plant all": _LONG + "test_ablation.py runs its parts",
-    "./dm compare --history --plant preisach --seed 41 --seed 42 --seed 43": _LONG + "test_ablation.py runs its parts",
+    "./dm compare --history --plant all --seed 51 --seed 52 --seed 53": _LONG + "test_ablation.py runs its parts",
     "./dm bench": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm bench --json runs/bench.json --plot runs/growth.png": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm bench --only focus": _LONG + "test_benchmark_ratios.py runs its jobs",
