@@ -279,9 +279,9 @@ class FocusControllerNode(Node):
         move = decision.move
         stamp = self._send(move.signals, request, now_ns)
         self._asked = move.signals
-        self._hold.begin(self._use.loop, move.effective, move.signals, 1e-9 * now_ns, decision.look.known)
-        if self._hold.active and self._often.is_canceled():
-            self._often.reset()
+        now = 1e-9 * now_ns
+        self._hold.begin(self._use.loop, move.effective, move.signals, now, decision.look.known)
+        self._pace_looks(now)
         return stamp
 
     def _condition(self, request: FocusRequest, decision: Decision) -> Waiting:
@@ -342,10 +342,14 @@ class FocusControllerNode(Node):
         with self._turn:
             now = self._now()
             self._correct_held_shape(now)
-            if self._hold.next_look - now > SELDOM_S:
-                self._often.cancel()
-            elif self._often.is_canceled():
-                self._often.reset()
+            self._pace_looks(now)
+
+    def _pace_looks(self, now: float) -> None:
+        """Look often only while a correction can be due soon."""
+        if self._hold.next_look - now > SELDOM_S:
+            self._often.cancel()
+        elif self._often.is_canceled():
+            self._often.reset()
 
     def _correct_held_shape(self, now: float) -> None:
         driver = self._driver.latest

@@ -15,7 +15,7 @@ from dm_controller.benchmarks.scaling import ACTUATORS
 from dm_controller.benchmarks.timing import Effort, medians
 from dm_controller.inverse import invert
 from dm_controller.model import CalibratedMirror
-from dm_controller.open_loop import OpenLoop
+from dm_controller.open_loop import SETTLE_S, OpenLoop
 from dm_controller.prepared_inverse import PreparedInverse
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget
@@ -24,8 +24,6 @@ Floats = NDArray[np.float64]
 
 #: Moves that the mirror has behind it, and s after its last at which it is asked.
 MOVES, ASKED_S = 12, 10.0
-#: s after the move at which the shape is to be right.
-AHEAD_S = 0.05
 REACH = 0.03  # 1/m
 #: Signals stay within the limits here, so that no branch is left out or taken in all.
 SWING, AIM = 0.7, 0.6
@@ -68,19 +66,19 @@ def _law(law: MemoryLaw, mirror: CalibratedMirror, effort: Effort, generator: np
     gain = np.linalg.pinv(model.influence_zernike[3:])
     wanted = FocusTarget(REACH).coefficients(model.aperture_radius)[3:]
     jobs = {
-        "ms": lambda: invert(law, at, next(aims), -1.0, 1.0, AHEAD_S),
-        "prepared_ms": lambda: ready.invert(asked, next(aims), AHEAD_S),
+        "ms": lambda: invert(law, at, next(aims), -1.0, 1.0, SETTLE_S),
+        "prepared_ms": lambda: ready.invert(asked, next(aims), SETTLE_S),
         "prepare_ms": lambda: PreparedInverse(law, state, -1.0, 1.0),
-        "plan_ms": lambda: cold.plan(FocusTarget(next(curvatures)), state, asked, ahead=AHEAD_S).signals,
-        "plan_prepared_ms": lambda: warm.plan(FocusTarget(next(curvatures)), state, asked, ahead=AHEAD_S).signals,
+        "plan_ms": lambda: cold.plan(FocusTarget(next(curvatures)), state, asked, ahead=SETTLE_S).signals,
+        "plan_prepared_ms": lambda: warm.plan(FocusTarget(next(curvatures)), state, asked, ahead=SETTLE_S).signals,
         "linear_ms": lambda: np.clip(gain @ wanted, -1.0, 1.0),
     }
     result = {name: 1e3 * seconds for name, seconds in medians(jobs, 5 * effort.rounds).items()}
     aim = next(aims)
-    prepared = ready.invert(asked, aim, AHEAD_S)
-    difference = 0.0 if prepared is None else np.abs(prepared - invert(law, at, aim, -1.0, 1.0, AHEAD_S).signals).max()
+    prepared = ready.invert(asked, aim, SETTLE_S)
+    difference = 0.0 if prepared is None else np.abs(prepared - invert(law, at, aim, -1.0, 1.0, SETTLE_S).signals).max()
     reached = law.effective(
-        law.advance(law.move(at, invert(law, at, aim, -1.0, 1.0, AHEAD_S).signals, asked), asked + AHEAD_S)
+        law.advance(law.move(at, invert(law, at, aim, -1.0, 1.0, SETTLE_S).signals, asked), asked + SETTLE_S)
     )
     return result | {"worst_signal": float(difference), "worst_effective": float(np.abs(reached - aim).max())}
 
@@ -92,6 +90,6 @@ def _growth(
     for name, law in laws.items():
         at = law.advance(_state(law, actuators, generator), MOVES + ASKED_S)
         aim = generator.uniform(-AIM, AIM, actuators)
-        job = partial(invert, law, at, aim, -1.0, 1.0, AHEAD_S)
+        job = partial(invert, law, at, aim, -1.0, 1.0, SETTLE_S)
         entry[name] = 1e3 * medians({"x": job}, effort.rounds)["x"]
     return entry
