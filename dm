@@ -55,7 +55,6 @@ On the twin, with figures
 
   doctor     say what is missing or wrong, and how to cure it
   security   least-privilege policies of every node for SROS 2, written or checked
-  audit      pins of the dependencies, and known vulnerabilities
   exec       run any command inside the environment: ./dm exec python my_script.py
 
 Every command has --help, and --json FILE where it yields figures. Set-up runs by itself when it is needed.
@@ -302,12 +301,18 @@ def run_environment() -> dict[str, str]:
         environment[name] = os.pathsep.join([*added, *present])
     # Nodes of a bench talk on this machine only unless the user opens it.
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    profile = ROOT / "src" / "dm_controller" / "config" / "fastdds.xml"
+    profile = ROOT / "src" / "dm_bringup" / "config" / "fastdds.xml"
     environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
     environment.setdefault("PYTHONUNBUFFERED", "1")
     # Matrix products here take a millisecond; the threads of several nodes would fight over the cores for longer.
     environment.setdefault("OPENBLAS_NUM_THREADS", "1")
     environment["DM_ROOT"] = str(ROOT)
+    # Studies and fault injection are not installed: they are used from the checkout.
+    present = environment.get("PYTHONPATH", "").split(os.pathsep)
+    checkout = [str(ROOT), str(ROOT / "tests")]
+    environment["PYTHONPATH"] = os.pathsep.join(
+        [*checkout, *(path for path in present if path and path not in checkout)]
+    )
     return environment
 
 
@@ -327,7 +332,7 @@ def main(arguments: list[str]) -> int:
     if COMPLETION in os.environ:
         if not (environment_is_ready() and workspace_is_ready()):
             return 0  # no set-up at the press of a Tab key
-        return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_controller.cli"], run_environment())
+        return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_tools"], run_environment())
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
         return 0 if arguments else 2
@@ -355,7 +360,7 @@ def main(arguments: list[str]) -> int:
             say(f"./dm exec: no command named {rest[0]!r} in the environment")
             return 127
         os.execve(target, rest, environment)
-    return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_controller.cli", command, *rest], environment)
+    return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_tools", command, *rest], environment)
 
 
 if __name__ == "__main__":

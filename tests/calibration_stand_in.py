@@ -10,8 +10,8 @@ import numpy as np
 from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import Degauss, Measure, SetSignals
 
-from dm_calibration.influence.mirror import Mirror
-from dm_runtime import qos
+from dm_common.mirror import Mirror
+from dm_common.ros import qos
 from linear_mirror import RADIUS, LinearMirror
 
 

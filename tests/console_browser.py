@@ -21,7 +21,7 @@ from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from dm_controller.cli.demo import free_ports
+from dm_tools.demo.demo import free_ports
 from support import wait_until
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -39,7 +39,7 @@ def served(domain: int, folder: Path) -> Iterator[str]:
     address = f"http://127.0.0.1:{port}/"
     with (folder / "console.log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "dm_controller.cli", "console", "--port", str(port)],
+            [sys.executable, "-m", "dm_tools.cli", "console", "--port", str(port)],
             stdout=log,
             stderr=subprocess.STDOUT,
             env=outside_pytest() | {"ROS_DOMAIN_ID": str(domain)},

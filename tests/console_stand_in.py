@@ -11,11 +11,11 @@ from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, Mi
 from dm_msgs.srv import ListCalibrations, SetFocus, SetSignals
 from numpy.typing import NDArray
 
-from dm_calibration.optics.sampling import edge_clustered_points
-from dm_calibration.optics.zernike import basis
-from dm_controller.console.status import NODES
-from dm_driver.geometry import neighbour_pairs
-from dm_runtime import qos
+from dm_common.geometry import neighbour_pairs
+from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.zernike import basis
+from dm_common.ros import qos
+from dm_tools.console.status import NODES
 
 RADIUS = 8e-3
 

@@ -11,11 +11,12 @@ from dm_msgs.msg import ActuatorState, Calibration, ErrorCode, FocusRequest, Mir
 from dm_msgs.srv import Degauss, Measure, SetSignals
 from rclpy.node import Node
 
-from dm_controller.converge_action import CONVERGE_PARAMETERS, ConvergeAction
-from dm_controller.conversions import doubles, target_of
+from dm_common.messages import doubles
+from dm_common.ros import qos
+from dm_common.ros.parameters import declare
+from dm_controller.converge.converge_action import CONVERGE_PARAMETERS, ConvergeAction
+from dm_controller.conversions import target_of
 from dm_controller.target import FocusTarget
-from dm_runtime import qos
-from dm_runtime.parameters import declare
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 X, Y = hexagon()

@@ -107,7 +107,7 @@ _LONG = "takes minutes; "
 PARSED = {
     "./dm demo": _LONG + "test_end_to_end.py runs it",
     "./dm demo --camera": _LONG + "its parts run in test_autofocus_node.py",
-    "./dm demo --config src/dm_controller/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
+    "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
     "./dm test": "would run this test again",
     "./dm calibrate": _LONG + "test_end_to_end.py runs the plan",
     "./dm calibrate --fresh": _LONG + "test_end_to_end.py runs the plan",
@@ -137,7 +137,7 @@ PARSED = {
     "./dm paper --out runs/paper": _LONG + "test_paper.py runs it",
     "./dm paper --out runs/paper --json runs/paper.json": _LONG + "test_paper.py runs it",
     "./dm doctor --config my_bench.yaml": "must complain while the scene runs; test_doctor.py runs it",
-    "./dm exec python -m dm_driver.virtual.plot --output twin.png": "draws for a minute",
+    "./dm exec python -m dm_simulation.plot --output twin.png": "draws for a minute",
     "./dm exec python -m pytest -q src/dm_driver/test/test_electronics_contract.py": "is a test of its own",
 }
 #: Need another machine, its package manager or the network; what is named in them is checked by hand.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import (
     ActuatorCommand,
-    ActuatorMemory,
+    ActuatorHysteresis,
     ActuatorState,
     Calibration,
     Capabilities,
@@ -22,11 +22,11 @@ from dm_msgs.msg import (
 from dm_msgs.srv import Degauss, SetFocus
 from numpy.typing import NDArray
 
-from dm_calibration.calibration_messages import doubles, recipe_book_message, time_message
-from dm_calibration.memory.law import CREEP_TIMES, MemoryLaw, MemoryState
-from dm_calibration.memory.recipes import Recipe, RecipeBook
-from dm_runtime import qos
-from dm_runtime.worker import WorkerService
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
+from dm_common.messages import doubles, recipe_book_message, time_message
+from dm_common.recipes import Recipe, RecipeBook
+from dm_common.ros import qos
+from dm_common.ros.worker import WorkerService
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from support import NodeProcess, Observer, wait_until
 
@@ -136,17 +136,17 @@ class Bench:
         )
 
 
-def make_law(creep_rate: float = 0.01) -> MemoryLaw:
+def make_law(creep_rate: float = 0.01) -> HysteresisModel:
     """Ten per cent of hysteresis, and creep."""
     radius = np.array([0.0, 0.2, 0.5])
     weight = np.array([[0.8], [0.1], [0.1]])
     none = np.zeros(0)
-    law = MemoryLaw(radius, weight, none, 0.0, creep_rate, CREEP_TIMES)
+    law = HysteresisModel(radius, weight, none, 0.0, creep_rate, CREEP_TIMES)
     return law.scaled(2.0 / law.span())
 
 
-def memory_message(law: MemoryLaw) -> ActuatorMemory:
-    return ActuatorMemory(
+def hysteresis_message(law: HysteresisModel) -> ActuatorHysteresis:
+    return ActuatorHysteresis(
         law="known",
         play_radius=doubles(law.play_radius),
         powers=law.play_weight.shape[1],
@@ -164,10 +164,10 @@ def recipe(curvature: float, effective: NDArray[np.float64]) -> Recipe:
     return Recipe(curvature, 0.0, effective, effective, max_zernike=5e-10, rms=2e-9, maps=4)
 
 
-def remembering_calibration(law: MemoryLaw, recipes: tuple[Recipe, ...] = (), **fields: Any) -> Calibration:
+def remembering_calibration(law: HysteresisModel, recipes: tuple[Recipe, ...] = (), **fields: Any) -> Calibration:
     """With the memory `law`, and `recipes` that begin with a degauss of 60 half-swings."""
     book = recipe_book_message(RecipeBook(recipes, 60, 1e-10, 0))
-    return calibration(memory=memory_message(law), recipes=book, **fields)
+    return calibration(hysteresis=hysteresis_message(law), recipes=book, **fields)
 
 
 class RememberingBench(Bench):
@@ -180,7 +180,7 @@ class RememberingBench(Bench):
         controller: under test, where it is to be stopped.
     """
 
-    def __init__(self, observer: Observer, law: MemoryLaw | None = None) -> None:
+    def __init__(self, observer: Observer, law: HysteresisModel | None = None) -> None:
         super().__init__(observer)
         self.law = law or make_law()
         self.mirror = self.law.demagnetised(37, self._now())
@@ -189,7 +189,7 @@ class RememberingBench(Bench):
         self.degauss_may_end.set()
         self.begun: list[int] = []
         self.controller: NodeProcess | None = None
-        self.reached: list[MemoryState] = []
+        self.reached: list[HysteresisState] = []
         self.other = observer.node.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
         WorkerService(observer.node, Degauss, "degauss", self._on_degauss)
 
@@ -233,7 +233,7 @@ class RememberingBench(Bench):
         self.other.publish(ActuatorCommand(signals=doubles(signals)))
         wait_until(lambda: len(self.commands) > count)
 
-    def surface_error(self, curvature: float, state: MemoryState | None = None, age: float | None = None) -> float:
+    def surface_error(self, curvature: float, state: HysteresisState | None = None, age: float | None = None) -> float:
         """Largest coefficient error beyond tilt, m.
 
         Args:

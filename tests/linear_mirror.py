@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import kei
 
-from dm_calibration.influence.mirror import NEIGHBOUR_REACH, Mirror
-from dm_calibration.optics.sampling import SamplePoints, edge_clustered_points
-from dm_calibration.optics.zernike import basis
+from dm_common.mirror import NEIGHBOUR_REACH, Mirror
+from dm_common.optics.sampling import SamplePoints, edge_clustered_points
+from dm_common.optics.zernike import basis
 
 if TYPE_CHECKING:
-    from dm_controller.model import InfluenceModel
+    from dm_controller.mirror_model import InfluenceModel
 
 Floats = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ class LinearMirror:
     def model(self, held_out: float = 1e-10) -> InfluenceModel:
         """What a perfect calibration would say of this mirror, with a held-out error (m) of choice."""
         # Here, because the tests of dm_calibration use this module too, and that package must do without dm_controller.
-        from dm_controller.model import InfluenceModel
+        from dm_controller.mirror_model import InfluenceModel
 
         return InfluenceModel(
             aperture_radius=RADIUS,

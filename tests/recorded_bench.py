@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dm_calibration.influence.mirror import Mirror
-from dm_calibration.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.procedure import (
-    MAP_REJECTED,
-    Bench,
-    Measurement,
-    MeasurementError,
-    Outcome,
-    Procedure,
-    ProcedureOptions,
-    Progress,
-)
-from dm_calibration.recorded_run import Move, RecordedRun
-from remembering_mirror import MIRROR, Floats, RememberingBench
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions, Progress
+from dm_calibration.procedure.recorded_run import Move, RecordedRun
+from dm_common.measurement import MAP_REJECTED, Bench, Measurement, MeasurementError
+from dm_common.mirror import Mirror
+from hysteretic_mirror import MIRROR, Floats, RememberingBench
 
 
 class RecordingBench:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.applied_history import Standing
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.memory.law import MemoryLaw
-from dm_calibration.memory.memory_fit import MemoryFit
-from dm_calibration.plan import PlanKind, make_plan
-from dm_calibration.procedure import Measurement, Procedure
+from dm_calibration.procedure.applied_history import Standing
+from dm_calibration.procedure.plan import PlanKind, make_plan
+from dm_calibration.procedure.procedure import Procedure
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.measurement import Measurement
 from linear_mirror import RADIUS, LinearMirror, make_mirror
 
 Floats = NDArray[np.float64]
@@ -22,7 +23,7 @@ NOISE = 0.5e-9
 
 
 class SteadyMirror:
-    """Implements dm_calibration.procedure.Bench."""
+    """Implements dm_calibration.procedure.procedure.Bench."""
 
     def __init__(self, seed: int = 1) -> None:
         self.mirror = make_mirror(RINGS)
@@ -77,7 +78,7 @@ class SteadyMirror:
         return evaluate(outcome, self.mirror, FitOptions(), provenance)[0]
 
 
-def without_effect(error: float = 1e-10) -> MemoryFit:
+def without_effect(error: float = 1e-10) -> HysteresisFit:
     """A memory that remembers nothing, predicted within `error` (m), so that only its history counts."""
     sigma = np.concatenate((np.zeros(3), np.full(18, error)))
-    return MemoryFit("none", MemoryLaw.linear(), sigma, 3.0 * error, 0.05, 100, ())
+    return HysteresisFit("none", HysteresisModel.linear(), sigma, 3.0 * error, 0.05, 100, ())

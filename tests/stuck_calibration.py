@@ -8,7 +8,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from dm_calibration import calibration_action, calibration_desk, calibration_node, run_journal, store
+from dm_calibration import calibration_action, calibration_node
+from dm_calibration import calibration_manager as calibration_desk
+from dm_calibration.procedure import run_journal
+from dm_calibration.store import calibration_store as store
 
 #: What is printed when the place is reached.
 MARK = "stuck at "

@@ -18,10 +18,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from dm_controller.suite import own_domain
-from dm_runtime.action_client import ThreadedActionClient
-from dm_runtime.executor import BackgroundExecutor
-from dm_runtime.worker import answers_arrive
+from dm_bringup.suite import own_domain
+from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.worker import answers_arrive
 
 
 def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:

@@ -23,8 +23,8 @@ from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
 from sensor_msgs.msg import Image
 
-from dm_controller.camera.optics import FocusOptics
-from dm_runtime import qos
+from dm_autofocus.optics import FocusOptics
+from dm_common.ros import qos
 from support import NodeProcess, Observer, wait_until
 
 REST_DISTANCE = 10.0
@@ -127,7 +127,7 @@ Start = Callable[..., NodeProcess]
 @pytest.fixture
 def bench(start: Start, observer: Observer) -> Iterator[Bench]:
     with Bench(observer, object_curvature=0.0173) as played:
-        start("dm_controller", "autofocus", PARAMETERS)
+        start("dm_autofocus", "autofocus", PARAMETERS)
         wait_until(lambda: played.states, 60, "the first figure of an image")
         yield played
 
@@ -219,14 +219,14 @@ def test_the_focus_range_comes_from_the_capabilities(bench: Bench, observer: Obs
 
 
 def test_without_controller_and_camera_the_reason_is_told(start: Start, observer: Observer) -> None:
-    start("dm_controller", "autofocus", PARAMETERS)
+    start("dm_autofocus", "autofocus", PARAMETERS)
     answer = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert answer.error_code == ErrorCode.TIMEOUT
     assert "focus_controller" in answer.message
 
 
 def test_a_senseless_region_ends_with_the_reason(start: Start) -> None:
-    process = start("dm_controller", "autofocus", {"region": [0.5, 0.0, 0.9, 1.0]})
+    process = start("dm_autofocus", "autofocus", {"region": [0.5, 0.0, 0.9, 1.0]})
     assert process.process.wait(30) == 1
     assert "region = [0.5, 0.0, 0.9, 1.0]" in process.output
 

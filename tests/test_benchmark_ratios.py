@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from dm_controller.benchmarks import rivals
-from dm_controller.benchmarks.influence_maps import peak_memory
-from dm_controller.benchmarks.page import growth_table, target_table
-from dm_controller.benchmarks.suite import JOBS, run
-from dm_controller.benchmarks.targets import TARGETS, rows
-from dm_controller.benchmarks.timing import Effort, medians
+from studies.benchmarks import rivals
+from studies.benchmarks.jobs.influence_maps import peak_memory
+from studies.benchmarks.page import growth_table, target_table
+from studies.benchmarks.suite import JOBS, run
+from studies.benchmarks.targets import TARGETS, rows
+from studies.benchmarks.timing import Effort, medians
 
 ROOT = Path(__file__).resolve().parents[1]
 BASELINE: dict[str, Any] = json.loads((ROOT / "benchmarks" / "baseline.json").read_text())

@@ -18,10 +18,10 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
 
 from calibration_stand_in import StandIn, doubles
-from dm_calibration.influence.sag import remove_piston_tilt
-from dm_calibration.plan import PlanKind
-from dm_calibration.store import CalibrationStore
-from dm_runtime import qos
+from dm_calibration.procedure.plan import PlanKind
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.optics.sag import remove_piston_tilt
+from dm_common.ros import qos
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from support import NodeProcess, Observer, wait_until
 

@@ -12,21 +12,21 @@ import pytest
 
 from dm_calibration.calibration_errors import Refused
 from dm_calibration.calibrator import Provenance, evaluate
-from dm_calibration.event_frames import map_hashes, record_hash
+from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
+from dm_calibration.hysteresis.identify import CANDIDATES
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.measurement import BenchError, Measurement
-from dm_calibration.memory.identify import CANDIDATES
-from dm_calibration.memory.memory_fit import fit_memory
-from dm_calibration.outcome import Event, MapTaken
-from dm_calibration.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
-from dm_calibration.procedure import Procedure
-from dm_calibration.resumable_run import OpenRun, ResumeOptions, identity_of, open_run
-from dm_calibration.run_journal import EVENTS, read_run
-from dm_calibration.store import CalibrationStore, StoreError
-from dm_calibration.unfinished_runs import UnfinishedRuns
-from dm_controller.experiments.twin_bench import TwinBench, TwinConfig
-from remembering_mirror import MIRROR, RememberingBench
+from dm_calibration.procedure.event_frames import map_hashes, record_hash
+from dm_calibration.procedure.outcome import Event, MapTaken
+from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure.procedure import Procedure
+from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, open_run
+from dm_calibration.procedure.run_journal import EVENTS, read_run
+from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
+from dm_calibration.store.calibration_store import CalibrationStore, StoreError
+from dm_common.measurement import BenchError, Measurement
+from hysteretic_mirror import MIRROR, RememberingBench
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 POKES = make_plan(PlanKind.POKES, MIRROR)
 
@@ -210,7 +210,7 @@ def test_a_disk_that_fills_up_costs_one_map(tmp_path: Path, monkeypatch: pytest.
         return write(handle, content, position)
 
     write = os.pwrite
-    monkeypatch.setattr("dm_calibration.run_journal.os.pwrite", full)
+    monkeypatch.setattr("dm_calibration.procedure.run_journal.os.pwrite", full)
     with pytest.raises(StoreError, match=r"map poke.*could not be kept in .*No space left"):
         procedure(run, POKES, RememberingBench()).run()
     run.journal.close()
@@ -222,10 +222,12 @@ def test_two_nodes_do_not_calibrate_into_one_folder(tmp_path: Path) -> None:
         UnfinishedRuns(tmp_path).__enter__()
 
 
-def interrupted(kind: PlanKind, config: TwinConfig, folder: Path, cuts: tuple[int, ...], maps: int = 100) -> MapSet:
+def interrupted(
+    kind: PlanKind, config: SimulationConfig, folder: Path, cuts: tuple[int, ...], maps: int = 100
+) -> MapSet:
     """The maps of a run on the twin, cut off before some of them, with the power off for an hour each time."""
-    bench = TwinBench(config)
-    options = PlanOptions(memory_maps=maps)
+    bench = SimulatedBench(config)
+    options = PlanOptions(hysteresis_maps=maps)
     plan = make_plan(kind, bench.mirror, options)
     identity = identity_of(plan, options, bench.mirror, {}, {})
     for cut in (*cuts, 10**9):
@@ -245,22 +247,22 @@ def interrupted(kind: PlanKind, config: TwinConfig, folder: Path, cuts: tuple[in
     return run.outcome.maps()
 
 
-def test_an_interrupted_memory_run_knows_the_law_as_well(tmp_path: Path) -> None:
-    config = TwinConfig(seed=90125)
+def test_an_interrupted_hysteresis_run_knows_the_law_as_well(tmp_path: Path) -> None:
+    config = SimulationConfig(seed=90125)
     laws = CANDIDATES[1:2]
-    whole = fit_memory(interrupted(PlanKind.MEMORY, config, tmp_path / "whole", ()), candidates=laws)
-    maps = interrupted(PlanKind.MEMORY, config, tmp_path / "parts", (30, 70))
+    whole = fit_hysteresis(interrupted(PlanKind.HYSTERESIS, config, tmp_path / "whole", ()), candidates=laws)
+    maps = interrupted(PlanKind.HYSTERESIS, config, tmp_path / "parts", (30, 70))
     assert np.unique(maps.segment).size == 3
-    parts = fit_memory(maps, candidates=laws)
+    parts = fit_hysteresis(maps, candidates=laws)
     assert parts.held_out_max_zernike < 2.0 * whole.held_out_max_zernike < 6e-9
     assert parts.law.creep_rate == pytest.approx(whole.law.creep_rate, rel=0.1)
-    blind = fit_memory(replace(maps, segment=np.zeros_like(maps.segment)), candidates=laws)
+    blind = fit_hysteresis(replace(maps, segment=np.zeros_like(maps.segment)), candidates=laws)
     assert blind.held_out_max_zernike > 2.0 * parts.held_out_max_zernike  # what not knowing of the cuts would cost
 
 
 @pytest.mark.parametrize(("law", "figure"), [("none", 2.5e-9), ("prandtl_ishlinskii", 25e-9)])
 def test_an_interrupted_poke_run_predicts_as_well(law: str, figure: float, tmp_path: Path) -> None:
-    config = TwinConfig(law=law, seed=90125)
+    config = SimulationConfig(law=law, seed=90125)
     whole = fit_influence(interrupted(PlanKind.POKES, config, tmp_path / "whole", ()))
     parts = fit_influence(interrupted(PlanKind.POKES, config, tmp_path / "parts", (20, 55)))
     assert parts.held_out_rms < 1.2 * whole.held_out_rms < 1.2 * figure

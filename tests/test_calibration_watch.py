@@ -20,8 +20,8 @@ from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import LoadCalibration, UpdateCalibration
 
 from calibration_stand_in import StandIn
-from dm_calibration.store import CalibrationStore
-from dm_runtime import qos
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.ros import qos
 from linear_mirror import LinearMirror
 from steady_mirror import NOISE, SteadyMirror, without_effect
 from support import NodeProcess, Observer, wait_until
@@ -77,10 +77,12 @@ def begin(
     folder = tmp_path / "calibrations"
     plant = LinearMirror(steady.mirror.x, steady.mirror.y, noise=NOISE, seed=2)
 
-    def begin(memory: bool = False, **changes: Any) -> Suite:
+    def begin(hysteresis: bool = False, **changes: Any) -> Suite:
         if not folder.exists():
             calibration = steady.calibrate(time.time_ns())
-            CalibrationStore(folder).save(replace(calibration, memory=without_effect()) if memory else calibration)
+            CalibrationStore(folder).save(
+                replace(calibration, hysteresis=without_effect()) if hysteresis else calibration
+            )
         values = {
             "calibration_folder": str(folder),
             "load_on_start": "newest",
@@ -157,7 +159,7 @@ def test_maps_that_the_interferometer_publishes_are_taken_once(suite: Suite) -> 
 def test_the_command_checks_and_tells_by_its_exit_status(suite: Suite, tmp_path: Path) -> None:
     suite.shape()
     figures = tmp_path / "figures.json"
-    command = [sys.executable, "-m", "dm_controller.cli", "check", "--json", str(figures)]
+    command = [sys.executable, "-m", "dm_tools.cli", "check", "--json", str(figures)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(figures.read_text())["check"]["revision"] == 1
@@ -232,8 +234,8 @@ def test_drift_beyond_its_limit_is_a_warning(begin: Callable[..., Suite]) -> Non
     assert figures["maps_taken"] == figures["revision"] == "1"
 
 
-def test_with_a_memory_an_unknown_history_is_refused_until_a_degauss(begin: Callable[..., Suite]) -> None:
-    suite = begin(memory=True)
+def test_with_a_hysteresis_an_unknown_history_is_refused_until_a_degauss(begin: Callable[..., Suite]) -> None:
+    suite = begin(hysteresis=True)
     suite.shape()
     refused = suite.call()
     assert refused.error_code == ErrorCode.MAP_REJECTED

@@ -14,10 +14,10 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from dm_controller.console import ros_side
-from dm_controller.console.ros_side import RefusedError, RosSide
-from dm_runtime.executor import BackgroundExecutor
-from dm_runtime.worker import WorkerActionServer
+from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.worker import WorkerActionServer
+from dm_tools.console import console_node as ros_side
+from dm_tools.console.console_node import ConsoleNode, RefusedError
 from support import own_domain
 
 LONGEST_S = 60.0
@@ -33,20 +33,20 @@ def until_cancelled(goal_handle: ServerGoalHandle) -> tuple[str, Any]:
 
 
 @pytest.fixture
-def bench() -> Iterator[tuple[RosSide, Node]]:
+def bench() -> Iterator[tuple[ConsoleNode, Node]]:
     """The console's side, and a node of the action `calibrate` that nobody serves yet."""
     with own_domain() as domain:
         context = rclpy.Context()
         rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         node = Node("played_calibration", context=context)
         WorkerActionServer(node, Calibrate, "calibrate", until_cancelled)
-        side = RosSide(domain=domain)
+        side = ConsoleNode(domain=domain)
         yield side, node
         side.close()
         context.try_shutdown()
 
 
-def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tuple[RosSide, Node]) -> None:
+def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tuple[ConsoleNode, Node]) -> None:
     side, node = bench
 
     async def scene() -> BackgroundExecutor:
@@ -63,7 +63,7 @@ def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tu
 
 
 def test_a_goal_whose_answer_was_lost_is_seen_and_can_be_cancelled(
-    bench: tuple[RosSide, Node], monkeypatch: pytest.MonkeyPatch
+    bench: tuple[ConsoleNode, Node], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     side, node = bench
 
@@ -84,7 +84,7 @@ def test_a_goal_whose_answer_was_lost_is_seen_and_can_be_cancelled(
     asyncio.run(asyncio.wait_for(scene(), LONGEST_S)).destroy_node()
 
 
-def test_a_goal_that_is_not_sent_yet_never_begins(bench: tuple[RosSide, Node]) -> None:
+def test_a_goal_that_is_not_sent_yet_never_begins(bench: tuple[ConsoleNode, Node]) -> None:
     side, node = bench
     served = BackgroundExecutor(node)
 

@@ -10,8 +10,8 @@ import pytest
 from dm_msgs.action import Calibrate
 
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
-from dm_controller.cli.demo import bench_config
-from dm_controller.suite import Suite
+from dm_bringup.suite import Suite
+from dm_tools.demo.demo import bench_config
 from support import Observer, own_domain, wait_until
 
 pytestmark = needs_browser
@@ -45,14 +45,14 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return shots_folder(tmp_path_factory.mktemp("shots"))
 
 
-def test_the_length_of_a_memory_plan_is_told_before_it_runs(page: Browser) -> None:
+def test_the_length_of_a_hysteresis_plan_is_told_before_it_runs(page: Browser) -> None:
     page.wait_for("driver: active")
     page.enter("Length: commands of the memory plan", "80")
     page.press("How long?")
     page.wait_for("nothing was moved", 30)
 
 
-def test_a_memory_calibration_shows_the_loops(page: Browser) -> None:
+def test_a_hysteresis_calibration_shows_the_loops(page: Browser) -> None:
     page.press("Calibrate")
     wait_until(lambda: page.pictures("residual of"), 60, "residuals of the run")
     page.wait_for(": held-out residual ", 900)

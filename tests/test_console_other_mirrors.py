@@ -15,7 +15,7 @@ from selenium.webdriver.common.keys import Keys
 
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from console_stand_in import StandIn
-from dm_driver.geometry import hexagonal_positions
+from dm_common.geometry import hexagonal_positions
 from support import Observer, own_domain, wait_until
 
 pytestmark = needs_browser

@@ -13,8 +13,8 @@ from dm_msgs.action import Converge
 from dm_msgs.msg import ErrorCode, FocusRequest
 
 from converge_stand_in import Bench, Host
+from dm_common.ros.executor import BackgroundExecutor
 from dm_controller.target import FocusTarget
-from dm_runtime.executor import BackgroundExecutor
 from linear_mirror import RADIUS
 from support import Observer
 

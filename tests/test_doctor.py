@@ -17,16 +17,17 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
+from dm_bringup.suite import load_config
 from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.plan import PlanKind, PlanOptions
-from dm_calibration.store import CalibrationStore
-from dm_controller.cli import doctor_bench, doctor_machine
-from dm_controller.cli.doctor_finding import Finding
-from dm_controller.cli.up import shared_config
-from dm_controller.suite import load_config
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_tools.doctor import bench as doctor_bench
+from dm_tools.doctor import machine as doctor_machine
+from dm_tools.doctor.finding import Finding
+from dm_tools.verbs.up import shared_config
+from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
-from remembering_mirror import MIRROR
 from support import wait_until
 
 GOOD: dict[str, Any] = load_config(shared_config("bench.yaml"))
@@ -217,9 +218,9 @@ def test_a_node_on_a_machine_with_another_clock(domain: int, monkeypatch: pytest
 
         return bool(wait_until(again, 60))
 
-    monkeypatch.setattr("dm_controller.client.DeformableMirrorClient.wait", lambda _self, *a: wait_and_publish(*a))
+    monkeypatch.setattr("dm_client.client.DeformableMirrorClient.wait", lambda _self, *a: wait_and_publish(*a))
     try:
-        from dm_controller.client import DeformableMirrorClient
+        from dm_client.client import DeformableMirrorClient
 
         with DeformableMirrorClient() as client:
             finding = doctor_machine._skew(client)
@@ -235,7 +236,7 @@ def test_the_command_tells_everything_and_fails_for_what_is_wrong(tmp_path: Path
     file, figures = tmp_path / "my_bench.yaml", tmp_path / "doctor.json"
     file.write_text(yaml.safe_dump({f"/**/{node}": {"ros__parameters": values} for node, values in config.items()}))
     done = subprocess.run(
-        [sys.executable, "-m", "dm_controller.cli", "doctor", "--config", str(file), "--json", str(figures)],
+        [sys.executable, "-m", "dm_tools.cli", "doctor", "--config", str(file), "--json", str(figures)],
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         capture_output=True,
         text=True,

@@ -26,12 +26,12 @@ import typer
 import yaml
 
 import documentation as told
-from dm_controller.cli import app
-from dm_controller.cli.demo import bench_config
-from dm_controller.cli.doctor_bench import parameters
-from dm_controller.client import DeformableMirrorClient
-from dm_controller.reference import TABLES
-from dm_controller.suite import load_config, own_domain, save_config
+from dm_bringup.suite import load_config, own_domain, save_config
+from dm_client.client import DeformableMirrorClient
+from dm_tools.cli import app
+from dm_tools.demo.demo import bench_config
+from dm_tools.doctor.bench import parameters
+from dm_tools.documentation.parameters import TABLES
 from documentation import Block, blocks
 from support import wait_until
 

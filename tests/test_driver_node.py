@@ -14,7 +14,7 @@ from dm_msgs.srv import Degauss, SetSignals
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 
-from dm_runtime import qos
+from dm_common.ros import qos
 from drive_unit_servers import Edac40TcpUnit, Frame
 from support import NodeProcess, Observer, wait_until
 
@@ -69,9 +69,9 @@ class Driver:
         self.diagnostics = observer.record(DiagnosticArray, "/diagnostics")
         self._publisher = observer.node.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
 
-    def command(self, signals: Any, age_s: float | None = None, if_turns: int = 0) -> None:
+    def command(self, signals: Any, age_s: float | None = None, expected_turns: int = 0) -> None:
         wait_until(lambda: self._publisher.get_subscription_count() > 0, what="the driver's subscription")
-        message = ActuatorCommand(signals=[float(value) for value in signals], if_turns=if_turns)
+        message = ActuatorCommand(signals=[float(value) for value in signals], expected_turns=expected_turns)
         if age_s is not None:
             stamp_ns = self.observer.node.get_clock().now().nanoseconds - round(age_s * 1e9)
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
@@ -119,9 +119,9 @@ def test_a_correction_counts_only_for_the_shape_that_it_corrects(driver: Driver)
     shape = np.full(37, -0.95)
     driver.command(shape)
     state = driver.wait_for_state(lambda state: state.sequence == 2, "the shape")
-    driver.command(-shape, if_turns=state.turns + 1)
+    driver.command(-shape, expected_turns=state.turns + 1)
     wait_until(overtaken, what="a correction that was left out")
-    driver.command(shape + 0.01, if_turns=state.turns)
+    driver.command(shape + 0.01, expected_turns=state.turns)
     state = driver.wait_for_state(lambda state: state.sequence == 3, "the correction")
     assert list(state.requested) == pytest.approx(list(shape + 0.01))
     assert state.error_code == ErrorCode.OK

@@ -22,14 +22,14 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, ErrorCode, ZernikeCoefficients
 from std_srvs.srv import SetBool
 
+from dm_bringup.suite import Suite, own_domain, save_config
 from dm_calibration.map_files import read_map
-from dm_controller.cli.demo import bench_config
-from dm_controller.client import DeformableMirrorClient, DeformableMirrorError
-from dm_controller.suite import Suite, own_domain, save_config
+from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+from dm_common.ros.action_client import ThreadedActionClient
 from dm_controller.target import FocusTarget
-from dm_controller.verify import map_of, surface_error
-from dm_driver.virtual.parameters import TABLE
-from dm_runtime.action_client import ThreadedActionClient
+from dm_simulation.parameters import TABLE
+from dm_tools.demo.demo import bench_config
+from dm_tools.verify import map_of, surface_error
 from support import bench_figures, wait_until
 
 SEED = 20_11
@@ -209,7 +209,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
     config["interferometer"].pop("trigger_command")
     config["interferometer"]["stable_time"] = 0.1
     save_config(config, tmp_path / "my_bench.yaml")
-    trigger = Path(sys.modules["dm_driver"].__path__[0]) / "virtual" / "trigger.py"
+    trigger = Path(sys.modules["dm_simulation"].__path__[0]) / "interferometer" / "trigger.py"
     with (
         own_domain() as elsewhere,
         Suite(bench, tmp_path / "bench", elsewhere, nodes=("virtual_bench",)),
@@ -217,7 +217,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
     ):
         log = (tmp_path / "up.log").open("w+")
         process = subprocess.Popen(
-            [sys.executable, "-m", "dm_controller.cli", "up", "--config", str(tmp_path / "my_bench.yaml")],
+            [sys.executable, "-m", "dm_tools.cli", "up", "--config", str(tmp_path / "my_bench.yaml")],
             env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
             stdout=log,
             stderr=subprocess.STDOUT,
@@ -250,7 +250,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
 def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
     """The demo as a user runs it, with a folder and figures of the test's."""
     figures = tmp_path / "demo.json"
-    command = [sys.executable, "-m", "dm_controller.cli", "demo", "--hysteresis", "off", "--seed", "2012"]
+    command = [sys.executable, "-m", "dm_tools.cli", "demo", "--hysteresis", "off", "--seed", "2012"]
     done = subprocess.run(
         [*command, "--out", str(tmp_path / "run"), "--json", str(figures)], capture_output=True, text=True, timeout=400
     )

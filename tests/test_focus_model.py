@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from dm_calibration.optics.zernike import basis
-from dm_controller.model import CalibratedMirror, InfluenceModel
+from dm_common.optics.zernike import basis
+from dm_controller.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget, TargetError
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror

@@ -12,8 +12,8 @@ from typing import Any
 from dm_msgs.msg import ErrorCode, ZernikeCoefficients
 from dm_msgs.srv import IngestFile, Measure
 
-from dm_calibration.folder_watch import FolderWatch
-from dm_runtime import qos
+from dm_calibration.acquisition.folder_watch import FolderWatch
+from dm_common.ros import qos
 from map_fixtures import dat_bytes, disc_counts
 from support import NodeProcess, Observer, wait_until
 

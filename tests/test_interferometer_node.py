@@ -17,8 +17,8 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from sensor_msgs.msg import Image
 
-from dm_calibration.optics.zernike import basis
-from dm_runtime import qos
+from dm_common.optics.zernike import basis
+from dm_common.ros import qos
 from map_fixtures import WAVELENGTH, dat_bytes, disc_counts, write_datx
 from support import NodeProcess, Observer, wait_until
 

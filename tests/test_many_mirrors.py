@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dm_controller.cli.demo import bench_config
-from dm_controller.cli.up import configurations
-from dm_controller.client import DeformableMirrorClient
-from dm_controller.suite import save_config
+from dm_bringup.suite import save_config
+from dm_client.client import DeformableMirrorClient
+from dm_tools.demo.demo import bench_config
+from dm_tools.verbs.up import configurations
 
 
 def test_virtual_mirrors_share_neither_ports_nor_folders() -> None:
@@ -50,7 +50,7 @@ def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:
         save_config(bench_config(tmp_path / name, "preisach", 0.01, 1, 0.0), tmp_path / f"{name}.yaml")
         arguments += ["--config", str(tmp_path / f"{name}.yaml"), "--namespace", name]
     process = subprocess.Popen(
-        [sys.executable, "-m", "dm_controller.cli", "up", *arguments, "--logs", str(tmp_path / "logs")],
+        [sys.executable, "-m", "dm_tools.cli", "up", *arguments, "--logs", str(tmp_path / "logs")],
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stdout=subprocess.DEVNULL,
     )

@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 
 from dm_calibration.regression.f_statistic import adjusted_r2_of_f, p_of_f
 from dm_calibration.report.document import Section, Table, write_html, write_pdf
-from dm_controller.cli.paper import paper
-from dm_controller.experiments.twin_bench import TwinConfig
-from dm_controller.paper import control, reported
-from dm_controller.paper.results import PaperOptions
-from dm_controller.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
+from studies.comparison.simulated_bench import SimulationConfig
+from studies.paper import control, reported
+from studies.paper.results import PaperOptions
+from studies.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
+from studies.verbs.paper import paper
 
 SEED = 31
 
@@ -40,7 +40,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
 
 @pytest.fixture(scope="module")
 def ideal() -> Samples:
-    return measure_samples(TwinConfig(law="none", hysteresis=0.0, creep=0.0, seed=SEED, pixels=118))
+    return measure_samples(SimulationConfig(law="none", hysteresis=0.0, creep=0.0, seed=SEED, pixels=118))
 
 
 def test_tables_2_and_3_have_every_model_and_surface(made: tuple[Path, dict[str, Any]]) -> None:
@@ -90,15 +90,15 @@ def test_hysteresis_costs_what_ideal_actuators_do_not_show(made: tuple[Path, dic
     assert ideal["control"]["AZreg"]["stored"]["within"]["lambda/50"] == 1.0
 
 
-def test_maps_and_memory_reach_a_thousandth_of_the_wavelength(made: tuple[Path, dict[str, Any]]) -> None:
+def test_maps_and_hysteresis_reach_a_thousandth_of_the_wavelength(made: tuple[Path, dict[str, Any]]) -> None:
     figures = made[1]
     readings = figures["control"]["AZreg"]
-    remembering = readings[control.LOOP_MEMORY]
+    remembering = readings[control.LOOP_HYSTERESIS]
     assert remembering["maps"] == control.LOOP_MAPS
     assert remembering["within"]["lambda/1000"] == 1.0
     assert readings["closed loop"]["within"]["lambda/50"] == 1.0
-    assert readings[control.OPEN_MEMORY]["maps"] == 0.0
-    assert readings[control.OPEN_MEMORY]["true_p50_nm"] < 0.2 * readings["stored"]["true_p50_nm"]
+    assert readings[control.OPEN_HYSTERESIS]["maps"] == 0.0
+    assert readings[control.OPEN_HYSTERESIS]["true_p50_nm"] < 0.2 * readings["stored"]["true_p50_nm"]
     # A noisy map cannot show what the noise-free surface does.
     assert remembering["p50_nm"] > remembering["true_p50_nm"]
     for order in remembering["orders"].values():
@@ -183,7 +183,7 @@ def test_unknown_reading_is_refused(ideal: Samples) -> None:
 def test_options_out_of_range_are_refused(field: str) -> None:
     changed: dict[str, Any] = {field: 0}
     with pytest.raises(ValueError, match=f"{field} = 0: must be at least"):
-        PaperOptions(TwinConfig(), **changed)
+        PaperOptions(SimulationConfig(), **changed)
 
 
 def test_a_file_as_folder_is_refused_before_anything_runs(tmp_path: Path) -> None:

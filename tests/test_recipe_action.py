@@ -13,9 +13,9 @@ from dm_msgs.msg import ErrorCode, FocusRequest
 from dm_msgs.srv import StoreRecipes
 
 from converge_stand_in import Bench, Host
-from dm_calibration.calibration_messages import recipe_book_from
+from dm_common.messages import recipe_book_from
+from dm_common.ros.executor import BackgroundExecutor
 from dm_controller.target import FocusTarget
-from dm_runtime.executor import BackgroundExecutor
 from linear_mirror import RADIUS
 from support import Observer, wait_until
 

@@ -19,17 +19,18 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rclpy.serialization import deserialize_message, serialize_message
 
-from dm_calibration.calibration_messages import calibration_message, doubles, time_message
+from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.plan import PlanKind, PlanOptions
-from dm_calibration.recorded_run import RecordedRun, RecordingError
-from dm_controller.recording.bag import METADATA_FILE, BagError, BagReader, BagWriter, Topic
-from dm_controller.recording.interfaces import UnknownTypeError, definition, message_class
-from dm_controller.recording.player import play, replayed
-from dm_controller.recording.recorder import Recorder
-from dm_controller.recording.session import COMPARED, differences, read_session, recalibrate
-from dm_runtime import qos
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
+from dm_common.messages import doubles, time_message
+from dm_common.ros import qos
+from dm_tools.recording.bag import METADATA_FILE, BagError, BagReader, BagWriter, Topic
+from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
+from dm_tools.recording.player import play, replayed
+from dm_tools.recording.recorder import Recorder
+from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate
 from recorded_bench import recorded
 from rosbag2_metadata import read_metadata
 from support import Observer, wait_until
@@ -146,7 +147,7 @@ def test_a_difference_of_one_bit_is_found(run_and_bag: tuple[RecordedRun, Any, B
 
 def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path) -> None:
     bag, figures = run_and_bag[2], tmp_path / "figures.json"
-    command = [sys.executable, "-m", "dm_controller.cli", "replay", str(bag.file.parent), "--recalibrate"]
+    command = [sys.executable, "-m", "dm_tools.cli", "replay", str(bag.file.parent), "--recalibrate"]
     done = subprocess.run(
         [*command, "--store", str(tmp_path / "store"), "--json", str(figures)], capture_output=True, text=True
     )

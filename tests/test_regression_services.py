@@ -20,16 +20,16 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.weights import surface_control_error
-from dm_calibration.optics.zernike import basis
 from dm_calibration.regression.surface_error import SURFACES
-from dm_calibration.store import CalibrationStore
-from dm_controller.experiments.twin_bench import influence_model
-from dm_controller.model import CalibratedMirror
-from dm_controller.prediction import ForecastClient, memory_share, surface_control_error_rms
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.optics.zernike import basis
+from dm_common.ros import qos
+from dm_controller.mirror_model import CalibratedMirror
+from dm_controller.prediction import ForecastClient, hysteresis_share, surface_control_error_rms
 from dm_controller.solvers.bounded import Limits
-from dm_runtime import qos
+from hysteretic_mirror import MIRROR, calibrated, calibrated_by_pokes
 from linear_mirror import RADIUS
-from remembering_mirror import MIRROR, calibrated, calibrated_by_pokes
+from studies.comparison.simulated_bench import influence_model
 from support import NodeProcess, Observer, wait_until
 
 
@@ -231,8 +231,8 @@ def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, obs
     assert client.forecast(0.0, 0.0) is None
 
 
-def test_share_of_the_memory() -> None:
-    share = memory_share(
+def test_share_of_the_hysteresis() -> None:
+    share = hysteresis_share(
         np.array([0.02, 0.0]), np.array([[50e-9, 40e-9, 60e-9], [5e-9, 3e-9, 8e-9]]), np.array([30e-9, 4e-9])
     )
     at_end = share.forecast(0.02, 0.0)

@@ -10,11 +10,11 @@ import pytest
 
 from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.plan import PlanKind, PlanOptions
-from dm_calibration.store import CalibrationStore
-from dm_controller.cli.report import find_calibration, report
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_tools.verbs.report import find_calibration, report
+from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
-from remembering_mirror import MIRROR
 
 
 @pytest.fixture(scope="module")

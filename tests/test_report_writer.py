@@ -10,10 +10,10 @@ import pytest
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.plan import PlanKind, PlanOptions
-from dm_calibration.report_writer import ReportingStore, ReportWriter
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.report.report_writer import ReportingStore, ReportWriter
+from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
-from remembering_mirror import MIRROR
 
 PATIENCE_S = 200.0
 

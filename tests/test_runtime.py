@@ -26,9 +26,9 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
-from dm_runtime.action_client import ThreadedActionClient
-from dm_runtime.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
-from dm_runtime.worker import (
+from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
+from dm_common.ros.worker import (
     ServiceCallError,
     WorkerActionServer,
     WorkerService,
@@ -301,7 +301,7 @@ def test_markdown_lists_every_parameter() -> None:
 
 NODE_SCRIPT = """
 import sys, time
-from dm_runtime.executor import run_node
+from dm_common.ros.executor import run_node
 from rclpy.node import Node
 
 class Careful(Node):

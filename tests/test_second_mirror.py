@@ -13,18 +13,18 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode
 from scipy.optimize import lsq_linear
 
-from dm_calibration.influence.sag import remove_piston_tilt
-from dm_calibration.optics.sampling import edge_clustered_points
-from dm_calibration.optics.zernike import basis
-from dm_controller.cli.demo import bench_config
-from dm_controller.cli.up import shared_config
-from dm_controller.client import DeformableMirrorClient, DeformableMirrorError
-from dm_controller.model import CalibratedMirror, InfluenceModel
+from dm_bringup.suite import Suite, own_domain
+from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.zernike import basis
+from dm_controller.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.solvers.bounded import Limits
-from dm_controller.suite import Suite, own_domain
 from dm_controller.target import FocusTarget
-from dm_controller.verify import map_of, surface_error
-from dm_driver.virtual.plate import Plate, PlateConfig, neighbour_pairs
+from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
+from dm_tools.demo.demo import bench_config
+from dm_tools.verbs.up import shared_config
+from dm_tools.verify import map_of, surface_error
 from support import bench_figures
 
 SEED = 20_19

@@ -9,15 +9,15 @@ from xml.etree import ElementTree as xml
 import pytest
 from typer.testing import CliRunner
 
-from dm_controller.cli import app
-from dm_controller.cli.demo import bench_config
-from dm_controller.client import DeformableMirrorClient
-from dm_controller.console.ros_side import RosSide
-from dm_controller.security.graph import declaration_of, differences
-from dm_controller.security.interfaces import interfaces
-from dm_controller.security.keystore import check_keystore, keys_missing
-from dm_controller.security.policy import Profile, dds_topics, write_profile
-from dm_controller.suite import Suite, own_domain
+from dm_bringup.suite import Suite, own_domain
+from dm_client.client import DeformableMirrorClient
+from dm_tools.cli import app
+from dm_tools.console.console_node import ConsoleNode
+from dm_tools.demo.demo import bench_config
+from dm_tools.security.graph import declaration_of, differences
+from dm_tools.security.interfaces import interfaces
+from dm_tools.security.keystore import check_keystore, keys_missing
+from dm_tools.security.policy import Profile, dds_topics, write_profile
 from support import wait_until
 
 PROFILE = Profile(twin=True)
@@ -37,7 +37,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
         Suite(config, folder, domain),
         DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
-        side = RosSide(domain=domain)
+        side = ConsoleNode(domain=domain)
         try:
             client.wait_until_active(60.0)
             wait_until(lambda: client.node.count_publishers("surface_map"), 60.0)

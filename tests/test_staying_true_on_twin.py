@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dm_calibration.applied_history import AppliedHistory, Report
-from dm_calibration.calibration_updates import CalibrationUpdates, UpdateOptions
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.optics.zernike import TERM_RMS, basis
-from dm_calibration.plan import PlanKind, PlanOptions
-from dm_calibration.procedure import Measurement
-from dm_controller.experiments.twin_bench import TwinBench, TwinConfig
+from dm_calibration.procedure.applied_history import AppliedHistory, Report
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_common.measurement import Measurement
+from dm_common.optics.zernike import TERM_RMS, basis
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 NIGHTS = 100
 ASTIGMATISM = 4
@@ -23,11 +23,11 @@ class AgeingTwin:
     """A Preisach twin whose gains and figure drift, with what its driver has reported."""
 
     def __init__(self) -> None:
-        self.bench = TwinBench(TwinConfig(law="preisach", seed=41))
-        self.calibration = self.bench.calibrate(PlanKind.MEMORY, PlanOptions(memory_maps=150))
+        self.bench = SimulatedBench(SimulationConfig(law="preisach", seed=41))
+        self.calibration = self.bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=150))
         self.history = AppliedHistory()
-        assert self.calibration.memory is not None
-        self.history.follow(self.calibration.memory.law)
+        assert self.calibration.hysteresis is not None
+        self.history.follow(self.calibration.hysteresis.law)
         self._gain = self.bench._piezo.gain.copy()
         self._heard = 0
         self._figure = 0.0
@@ -65,7 +65,7 @@ def twin() -> AgeingTwin:
 
 
 def test_maps_of_the_nights_keep_the_calibration_true(twin: AgeingTwin, tmp_path: Path) -> None:
-    updates = CalibrationUpdates(tmp_path, UpdateOptions)
+    updates = RecalibrationManager(tmp_path, UpdateOptions)
     assert updates.begin(twin.calibration) == ""
     rng = np.random.default_rng(42)
     drift = 0.01 * rng.uniform(0.2, 1.0, 37)

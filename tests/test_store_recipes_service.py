@@ -12,10 +12,10 @@ from dm_msgs.msg import Calibration, ErrorCode
 from dm_msgs.srv import StoreRecipes
 
 from calibration_stand_in import StandIn
-from dm_calibration.calibration_messages import recipe_book_from, recipe_book_message
-from dm_calibration.memory.recipes import Recipe, RecipeBook
-from dm_calibration.store import CalibrationStore
-from dm_runtime import qos
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.messages import recipe_book_from, recipe_book_message
+from dm_common.recipes import Recipe, RecipeBook
+from dm_common.ros import qos
 from linear_mirror import LinearMirror, make_mirror
 from support import NodeProcess, Observer, wait_until
 

@@ -8,12 +8,12 @@ import pytest
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.regression.surface_error import Reading, regress_surface_errors
-from dm_controller.experiments.twin_bench import TwinBench, TwinConfig
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    return TwinBench(TwinConfig(seed=31)).calibrate()
+    return SimulatedBench(SimulationConfig(seed=31)).calibrate()
 
 
 @pytest.mark.parametrize("method", ["AZreg", "AZWreg"])

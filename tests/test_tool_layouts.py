@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import yaml
 
-from dm_controller.console.ros_side import TOPICS
+from dm_tools.console.console_node import TOPICS
 
-CONFIG = Path(__file__).resolve().parents[1] / "src" / "dm_controller" / "config"
+CONFIG = Path(__file__).resolve().parents[1] / "src" / "dm_bringup" / "config"
 #: Topics that every ROS 2 system has.
 STANDARD = {"diagnostics", "rosout"}
 #: Panel types of Foxglove and Lichtblick that the layout uses, and the settings each of them reads.

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dm_controller.torture.calibration_faults import FAULTS
-from dm_controller.torture.faults import run_faults
+from fault_injection.faults.calibration_faults import FAULTS
+from fault_injection.faults.fault import run_faults
 
 #: Those that nothing else in the tests shows; `./dm torture` runs all.
 NAMES = ("calibration_power_cut", "calibration_interferometer_killed")

@@ -7,9 +7,9 @@ from random import Random
 
 import pytest
 
-from dm_controller.torture.faults import FaultRecord, run_faults
-from dm_controller.torture.focus_rig import FocusRig
-from dm_controller.torture.registry import GROUPS, OTHERS, select
+from fault_injection.faults.fault import FaultRecord, run_faults
+from fault_injection.faults.registry import GROUPS, OTHERS, select
+from fault_injection.rigs.focus_rig import FocusRig
 
 #: Those that nothing else in the tests shows; `./dm torture` runs all.
 FAULTS = (

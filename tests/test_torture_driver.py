@@ -8,9 +8,9 @@ from random import Random
 import numpy as np
 import pytest
 
-from dm_controller.torture.driver_faults import REGISTRY, select
-from dm_controller.torture.driver_rig import DriverRig
-from dm_controller.torture.faults import Fault, FaultRecord, run_faults
+from fault_injection.faults.driver_faults import REGISTRY, select
+from fault_injection.faults.fault import Fault, FaultRecord, run_faults
+from fault_injection.rigs.driver_rig import DriverRig
 
 #: Those that nothing else in the tests shows; `./dm torture` runs all.
 FAULTS = (

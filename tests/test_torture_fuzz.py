@@ -9,13 +9,13 @@ import h5py
 import numpy as np
 import pytest
 
-from dm_calibration.hdf5_image import ImageError, read_image, write_image
-from dm_calibration.hdf5_sandbox import Hdf5Sandbox, SandboxError
 from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
-from dm_controller.torture.fuzz import fuzz
-from dm_controller.torture.intact import FORMATS, XYZ_UNIT, Intact, intact
-from dm_controller.torture.judge import Verdict, judge
-from dm_controller.torture.mutations import Mutation, mutate
+from dm_calibration.store.hdf5_image import ImageError, read_image, write_image
+from dm_calibration.store.hdf5_sandbox import Hdf5Sandbox, SandboxError
+from fault_injection.fuzz.classify import Verdict, judge
+from fault_injection.fuzz.fuzz import fuzz
+from fault_injection.fuzz.mutations import Mutation, mutate
+from fault_injection.fuzz.reference_files import FORMATS, XYZ_UNIT, ReferenceFile, intact
 
 #: HDF5 files take longer: the library crashes now and then, and its process is started again.
 FILES = {"dat": 1000, "asc": 1000, "xyz": 1000, "datx": 250, "calibration": 250}
@@ -37,7 +37,7 @@ def test_a_damaged_file_can_be_made_again() -> None:
     assert len({mutate(file, 1, number).content for number in range(30)}) > 25
 
 
-def read_intact(name: str, folder: Path) -> tuple[Intact, SurfaceMap]:
+def read_intact(name: str, folder: Path) -> tuple[ReferenceFile, SurfaceMap]:
     file = intact(name)
     path = folder / f"whole{file.suffix}"
     path.write_bytes(file.content)

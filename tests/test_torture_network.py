@@ -9,17 +9,17 @@ from random import Random
 
 import pytest
 
-from dm_controller.network_namespaces import NotPermittedError, inside
-from dm_controller.torture import faults as torture_faults
-from dm_controller.torture.cable import Cable, bad_cable
-from dm_controller.torture.faults import Fault, FaultRecord, run_faults
-from dm_controller.torture.registry import select
+from fault_injection.faults import fault as torture_faults
+from fault_injection.faults.fault import Fault, FaultRecord, run_faults
+from fault_injection.faults.registry import select
+from fault_injection.rigs.netem import Netem, bad_cable
+from studies.network_namespaces import NotPermittedError, inside
 
 DATAGRAMS = 2000
 
 
 @pytest.fixture
-def wire() -> Iterator[tuple[Cable, socket.socket, socket.socket]]:
+def wire() -> Iterator[tuple[Netem, socket.socket, socket.socket]]:
     """A cable, and a socket on each of its hosts."""
     try:
         with bad_cable(Random(3)) as (left, right, cable):
@@ -50,7 +50,7 @@ def received(end: socket.socket) -> int:
     raise AssertionError("an empty datagram")
 
 
-def test_the_cable_loses_the_share_it_is_told(wire: tuple[Cable, socket.socket, socket.socket]) -> None:
+def test_the_cable_loses_the_share_it_is_told(wire: tuple[Netem, socket.socket, socket.socket]) -> None:
     cable, left, right = wire
     cable.loss = 0.05
     got = 0
@@ -61,7 +61,7 @@ def test_the_cable_loses_the_share_it_is_told(wire: tuple[Cable, socket.socket, 
     assert 1.0 - got / DATAGRAMS == pytest.approx(0.05, abs=0.02)  # four standard deviations
 
 
-def test_a_cable_that_is_cut_carries_nothing(wire: tuple[Cable, socket.socket, socket.socket]) -> None:
+def test_a_cable_that_is_cut_carries_nothing(wire: tuple[Netem, socket.socket, socket.socket]) -> None:
     cable, left, right = wire
     cable.plugged = False
     left.sendto(b"x", ("10.77.0.2", 5000))

@@ -7,9 +7,9 @@ from random import Random
 
 import pytest
 
-from dm_controller.torture import process_faults, wire_faults
-from dm_controller.torture.faults import run_faults
-from dm_controller.torture.wire_faults import Storm
+from fault_injection.faults import process_faults, wire_faults
+from fault_injection.faults.fault import run_faults
+from fault_injection.faults.wire_faults import Storm
 
 FAULTS = {fault.name: fault for fault in (*process_faults.FAULTS, *wire_faults.FAULTS)}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dm_controller.torture.soak import NODES, RATE, WINDOWS, SoakResult, Window, soak
+from fault_injection.soak import NODES, RATE, WINDOWS, SoakResult, Window, soak
 
 SECONDS = 25.0
 

@@ -19,8 +19,8 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-import dm_driver.virtual.trigger
-from dm_runtime import qos
+import dm_simulation.interferometer.trigger
+from dm_common.ros import qos
 from support import NodeProcess, Observer, wait_until
 
 Start = Callable[..., NodeProcess]
@@ -53,7 +53,7 @@ def test_trigger_power_and_diagnostics(start: Start, observer: Observer, tmp_pat
     link = tmp_path / "tty"
     folder = tmp_path / "maps"
     process = start(
-        "dm_driver",
+        "dm_simulation",
         "virtual_bench",
         {**SMALL, "output_folder": str(folder), "output_format": "dat", "electronics.pty_link": str(link)},
     )
@@ -66,7 +66,14 @@ def test_trigger_power_and_diagnostics(start: Start, observer: Observer, tmp_pat
     assert answer.success, answer.message
     assert Path(answer.message).stat().st_size == 834 + 4 * 128 * 128
 
-    client = [sys.executable, "-S", "-I", dm_driver.virtual.trigger.__file__, "--port", str(endpoints["trigger_port"])]
+    client = [
+        sys.executable,
+        "-S",
+        "-I",
+        dm_simulation.interferometer.trigger.__file__,
+        "--port",
+        str(endpoints["trigger_port"]),
+    ]
     target = folder / "asked.datx"
     run = subprocess.run([*client, "--output", str(target)], capture_output=True, text=True, timeout=30, check=False)
     assert (run.returncode, run.stdout.strip()) == (0, str(target))
@@ -96,7 +103,7 @@ def test_trigger_power_and_diagnostics(start: Start, observer: Observer, tmp_pat
 
 def test_fast_clock(start: Start, observer: Observer) -> None:
     ticks: list[Clock] = observer.record(Clock, "/clock")
-    process = start("dm_driver", "virtual_bench", {**SMALL, "clock.speed": 50.0})
+    process = start("dm_simulation", "virtual_bench", {**SMALL, "clock.speed": 50.0})
     wait_until(lambda: len(ticks) > 200, 60, "ticks of /clock")
     times = [tick.clock.sec + tick.clock.nanosec * 1e-9 for tick in ticks]
     assert times == sorted(times)
@@ -108,7 +115,7 @@ def test_fast_clock(start: Start, observer: Observer) -> None:
 
 def test_images_of_the_camera(start: Start, observer: Observer) -> None:
     images: list[Image] = observer.record(Image, "image_raw", qos_profile_sensor_data)
-    process = start("dm_driver", "virtual_bench", {**SMALL, "camera.rate": 30.0, "camera.width": 160})
+    process = start("dm_simulation", "virtual_bench", {**SMALL, "camera.rate": 30.0, "camera.width": 160})
     wait_until(lambda: len(images) > 10, 60, "images")
     first, last = images[0], images[-1]
     assert (last.width, last.height, last.encoding, len(last.data)) == (160, 240, "mono8", 160 * 240)
@@ -121,9 +128,9 @@ def test_images_of_the_camera(start: Start, observer: Observer) -> None:
 
 
 def test_a_senseless_configuration_ends_with_the_reason(start: Start) -> None:
-    wrong = start("dm_driver", "virtual_bench", {**SMALL, "piezo.law": "magic"})
+    wrong = start("dm_simulation", "virtual_bench", {**SMALL, "piezo.law": "magic"})
     assert wrong.process.wait(30) == 1
     assert "piezo.law = 'magic': must be one of none, prandtl_ishlinskii, preisach, bouc_wen" in wrong.output
-    twice = start("dm_driver", "virtual_bench", {**SMALL, "wiring": [3] * 37})
+    twice = start("dm_simulation", "virtual_bench", {**SMALL, "wiring": [3] * 37})
     assert twice.process.wait(30) == 1
     assert "wiring" in twice.output

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 from setuptools import find_packages, setup
 
 package_name = "dm_controller"
@@ -11,21 +9,17 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
-        (f"share/{package_name}/launch", [str(path) for path in Path("launch").glob("*.launch.py")]),
-        (f"share/{package_name}/config", [str(path) for path in Path("config").glob("*.*")]),
     ],
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},  # tells `colcon test` to use pytest
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="Open-loop focus controller for deformable mirrors, with launch files and the dm command",
+    description="Open-loop focus controller for deformable mirrors",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
             "focus_controller = dm_controller.focus_controller_node:main",
-            "autofocus = dm_controller.autofocus_node:main",
-            "dm = dm_controller.cli:main",
         ],
     },
 )

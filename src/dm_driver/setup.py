@@ -15,12 +15,11 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="Drive electronics, safety limiter and virtual bench for piezo deformable mirrors",
+    description="Drive electronics and safety limiter for piezo deformable mirrors",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
             "pdm_driver = dm_driver.pdm_driver_node:main",
-            "virtual_bench = dm_driver.virtual_bench_node:main",
         ],
     },
 )

@@ -10,14 +10,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hdf5_image import Attribute, Column
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.memory.memory_fit import MemoryFit
-from dm_calibration.memory.recipes import NO_RECIPES, RecipeBook
-from dm_calibration.memory.storage import memory_columns, memory_from, recipe_columns, recipes_from
-from dm_calibration.optics.regions import AREA_FRACTIONS
-from dm_calibration.optics.sampling import SamplePoints
+from dm_calibration.store.hdf5_image import Attribute, Column
+from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
+from dm_common.optics.sample_regions import AREA_FRACTIONS
+from dm_common.optics.sampling import SamplePoints
+from dm_common.recipes import NO_RECIPES, RecipeBook
 
 T = TypeVar("T")
 Floats = NDArray[np.float64]
@@ -70,7 +70,7 @@ class Calibration:
     limitations: tuple[str, ...] = ()
     note: str = ""
     software_version: str = ""
-    memory: MemoryFit | None = None
+    hysteresis: HysteresisFit | None = None
     recipes: RecipeBook = NO_RECIPES
     region_weights: Floats = field(default_factory=lambda: np.zeros(0))
 
@@ -134,7 +134,7 @@ def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, A
             attributes[f"fit_{figure.name}"] = value
     if calibration.region_weights.size:
         columns["regions/weights"] = calibration.region_weights
-    columns |= memory_columns(calibration.memory) | recipe_columns(calibration.recipes)
+    columns |= hysteresis_columns(calibration.hysteresis) | recipe_columns(calibration.recipes)
     return columns, attributes
 
 
@@ -180,7 +180,7 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
             limitations=_typed(attributes, "known_limitations", tuple),
             note=_typed(attributes, "note", str),
             software_version=_typed(attributes, "software_version", str),
-            memory=memory_from(columns),
+            hysteresis=hysteresis_from(columns),
             recipes=recipes_from(columns),
             region_weights=np.asarray(columns.get("regions/weights", np.zeros(0)), dtype=np.float64),
         )
@@ -225,7 +225,7 @@ def _check_result(calibration: Calibration) -> None:
         raise CalibrationFileError(f"result/reasons has {len(fit.reasons)} entries: must be {m}")
     if calibration.actuator_x.shape != (n,) or calibration.actuator_y.shape != (n,):
         raise CalibrationFileError(f"mirror/actuator_x and actuator_y: must have {n} values each")
-    if calibration.memory is not None and calibration.memory.zernike_sigma.shape != (k,):
+    if calibration.hysteresis is not None and calibration.hysteresis.zernike_sigma.shape != (k,):
         raise CalibrationFileError(f"memory/zernike_sigma: must have {k} values")
     weights = calibration.region_weights
     if weights.size and not (

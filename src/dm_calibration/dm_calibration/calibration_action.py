@@ -13,20 +13,20 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_bench import RosBench
-from dm_calibration.calibration_desk import CalibrationDesk
 from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
+from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, check_fit, dropped_maps, evaluate
-from dm_calibration.event_frames import Storing
+from dm_calibration.hysteresis.forecast import forecast
 from dm_calibration.influence.fit import fit_influence
-from dm_calibration.influence.mirror import Mirror
-from dm_calibration.memory_forecast import forecast
-from dm_calibration.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
-from dm_calibration.procedure import Procedure, Progress
-from dm_calibration.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
-from dm_calibration.unfinished_runs import UnfinishedRuns
-from dm_runtime.worker import wait_for_clock
+from dm_calibration.procedure.event_frames import Storing
+from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure.procedure import Procedure, Progress
+from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
+from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
+from dm_common.mirror import Mirror
+from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.worker import wait_for_clock
 
 #: Least time between two feedback messages, s.
 FEEDBACK_PERIOD_S = 0.1
@@ -35,8 +35,8 @@ _PHASES = {
     StepKind.DEGAUSS: Calibrate.Feedback.PHASE_DEGAUSS,
     StepKind.POKE: Calibrate.Feedback.PHASE_POKES,
     StepKind.SURFACE: Calibrate.Feedback.PHASE_SURFACES,
-    StepKind.EXCITATION: Calibrate.Feedback.PHASE_MEMORY,
-    StepKind.CHECK: Calibrate.Feedback.PHASE_MEMORY,
+    StepKind.EXCITATION: Calibrate.Feedback.PHASE_HYSTERESIS,
+    StepKind.CHECK: Calibrate.Feedback.PHASE_HYSTERESIS,
 }
 
 
@@ -51,8 +51,8 @@ class CalibrateAction:
         self,
         node: Node,
         values: Mapping[str, Any],
-        bench: RosBench,
-        desk: CalibrationDesk,
+        bench: BenchServices,
+        desk: CalibrationManager,
         driver_facts: Callable[[], Mapping[str, Any]],
     ) -> None:
         """`driver_facts` tells of wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
@@ -155,7 +155,7 @@ class CalibrateAction:
             reference_every=goal.reference_every or self._values["reference_every"],
             surfaces=tuple(goal.surfaces),
             degauss=not goal.skip_degauss,
-            memory_maps=goal.memory_maps or self._values["memory_maps"],
+            hysteresis_maps=goal.hysteresis_maps or self._values["hysteresis_maps"],
         )
         return make_plan(PlanKind(goal.plan), mirror, options), options
 
@@ -168,7 +168,7 @@ class CalibrateAction:
             accuracy = ""
             if expected.max_zernike > 0.0:
                 accuracy = f", moves then right to {expected.max_zernike * 1e9:.1f} nm (largest coefficient, 95 %)"
-            elif plan.kind is PlanKind.MEMORY:
+            elif plan.kind is PlanKind.HYSTERESIS:
                 accuracy = ", accuracy not known without an earlier calibration in use"
             result.message = f"{maps} maps in about {expected.duration:.0f} s{accuracy}; nothing was moved"
 
@@ -262,8 +262,11 @@ class CalibrateAction:
                 raise Refused(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
             result.message = "wiring and orientation are as configured"
             return
-        if (memory := calibration.memory) is not None:
-            result.memory_law, result.memory_held_out_max_zernike = memory.name, memory.held_out_max_zernike
+        if (hysteresis := calibration.hysteresis) is not None:
+            result.hysteresis_model, result.hysteresis_held_out_max_zernike = (
+                hysteresis.name,
+                hysteresis.held_out_max_zernike,
+            )
         report(Calibrate.Feedback.PHASE_STORE, calibration.id, len(plan.steps))
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
         result.file = str(self._desk.keep(calibration))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dm_msgs.msg import ErrorCode
 
-from dm_calibration.applied_history import MapNotUsableError
 from dm_calibration.calibration import CalibrationFileError
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_calibration.names import UnknownNameError
-from dm_calibration.optics.regions import EmptyRegionError
-from dm_calibration.procedure import BenchError, Cancelled
+from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.regression.stepwise import CollinearError, TooFewSamplesError
-from dm_calibration.store import StoreError, UnknownCalibrationError
+from dm_calibration.store.calibration_store import StoreError, UnknownCalibrationError
+from dm_common.measurement import BenchError, Cancelled
+from dm_common.names import UnknownNameError
+from dm_common.optics.sample_regions import EmptyRegionError
 
 
 class Refused(Exception):

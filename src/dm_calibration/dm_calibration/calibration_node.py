@@ -25,29 +25,24 @@ from rclpy.node import Node
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_action import CalibrateAction
-from dm_calibration.calibration_bench import RosBench
-from dm_calibration.calibration_desk import CalibrationDesk
 from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
-from dm_calibration.calibration_messages import (
-    calibration_message,
-    driver_facts,
-    mirror_from,
-    recipe_book_from,
-    time_message,
-)
+from dm_calibration.calibration_manager import CalibrationManager
+from dm_calibration.calibration_messages import calibration_message, driver_facts
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options
-from dm_calibration.calibration_watch import PUBLISH_PERIOD_S, CalibrationWatch
 from dm_calibration.calibrator import refit
-from dm_calibration.error_prediction import ErrorPrediction
-from dm_calibration.report_writer import ReportingStore, ReportWriter
-from dm_runtime import diagnostics, qos
-from dm_runtime.executor import run_node
-from dm_runtime.parameters import declare
-from dm_runtime.worker import WorkerActionServer, WorkerService
+from dm_calibration.recalibration.map_listener import PUBLISH_PERIOD_S, MapListener
+from dm_calibration.regression.error_prediction import ErrorPrediction
+from dm_calibration.report.report_writer import ReportingStore, ReportWriter
+from dm_common.messages import mirror_from, recipe_book_from, time_message
+from dm_common.ros import diagnostics, qos
+from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.executor import run_node
+from dm_common.ros.parameters import declare
+from dm_common.ros.worker import WorkerActionServer, WorkerService
 
 
 class CalibrationNode(Node):
-    """Topics, services and the action of the calibration; what they do is in CalibrationDesk and CalibrateAction."""
+    """Topics, services and the action of the calibration; what they do is in CalibrationManager and CalibrateAction."""
 
     def __init__(self) -> None:
         super().__init__("calibration")
@@ -58,7 +53,7 @@ class CalibrationNode(Node):
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.LATCHED)
         self._reports = ReportWriter(self._tell_of_report)
-        self._desk = CalibrationDesk(
+        self._desk = CalibrationManager(
             ReportingStore(
                 self._values["calibration_folder"], self._reports, lambda: bool(self._values["write_report"])
             ),
@@ -66,11 +61,11 @@ class CalibrationNode(Node):
             lambda: int(self.get_clock().now().nanoseconds),
             self._publish,
         )
-        self._bench = RosBench(self, self._values)
+        self._bench = BenchServices(self, self._values)
         self._driver_facts: dict[str, Any] = {}
         action = CalibrateAction(self, self._values, self._bench, self._desk, lambda: self._driver_facts)
         self._server = WorkerActionServer(self, Calibrate, "calibrate", action.run, exclusive="refuse")
-        self._watch = CalibrationWatch(self, self._values, self._desk, self._bench, lambda: self._server.busy)
+        self._watch = MapListener(self, self._values, self._desk, self._bench, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load)
         WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)

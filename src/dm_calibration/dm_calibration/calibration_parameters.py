@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dm_calibration.bump_check import BumpOptions
-from dm_calibration.calibration_updates import UpdateOptions
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.quality import GradeOptions
 from dm_calibration.influence.screening import ScreeningOptions
-from dm_calibration.memory.updates import DriftRates
-from dm_calibration.procedure import ProcedureOptions
-from dm_runtime.parameters import Parameter
+from dm_calibration.procedure.bump_check import BumpOptions
+from dm_calibration.procedure.procedure import ProcedureOptions
+from dm_calibration.recalibration.drift_filter import DriftRates
+from dm_calibration.recalibration.updates import UpdateOptions
+from dm_common.ros.parameters import Parameter
 
 PARAMETERS = (
     Parameter("calibration_folder", str, "~/.ros/dm_calibrations", "Folder of the calibration files."),
@@ -31,7 +31,7 @@ PARAMETERS = (
     ),
     Parameter("poke_amplitude", float, 0.5, "Half-swing of a push-pull poke, normalised.", "", 0.01, 1.0, live=True),
     Parameter("reference_every", int, 10, "Steps between two reference frames.", "", 1, 1000, live=True),
-    Parameter("memory_maps", int, 300, "Commands of a memory plan; more give less noise.", "", 60, 2000, live=True),
+    Parameter("hysteresis_maps", int, 300, "Commands of a memory plan; more give less noise.", "", 60, 2000, live=True),
     Parameter("settle_time", float, 0.5, "Wait between command and map, in ROS time.", "s", 0.0, 600.0, live=True),
     Parameter("measure_retries", int, 1, "Further tries after a map that failed.", "", 0, 20, live=True),
     Parameter(

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration, software_version
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
 from dm_calibration.influence.maps import EXCITATION, SURFACE, MapSet
-from dm_calibration.influence.mirror import Mirror
+from dm_calibration.influence.poke_check import PokeCheck, check_pokes
 from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
 from dm_calibration.influence.region_weighting import weighting_of
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_calibration.memory.memory_fit import MemoryFit, effective_maps, fit_memory
-from dm_calibration.poke_check import PokeCheck, check_pokes
-from dm_calibration.procedure import Outcome
+from dm_calibration.procedure.procedure import Outcome
+from dm_common.mirror import Mirror
 
 Floats = NDArray[np.float64]
 
@@ -53,10 +53,10 @@ def evaluate(
         ValueError: time stamps that run backwards where the memory is to be identified.
     """
     maps = outcome.maps()
-    memory = fit_memory(maps) if EXCITATION in maps.kind else None
-    fit = fit_remembering(maps, memory, options, mirror)
+    hysteresis = fit_hysteresis(maps) if EXCITATION in maps.kind else None
+    fit = fit_remembering(maps, hysteresis, options, mirror)
     check = check_fit(fit, mirror)
-    limitations = [*fit.limitations, *(memory.remarks if memory else ()), *run_limitations]
+    limitations = [*fit.limitations, *(hysteresis.remarks if hysteresis else ()), *run_limitations]
     if not outcome.radius_known:
         limitations.append(
             "The maps do not tell their aperture radius; the mirror's working aperture "
@@ -84,7 +84,7 @@ def evaluate(
         limitations=tuple(limitations),
         note=provenance.note,
         software_version=software_version(),
-        memory=memory,
+        hysteresis=hysteresis,
         region_weights=_region_weights(maps, fit, options),
     )
     return calibration, check
@@ -101,16 +101,16 @@ def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Flo
 
 
 def fit_remembering(
-    maps: MapSet, memory: MemoryFit | None, options: FitOptions, mirror: Mirror, exclude: Collection[str] = ()
+    maps: MapSet, hysteresis: HysteresisFit | None, options: FitOptions, mirror: Mirror, exclude: Collection[str] = ()
 ) -> InfluenceFit:
     """The influence function of `maps`, of effective signals when a memory is known.
 
     Raises:
         As :func:`~dm_calibration.influence.fit.fit_influence`.
     """
-    if memory is None:
+    if hysteresis is None:
         return fit_influence(maps, options, rings=mirror.rings, exclude=exclude)
-    fit = fit_influence(effective_maps(maps, memory.law), options, rings=mirror.rings, exclude=exclude)
+    fit = fit_influence(effective_maps(maps, hysteresis.law), options, rings=mirror.rings, exclude=exclude)
     return replace(fit, signal_min=float(maps.applied.min()), signal_max=float(maps.applied.max()))
 
 
@@ -124,7 +124,7 @@ def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], pr
     mirror = Mirror(
         stored.mirror_name, stored.mirror_serial, stored.actuator_x, stored.actuator_y, stored.aperture_radius
     )
-    fit = fit_remembering(stored.maps, stored.memory, options, mirror, exclude)
+    fit = fit_remembering(stored.maps, stored.hysteresis, options, mirror, exclude)
     of_the_run = [sentence for sentence in stored.limitations if sentence not in stored.fit.limitations]
     without = f" without {', '.join(exclude)}" if exclude else ""
     return replace(

@@ -21,17 +21,22 @@ from rclpy.time import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from dm_runtime import diagnostics, parameters, qos
-from dm_runtime.executor import run_node
-from dm_runtime.worker import WorkerService
-
-from . import interferometer_messages as messages
-from .acquisition import Acquired, Acquisition, AcquisitionStoppedError, MapTimeoutError, NothingToAcquireError
-from .ingest import Ingest, MapRejectedError, Measurement
-from .interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
-from .map_files import MapFileError, NoValidPixelsError
-from .optics.aperture import InsufficientDataError
-from .trigger import TriggerError
+from dm_calibration.acquisition import interferometer_messages as messages
+from dm_calibration.acquisition.acquisition import (
+    Acquired,
+    Acquisition,
+    AcquisitionStoppedError,
+    MapTimeoutError,
+    NothingToAcquireError,
+)
+from dm_calibration.acquisition.ingest import Ingest, MapRejectedError, Measurement
+from dm_calibration.acquisition.trigger import TriggerError
+from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
+from dm_calibration.map_files import MapFileError, NoValidPixelsError
+from dm_calibration.optics.aperture import InsufficientDataError
+from dm_common.ros import diagnostics, parameters, qos
+from dm_common.ros.executor import run_node
+from dm_common.ros.worker import WorkerService
 
 #: First match wins, so the special case of a family stands before it.
 _ERROR_CODES: tuple[tuple[type[Exception], int], ...] = (

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dm_runtime.parameters import Parameter
-
-from .acquisition import AcquisitionSettings
-from .ingest import IngestSettings
-from .map_files import XYZ_UNITS
-from .optics.orientation import ROTATIONS, Orientation
+from dm_calibration.acquisition.acquisition import AcquisitionSettings
+from dm_calibration.acquisition.ingest import IngestSettings
+from dm_calibration.map_files import XYZ_UNITS
+from dm_calibration.optics.orientation import ROTATIONS, Orientation
+from dm_common.ros.parameters import Parameter
 
 PARAMETERS = (
     Parameter("autostart", bool, True, "Configure and activate by itself after the start."),

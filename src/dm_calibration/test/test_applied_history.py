@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_calibration.applied_history import AppliedHistory, MapNotUsableError, Report
-from dm_calibration.memory.law import MemoryLaw
-from dm_calibration.memory.tracker import Applied
+from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError, Report
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.tracker import Applied
 
 #: A signal with a backlash of half-width 0.3 that carries half of it.
-LAW = MemoryLaw(np.array([0.0, 0.3]), np.array([[0.5], [0.5]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
+LAW = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.5], [0.5]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
 
 
 class Driver:
@@ -80,7 +80,7 @@ def test_holding_a_shape_against_creep_is_no_move(history: AppliedHistory, drive
     assert history.standing(20.2, 1.0).effective == pytest.approx(0.2001)
 
 
-def test_effective_signals_follow_the_memory(history: AppliedHistory, driver: Driver) -> None:
+def test_effective_signals_follow_the_hysteresis(history: AppliedHistory, driver: Driver) -> None:
     history.follow(LAW)
     driver.degauss(1.0)
     driver.go(2.0, 0.8)

@@ -8,7 +8,7 @@ import pytest
 
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options
 from dm_calibration.influence.fit import FitOptions
-from dm_runtime.parameters import ParameterError
+from dm_common.ros.parameters import ParameterError
 
 DEFAULTS: dict[str, Any] = {parameter.name: parameter.default for parameter in PARAMETERS}
 

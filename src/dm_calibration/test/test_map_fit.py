@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
-from dm_calibration.optics.piston_tilt import fit_plane, remove_piston_tilt
 from dm_calibration.optics.regions import ConcentricRegions
-from dm_calibration.optics.zernike import basis
+from dm_common.optics.piston_tilt import fit_plane, remove_piston_tilt
+from dm_common.optics.zernike import basis
 
 
 def unit_coordinates(shape: tuple[int, int], x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dm_calibration.hysteresis.features import crept, play_features
 from dm_calibration.influence.maps import MapRecord, MapSet
-from dm_calibration.memory.features import crept, play_features
-from dm_calibration.memory.law import CREEP_TIMES, MemoryLaw, certain_reach, follow
-from dm_calibration.optics.sampling import edge_clustered_points
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, certain_reach, follow
+from dm_common.optics.sampling import edge_clustered_points
 
 RATE = 0.02
-LAW = MemoryLaw(np.zeros(1), np.ones((1, 1)), np.zeros(0), 0.0, RATE, CREEP_TIMES)
+LAW = HysteresisModel(np.zeros(1), np.ones((1, 1)), np.zeros(0), 0.0, RATE, CREEP_TIMES)
 SIGNALS = np.array([[0.5], [-0.5], [0.8], [0.8]])
 TIME = np.array([1.0, 4.0, 9.0, 60.0])
 MOVED = np.array([0.2, 3.5, 4.0, 9.0])
@@ -54,7 +54,7 @@ def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
 
 
 def test_what_is_certainly_within_reach_leaves_room_for_hysteresis_and_creep() -> None:
-    assert certain_reach(MemoryLaw.linear(), -1.0, 0.5) == pytest.approx((-1.0, 0.5))
+    assert certain_reach(HysteresisModel.linear(), -1.0, 0.5) == pytest.approx((-1.0, 0.5))
     low, high = certain_reach(LAW, -1.0, 1.0)
     assert -1.0 < low < -0.85 and 0.85 < high < 1.0
     rng = np.random.default_rng(7)

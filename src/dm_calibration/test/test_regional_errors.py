@@ -5,17 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_calibration.influence.sag import remove_piston_tilt
 from dm_calibration.optics.aperture import Aperture
-from dm_calibration.optics.regions import (
-    AREA_FRACTIONS,
-    ConcentricRegions,
-    EmptyRegionError,
-    figure_5,
-    region_statistics,
-)
-from dm_calibration.optics.sample_regions import disc_shares, regional_rms
-from dm_calibration.optics.sampling import SamplePoints, edge_clustered_points, sample_map, uniform_points
+from dm_calibration.optics.regions import ConcentricRegions, figure_5, region_statistics
+from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.sample_regions import AREA_FRACTIONS, EmptyRegionError, disc_shares, regional_rms
+from dm_common.optics.sampling import SamplePoints, edge_clustered_points, sample_map, uniform_points
 
 SIZE = 301
 APERTURE = Aperture(150.0, 150.0, 150.0)

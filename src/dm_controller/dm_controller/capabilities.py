@@ -6,12 +6,12 @@ from typing import Any
 
 from dm_msgs.msg import Capabilities
 
-from dm_controller.mirror_in_use import MirrorInUse
+from dm_controller.active_calibration import ActiveCalibration
 from dm_controller.target import FocusTarget
 
 
 def capabilities_message(
-    use: MirrorInUse, tolerance: float, unknown: str, stale: str, condition_time: float
+    use: ActiveCalibration, tolerance: float, unknown: str, stale: str, condition_time: float
 ) -> Capabilities:
     """Capabilities of a calibrated mirror, without the header.
 
@@ -24,7 +24,7 @@ def capabilities_message(
     """
     low, high = use.reachable_range(FocusTarget(0.0), tolerance)
     sentences = [f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
-    if unknown and use.loop.memory is not None:
+    if unknown and use.loop.hysteresis is not None:
         sentences.append(f"wider error bound: {unknown}")
     if stale:
         sentences.append(stale)

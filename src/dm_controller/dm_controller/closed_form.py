@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.optics.conic_series import ORDERS, series, series_coefficients, series_sag
-from dm_calibration.optics.zernike import TERMS, basis
+from dm_common.optics.conic_series import ORDERS, series, series_coefficients, series_sag
+from dm_common.optics.zernike import TERMS, basis
 from dm_controller.target import FocusTarget
 
 Floats = NDArray[np.float64]

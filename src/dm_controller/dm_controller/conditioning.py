@@ -16,9 +16,9 @@ from dm_msgs.msg import ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import Degauss
 from rclpy.node import Node
 
+from dm_common.errors import Refusal
+from dm_common.ros.worker import ServiceCallError, call
 from dm_controller.driver_watch import DriverWatch
-from dm_controller.refusal import Refusal
-from dm_runtime.worker import ServiceCallError, call
 
 #: Half-swings that the driver does when it is not told how many, as far as can be known from here.
 STEPS_ASSUMED = 100

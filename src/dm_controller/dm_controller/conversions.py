@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.calibration_messages import doubles, memory_law_from
-from dm_controller.model import InfluenceModel
-from dm_controller.open_loop import MemoryFigures
+from dm_common.messages import doubles, hysteresis_model_from
+from dm_controller.mirror_model import InfluenceModel
+from dm_controller.planner import HysteresisFigures
 from dm_controller.solvers.bounded import Limits
 from dm_controller.target import FocusTarget
 
-__all__ = ["doubles", "limits_of", "memory_figures_of", "model_of", "target_of"]
+__all__ = ["doubles", "hysteresis_figures_of", "limits_of", "model_of", "target_of"]
 
 #: A law is scaled so that effective signals span this over a full cycle; gains are in the influence function.
 SPAN = 2.0
@@ -49,37 +49,37 @@ def model_of(calibration: Any) -> InfluenceModel:
     )
 
 
-def memory_figures_of(calibration: Any) -> MemoryFigures | None:
+def hysteresis_figures_of(calibration: Any) -> HysteresisFigures | None:
     """The memory of a dm_msgs/Calibration; None when none was identified.
 
     Raises:
         ValueError: a field that makes no sense, or a law that has no inverse, naming it.
     """
-    memory = calibration.memory
+    hysteresis = calibration.hysteresis
     try:
-        law = memory_law_from(memory)
+        law = hysteresis_model_from(hysteresis)
     except ValueError as error:
-        raise ValueError(f"memory: {str(error).removeprefix('memory: ')}") from error
+        raise ValueError(f"hysteresis: {str(error).removeprefix('memory: ')}") from error
     if law is None:
         return None
     slope = law.slope_min()
     if not slope > 0.0:
         raise ValueError(
-            f"memory: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"
+            f"hysteresis: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"
         )
     span = law.span()
     if not abs(span - SPAN) <= SPAN_TOLERANCE:
         raise ValueError(
-            f"memory: play_weight: effective signals span {span:.3g}, must be {SPAN:g}: a law of another scale"
+            f"hysteresis: play_weight: effective signals span {span:.3g}, must be {SPAN:g}: a law of another scale"
         )
-    sigma = np.array(memory.zernike_sigma, dtype=np.float64)
+    sigma = np.array(hysteresis.zernike_sigma, dtype=np.float64)
     if sigma.shape != (calibration.terms,) or not (np.isfinite(sigma) & (sigma >= 0.0)).all():
-        raise ValueError(f"memory: zernike_sigma: must be {calibration.terms} finite numbers, none negative")
+        raise ValueError(f"hysteresis: zernike_sigma: must be {calibration.terms} finite numbers, none negative")
     for name in ("held_out_max_zernike", "unknown_sigma"):
-        value = getattr(memory, name)
+        value = getattr(hysteresis, name)
         if not (np.isfinite(value) and value >= 0.0):
-            raise ValueError(f"memory: {name} = {value:g}: must be finite and not negative")
-    return MemoryFigures(law, sigma, memory.held_out_max_zernike, memory.unknown_sigma)
+            raise ValueError(f"hysteresis: {name} = {value:g}: must be finite and not negative")
+    return HysteresisFigures(law, sigma, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma)
 
 
 def limits_of(mirror: Any) -> Limits:

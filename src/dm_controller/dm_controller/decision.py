@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 from dm_msgs.msg import ErrorCode, FocusRequest
 
-from dm_calibration.memory.recipes import RecipeError
+from dm_common.errors import Refusal
+from dm_common.recipes import RecipeError
+from dm_controller.active_calibration import ActiveCalibration
 from dm_controller.conversions import target_of
-from dm_controller.memory_watch import Look, after_degauss
-from dm_controller.mirror_in_use import MirrorInUse
-from dm_controller.open_loop import Move
+from dm_controller.hysteresis_observer import Look, after_degauss
+from dm_controller.planner import Move
 from dm_controller.recipes import FoundRecipe, find
-from dm_controller.refusal import Refusal
 from dm_controller.target import FocusTarget, TargetError
 
 #: A message's constants are properties of its class, which take longer to look up.
@@ -51,7 +51,7 @@ class Decision:
         return self._find_range()
 
 
-class Situation(NamedTuple):
+class PlanningContext(NamedTuple):
     """What a decision depends on beside the request.
 
     Attributes:
@@ -63,7 +63,7 @@ class Situation(NamedTuple):
         degauss_time: s that a degauss of so many half-swings takes; 0 = not known.
     """
 
-    use: MirrorInUse
+    use: ActiveCalibration
     look: Look
     now: float
     conditioned: int | None
@@ -71,12 +71,12 @@ class Situation(NamedTuple):
     degauss_time: Callable[[int], float]
 
 
-def condition_steps(use: MirrorInUse, configured: int) -> int:
+def condition_steps(use: ActiveCalibration, configured: int) -> int:
     """Half-swings of the degauss that conditions: as `configured`, else as the recipes were built; 0 = the driver's."""
     return configured or (use.recipes.degauss_steps if use.recipes.recipes else 0)
 
 
-def decide(request: FocusRequest, situation: Situation, values: Mapping[str, Any]) -> Decision:
+def decide(request: FocusRequest, situation: PlanningContext, values: Mapping[str, Any]) -> Decision:
     """Judge a request: everything that can be known before anything moves. `values`: the node's parameters.
 
     Raises:
@@ -116,7 +116,7 @@ def _budget(request: FocusRequest, values: Mapping[str, Any]) -> float:
 class _Options:
     """The ways to one target."""
 
-    situation: Situation
+    situation: PlanningContext
     target: FocusTarget
     tolerance: float
     steps: int

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode, FocusRequest
 
-from dm_controller.refusal import Refusal
+from dm_common.errors import Refusal
 from dm_controller.request_checks import check_driver
 
 

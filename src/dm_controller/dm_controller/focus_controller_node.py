@@ -22,28 +22,27 @@ from dm_msgs.srv import Flatten, SetFocus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_calibration.calibration_messages import stamp_ns, time_message
+from dm_common.errors import Refusal
+from dm_common.messages import doubles, stamp_ns, time_message
+from dm_common.ros import diagnostics, qos
+from dm_common.ros.executor import run_node
+from dm_common.ros.parameters import declare
+from dm_common.ros.worker import never_silent
+from dm_controller.active_calibration import NO_CALIBRATION, ActiveCalibration, active_calibration
 from dm_controller.capabilities import capabilities_message, settling_time
 from dm_controller.conditioning import Conditioner, Waiting
-from dm_controller.converge_action import ConvergeAction
-from dm_controller.conversions import doubles
-from dm_controller.decision import Decision, Situation, condition_steps, decide
+from dm_controller.converge.converge_action import ConvergeAction
+from dm_controller.creep_hold import SAME_SIGNAL, CreepHold
+from dm_controller.decision import Decision, PlanningContext, condition_steps, decide
 from dm_controller.driver_watch import DriverWatch
 from dm_controller.focus_parameters import PARAMETERS
 from dm_controller.focus_report import Outcome, fill_state, health, state_of
-from dm_controller.hold import SAME_SIGNAL, Hold
+from dm_controller.hysteresis_observer import CURE, HysteresisObserver, same_model
 from dm_controller.latency import Latency
-from dm_controller.memory_watch import CURE, MemoryWatch, same_law
-from dm_controller.mirror_in_use import NO_CALIBRATION, MirrorInUse, mirror_in_use
 from dm_controller.move_focus_action import MoveFocusAction
 from dm_controller.prediction import ForecastClient
-from dm_controller.refusal import Refusal
 from dm_controller.request_checks import check_age, check_reachable
 from dm_controller.target import FocusTarget
-from dm_runtime import diagnostics, qos
-from dm_runtime.executor import run_node
-from dm_runtime.parameters import declare
-from dm_runtime.worker import never_silent
 
 #: Time after a command until `focus_state` tells of it, s. Whoever waits for the command wakes up meanwhile: it may
 #: have to on this very core (measured: 0.2 ms sooner).
@@ -55,7 +54,7 @@ LOOK_S = 0.5
 
 
 class FocusControllerNode(Node):
-    """See README for the interfaces; the mathematics is in `dm_controller.model` and `dm_controller.open_loop`.
+    """See README for the interfaces; the mathematics is in `dm_controller.mirror_model` and `dm_controller.planner`.
 
     Requests come from the executor and from the threads of move_focus and conditioning. They are judged and carried out
     one at a time, under `_turn`.
@@ -67,12 +66,12 @@ class FocusControllerNode(Node):
         self._turn = threading.RLock()
         self._mirror_info: MirrorInfo | None = None
         self._calibration: Calibration | None = None
-        self._use: MirrorInUse | None = None
+        self._use: ActiveCalibration | None = None
         self._not_calibrated = Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
         self._driver = DriverWatch(self._values)
         self._asked: Any = ()  # signals of the last request's command; () = the last command answers none
         self._sent: Any = ()  # signals of the last command: those, or with creep corrected
-        self._watch, self._hold, self._latency = MemoryWatch(), Hold(self._values), Latency()
+        self._watch, self._hold, self._latency = HysteresisObserver(), CreepHold(self._values), Latency()
         self._told: tuple[object, ...] = ()  # what the last capabilities said of the driver
         self._counts = {"requests": 0, "refused": 0}
 
@@ -131,11 +130,11 @@ class FocusControllerNode(Node):
             self._tell()
             before = self._use
             try:
-                use = mirror_in_use(self._calibration, self._mirror_info, self._values["aperture_tolerance"])
+                use = active_calibration(self._calibration, self._mirror_info, self._values["aperture_tolerance"])
                 # A new revision leaves the shape that stands as it is: so it can be held on.
                 if before is None or before.calibration.id != use.calibration.id:
                     self._hold.end("another calibration is used")
-                elif not same_law(before.loop.law, use.loop.law):
+                elif not same_model(before.loop.law, use.loop.law):
                     self._hold.end("the memory law changed")
                 self.get_logger().info(f"using calibration {use.calibration.id} of {use.calibration.mirror_serial}")
                 self._watch.use(use.loop.law, use.middle)
@@ -151,7 +150,7 @@ class FocusControllerNode(Node):
     def _use_forecast(self) -> None:
         """Let the forecast fetch what it lacks for a calibration that does not know the memory itself."""
         use = self._use
-        if use is None or use.loop.memory is not None:
+        if use is None or use.loop.hysteresis is not None:
             self._forecast.use("", None, (0.0, 0.0))
             return
         reachable = use.reachable_range(FocusTarget(0.0), self._values["reachable_tolerance"])
@@ -184,7 +183,7 @@ class FocusControllerNode(Node):
         if conditioned is None and self._conditioner.busy:
             conditioned, wait = self._conditioner.steps, self._conditioner.remaining(use.slew_rate, use.span)
         look = self._watch.look(now, use.slew_rate)
-        situation = Situation(use, look, now, conditioned, wait, self._degauss_time)
+        situation = PlanningContext(use, look, now, conditioned, wait, self._degauss_time)
         return decide(request, situation, self._values)
 
     def _degauss_time(self, steps: int) -> float:
@@ -297,9 +296,9 @@ class FocusControllerNode(Node):
         return state
 
     def _send(
-        self, signals: Any, request: FocusRequest | None = None, now_ns: int | None = None, if_turns: int = 0
+        self, signals: Any, request: FocusRequest | None = None, now_ns: int | None = None, expected_turns: int = 0
     ) -> Any:
-        command = ActuatorCommand(signals=doubles(signals), if_turns=if_turns)
+        command = ActuatorCommand(signals=doubles(signals), expected_turns=expected_turns)
         command.header.stamp = time_message(self._now_ns() if now_ns is None else now_ns)
         self._command.publish(command)
         self._latency.sent(command)
@@ -361,7 +360,7 @@ class FocusControllerNode(Node):
         signals = self._hold.correction(self._watch.look(now), now)
         if signals is not None:
             self._hold.sent(signals, now)
-            self._send(signals, if_turns=driver.turns)
+            self._send(signals, expected_turns=driver.turns)
 
     def _on_focus_request(self, request: FocusRequest) -> None:
         with self._turn:
@@ -400,12 +399,12 @@ class FocusControllerNode(Node):
         self._told = (driver.driver_state if driver is not None else None, unknown)
         self._capabilities.publish(message)
 
-    def _remarks(self, use: MirrorInUse, unknown: str) -> str:
+    def _remarks(self, use: ActiveCalibration, unknown: str) -> str:
         """What makes predictions worse than they could be, in words; "" = nothing."""
         history = f"the history of the actuators is not known ({unknown}): {CURE}" if unknown else ""
-        return "; ".join(filter(None, (history if use.loop.memory is not None else "", self._stale(use))))
+        return "; ".join(filter(None, (history if use.loop.hysteresis is not None else "", self._stale(use))))
 
-    def _stale(self, use: MirrorInUse) -> str:
+    def _stale(self, use: ActiveCalibration) -> str:
         return use.stale(self._now_ns(), self._values["calibration_age_max"])
 
     def _health(self) -> diagnostics.Health:

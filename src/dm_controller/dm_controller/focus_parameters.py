@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-from dm_controller.converge_action import CONVERGE_PARAMETERS
-from dm_controller.hold import PERIOD_S
-from dm_controller.open_loop import SETTLE_S
-from dm_runtime.parameters import Parameter
+from dm_common.ros.parameters import Parameter
+from dm_controller.converge.converge_action import CONVERGE_PARAMETERS
+from dm_controller.creep_hold import PERIOD_S
+from dm_controller.planner import SETTLE_S
 
 PARAMETERS: Final = (
     Parameter(

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from dm_msgs.msg import FocusRequest, FocusState
 
+from dm_common.errors import Refusal
+from dm_common.messages import doubles
+from dm_common.ros import diagnostics
 from dm_controller.conditioning import Waiting
-from dm_controller.conversions import doubles
 from dm_controller.decision import Decision
 from dm_controller.prediction import Forecast
-from dm_controller.refusal import Refusal
-from dm_runtime import diagnostics
 
 
 class Outcome(NamedTuple):

@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 from dm_msgs.msg import ActuatorCommand, ActuatorState
 
-from dm_calibration.calibration_messages import stamp_ns
+from dm_common.messages import stamp_ns
 
 #: Moves over which it is taken.
 MOVES = 20

@@ -12,9 +12,9 @@ from dm_msgs.msg import ActuatorState, ErrorCode, FocusRequest, FocusState
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
+from dm_common.ros.worker import WorkerActionServer, sleep
 from dm_controller.conditioning import Waiting
 from dm_controller.driver_watch import DriverWatch
-from dm_runtime.worker import WorkerActionServer, sleep
 
 #: How a goal ends whose shape somebody else replaced.
 _SUPERSEDED = ("abort", ErrorCode.PREEMPTED, "another command took over")

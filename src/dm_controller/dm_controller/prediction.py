@@ -19,9 +19,9 @@ from dm_msgs.srv import PredictError
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from dm_calibration.optics.zernike import basis
-from dm_controller.conversions import doubles
-from dm_controller.model import CalibratedMirror, InfluenceModel
+from dm_common.messages import doubles
+from dm_common.optics.zernike import basis
+from dm_controller.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.target import FocusTarget
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ class Forecast:
 
 
 @dataclass(frozen=True, eq=False)
-class MemoryShare:
+class HysteresisShare:
     """Mean square residual that the actuators' memory adds, over curvature.
 
     Attributes:
@@ -61,7 +61,7 @@ class MemoryShare:
         return Forecast(rms, lower, upper)
 
 
-def memory_share(curvature: Floats, answers: Floats, modelled: Floats) -> MemoryShare:
+def hysteresis_share(curvature: Floats, answers: Floats, modelled: Floats) -> HysteresisShare:
     """From answers of `predict_error` to the share of the memory in them.
 
     Args:
@@ -71,7 +71,7 @@ def memory_share(curvature: Floats, answers: Floats, modelled: Floats) -> Memory
     """
     order = np.argsort(curvature)
     square = np.maximum(np.square(answers) - np.square(modelled)[:, np.newaxis], 0.0)
-    return MemoryShare(curvature[order], square[order])
+    return HysteresisShare(curvature[order], square[order])
 
 
 def surface_control_error_rms(model: InfluenceModel, signals: Floats) -> float:
@@ -93,7 +93,7 @@ class ForecastClient:
 
     def __init__(self, node: Node, on_change: Callable[[], None] = lambda: None) -> None:
         """`on_change` is called, in the executor, when there is a new share."""
-        self.share: MemoryShare | None = None
+        self.share: HysteresisShare | None = None
         self._node, self._on_change = node, on_change
         self._client = node.create_client(PredictError, "predict_error")
         self._calibration_id = ""
@@ -136,7 +136,7 @@ class ForecastClient:
             )
 
     def forecast(self, curvature: float, model_rms: float) -> Forecast | None:
-        """See :meth:`MemoryShare.forecast`; None while there is no share."""
+        """See :meth:`HysteresisShare.forecast`; None while there is no share."""
         return None if self.share is None else self.share.forecast(curvature, model_rms)
 
     def _on_answer(
@@ -152,5 +152,5 @@ class ForecastClient:
             return
         answers[row] = answer.predicted_rms, answer.lower, answer.upper
         if self.share is None and np.isfinite(answers).all():
-            self.share = memory_share(grid, answers, modelled)
+            self.share = hysteresis_share(grid, answers, modelled)
             self._on_change()

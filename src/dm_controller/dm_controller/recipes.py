@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator, make_interp_spline
 
-from dm_calibration.memory.recipes import Recipe, RecipeBook, RecipeError
-from dm_controller.model import FREE_TERMS
+from dm_common.recipes import Recipe, RecipeBook, RecipeError
+from dm_controller.mirror_model import FREE_TERMS
 from dm_controller.target import FocusTarget
 
 Floats = NDArray[np.float64]

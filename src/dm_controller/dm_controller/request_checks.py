@@ -6,8 +6,8 @@ import math
 
 from dm_msgs.msg import ActuatorState, ErrorCode
 
+from dm_common.errors import Refusal
 from dm_controller.decision import Decision
-from dm_controller.refusal import Refusal
 
 #: A message's constants are properties of its class, which take longer to look up.
 _ACTIVE = ActuatorState.STATE_ACTIVE

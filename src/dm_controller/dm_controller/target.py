@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.optics.conic import conic_coefficients, conic_sag
-from dm_calibration.optics.zernike import TERMS, basis
+from dm_common.optics.conic import conic_coefficients, conic_sag
+from dm_common.optics.zernike import TERMS, basis
 
 
 class TargetError(ValueError):

@@ -8,8 +8,8 @@ from array import array
 import pytest
 from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode, FocusRequest
 
+from dm_common.errors import Refusal
 from dm_controller.driver_watch import DriverWatch
-from dm_controller.refusal import Refusal
 
 TIMEOUT = 2.0
 HERE, THERE = array("d", [0.1] * 37), array("d", [0.2] * 37)

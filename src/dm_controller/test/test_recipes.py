@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_calibration.memory.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
+from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 from dm_controller.recipes import find, interpolation_error
 from dm_controller.target import FocusTarget
 

@@ -16,7 +16,7 @@ from dm_driver.degauss import degauss_waypoints
 from dm_driver.electronics.base import DriveElectronics, ElectronicsError
 from dm_driver.last_shape import LastShape
 from dm_driver.moves import Counters, Kind, Move, Outcome, WriterState
-from dm_driver.output_stage import OutputStage
+from dm_driver.output.output_stage import OutputStage
 from dm_driver.refusal import Reason, Refusal
 from dm_driver.safety_limiter import SafetyLimiter, Shape, Watchdog, largest_change
 

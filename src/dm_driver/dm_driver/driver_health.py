@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from dm_common.ros.diagnostics import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.driver_messages import Complaint
 from dm_driver.refusal import Reason
-from dm_runtime.diagnostics import ERROR, OK, WARN, Health
 
 
 def driver_health(writer: ActuatorWriter | None, complaint: Complaint, refused: Mapping[str, int]) -> Health:

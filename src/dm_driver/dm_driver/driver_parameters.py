@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from dm_common.ros.parameters import REQUIRED, Parameter
 from dm_driver.electronics import BACK_ENDS
 from dm_driver.electronics.check_sums import CHECK_SUMS
 from dm_driver.electronics.frame_format import BYTE_ORDERS, MOST_BITS, MOST_WORD_BITS, PARITIES, FrameFormat
-from dm_runtime.parameters import REQUIRED, Parameter
 
 _FRAME: Final = FrameFormat()
 

@@ -22,6 +22,9 @@ from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.time import Time
 
+from dm_common.ros import diagnostics, parameters, qos
+from dm_common.ros.executor import run_node
+from dm_common.ros.worker import WorkerService
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.driver_configuration import DriverConfiguration, build_configuration
 from dm_driver.driver_health import driver_health
@@ -30,9 +33,6 @@ from dm_driver.driver_parameters import PARAMETERS
 from dm_driver.last_shape import LastShape, record_path
 from dm_driver.moves import Move, Outcome, WriterState
 from dm_driver.refusal import Reason, Refusal
-from dm_runtime import diagnostics, parameters, qos
-from dm_runtime.executor import run_node
-from dm_runtime.worker import WorkerService
 
 #: Shortest time between two state messages in the middle of a ramp.
 STATE_INTERVAL_S = 0.02
@@ -191,7 +191,7 @@ class PdmDriver(LifecycleNode):
             if stamp.nanoseconds:
                 configuration.limiter.check_age((self.get_clock().now() - stamp).nanoseconds * 1e-9)
             shape = configuration.limiter.check_shape(message.signals)
-            return writer.correct(shape, message.if_turns) if message.if_turns else writer.command(shape)
+            return writer.correct(shape, message.expected_turns) if message.expected_turns else writer.command(shape)
 
         self._attempt("actuator_command", carry_out)
 

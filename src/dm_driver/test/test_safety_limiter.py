@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.degauss import degauss_waypoints
-from dm_driver.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.refusal import Reason, Refusal
 from dm_driver.safety_limiter import Limits, SafetyLimiter, Watchdog
 

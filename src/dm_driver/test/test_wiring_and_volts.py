@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dm_driver.geometry import hexagonal_positions, neighbour_pairs, ring_count
-from dm_driver.output_stage import OutputStage
-from dm_driver.volts import VoltScale
-from dm_driver.wiring import TABLES, wiring_table
+from dm_common.geometry import hexagonal_positions, neighbour_pairs, ring_count
+from dm_driver.output.output_stage import OutputStage
+from dm_driver.output.volts import VoltScale
+from dm_driver.output.wiring import TABLES, wiring_table
 
 
 @pytest.mark.parametrize("name", sorted(TABLES))

@@ -21,11 +21,11 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GradeOptions
 from dm_calibration.influence.region_weighting import choose_weighting, weighted_coefficients
 from dm_calibration.influence.regression import METHODS, Design, Method, Regression, TooFewMapsError, make_design
-from dm_calibration.influence.sag import rms
 from dm_calibration.influence.screening import ScreeningOptions
 from dm_calibration.influence.weights import check_epsilon
-from dm_calibration.names import unknown_name
-from dm_calibration.optics.sampling import SamplePoints
+from dm_common.names import unknown_name
+from dm_common.optics.sag import rms
+from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.optics.sampling import SamplePoints
+from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence.regression import Design
-from dm_calibration.optics.zernike import TERM_RMS
+from dm_common.optics.zernike import TERM_RMS
 
 Floats = NDArray[np.float64]
 

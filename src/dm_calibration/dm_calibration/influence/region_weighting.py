@@ -21,16 +21,16 @@ from dm_calibration.influence import quality
 from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import SURFACE, MapSet
 from dm_calibration.influence.regression import Design, TooFewMapsError, least_squares, make_design
-from dm_calibration.influence.sag import remove_piston_tilt, weighted_fit
 from dm_calibration.influence.weights import (
     check_epsilon,
     coefficient_operator,
     region_weights,
     surface_control_error,
 )
-from dm_calibration.optics.regions import AREA_FRACTIONS, region_statistics
-from dm_calibration.optics.sample_regions import regional_rms
-from dm_calibration.optics.zernike import PISTON_TILT, TERMS, basis
+from dm_calibration.optics.regions import region_statistics
+from dm_common.optics.sag import remove_piston_tilt, weighted_fit
+from dm_common.optics.sample_regions import AREA_FRACTIONS, regional_rms
+from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 
 Floats = NDArray[np.float64]
 

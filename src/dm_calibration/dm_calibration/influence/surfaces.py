@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from dm_calibration.influence.mirror import Mirror, scale_to_limits
-from dm_calibration.influence.sag import remove_piston_tilt, rms
-from dm_calibration.names import unknown_name
-from dm_calibration.optics.conic import conic_coefficients
-from dm_calibration.optics.sampling import SamplePoints
-from dm_calibration.optics.zernike import TERMS, basis
+from dm_common.mirror import Mirror, scale_to_limits
+from dm_common.names import unknown_name
+from dm_common.optics.conic import conic_coefficients
+from dm_common.optics.sag import remove_piston_tilt, rms
+from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import TERMS, basis
 
 Floats = NDArray[np.float64]
 

@@ -25,11 +25,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dm_calibration.influence.sag import remove_piston_tilt
-from dm_calibration.optics.regions import AREA_FRACTIONS
-from dm_calibration.optics.sample_regions import disc_shares
-from dm_calibration.optics.sampling import SamplePoints
-from dm_calibration.optics.zernike import TERMS, basis
+from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.sample_regions import point_weights
+from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import TERMS, basis
 
 Floats = NDArray[np.float64]
 
@@ -87,26 +86,6 @@ def surface_control_error(sag: Floats, signals: Floats, influence_zernike: Float
     return remove_piston_tilt(sag - nominal, points)
 
 
-def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
-    """(P,) weight of each point: that of the ring it lies in.
-
-    Where the boundary of a region cuts through a point's area the squares are averaged, since weights act squared.
-
-    Args:
-        weights: (R,) of the discs, from the smallest; R of equal steps in area up to the whole aperture.
-
-    Raises:
-        ValueError: weights not above 0, or not one per region.
-    """
-    w = np.asarray(weights, dtype=float)
-    if w.shape != (len(AREA_FRACTIONS),) or not (np.isfinite(w) & (w > 0.0)).all():
-        raise ValueError(
-            f"weights = {w.tolist()}: must be {len(AREA_FRACTIONS)} finite numbers above 0, one per region"
-        )
-    ring_shares = np.diff(disc_shares(points), axis=1, prepend=0.0)
-    return np.asarray(np.sqrt(ring_shares @ np.square(w)))
-
-
 def coefficient_operator(points: SamplePoints, weights: ArrayLike) -> Floats:
     """Place (a): the linear map from sag at the points to the 21 coefficients, points weighted by area and region.
 
@@ -129,22 +108,6 @@ def coefficient_operator(points: SamplePoints, weights: ArrayLike) -> Floats:
     if diagonal.min() < RANK_TOLERANCE * diagonal.max():
         raise ValueError(f"the {len(points)} sampling points do not tell the {len(TERMS)} terms apart: spread them out")
     return np.asarray(np.linalg.solve(r, q.T * row))
-
-
-def command_row_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
-    """Place (b): factor of each row of the command solve min |W(dC - G dS)| on the vector of sag points.
-
-    Multiply the rows of the influence function (P, N) and of the wanted sag (P,) by it. It holds the points' areas too,
-    and its squares sum to 1 as those do: a ridge then weighs as much as without region weights.
-
-    Args:
-        weights: (R,) of the regions.
-
-    Returns:
-        (P,) above 0.
-    """
-    row = np.sqrt(points.weight) * point_weights(points, weights)
-    return np.asarray(row / np.linalg.norm(row))
 
 
 def weights_cancel_max_abs(delta_c: Floats, delta_s: Floats, weights: ArrayLike) -> float:

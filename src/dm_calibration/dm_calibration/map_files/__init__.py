@@ -7,15 +7,15 @@ import os
 import stat
 from pathlib import Path
 
-from ..hdf5_sandbox import SandboxError, read_in_sandbox
-from . import dat
-from .asc import parse_asc
-from .dat import is_dat, parse_dat
-from .datx import is_datx
-from .surface_map import MapFileError, NoValidPixelsError, SurfaceMap
-from .text_header import XYZ_TITLE, is_text
-from .xyz import UNITS as XYZ_UNITS
-from .xyz import parse_xyz
+from dm_calibration.map_files import dat
+from dm_calibration.map_files.asc import parse_asc
+from dm_calibration.map_files.dat import is_dat, parse_dat
+from dm_calibration.map_files.datx import is_datx
+from dm_calibration.map_files.surface_map import MapFileError, NoValidPixelsError, SurfaceMap
+from dm_calibration.map_files.text_header import XYZ_TITLE, is_text
+from dm_calibration.map_files.xyz import UNITS as XYZ_UNITS
+from dm_calibration.map_files.xyz import parse_xyz
+from dm_calibration.store.hdf5_sandbox import SandboxError, read_in_sandbox
 
 __all__ = ["XYZ_UNITS", "MapFileError", "NoValidPixelsError", "SurfaceMap", "read_map"]
 

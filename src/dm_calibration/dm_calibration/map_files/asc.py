@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from .surface_map import MapFileError, SurfaceMap, check_pitch, check_size, sag_from_counts, sag_per_count
-from .text_header import TextHeader, numbers, split_header
+from dm_calibration.map_files.surface_map import (
+    MapFileError,
+    SurfaceMap,
+    check_pitch,
+    check_size,
+    sag_from_counts,
+    sag_per_count,
+)
+from dm_calibration.map_files.text_header import TextHeader, numbers, split_header
 
 
 def _phase_section(header: TextHeader, body: bytes) -> bytes:

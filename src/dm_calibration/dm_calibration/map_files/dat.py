@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from .surface_map import MapFileError, SurfaceMap, check_pitch, check_size, sag_from_counts, sag_per_count
+from dm_calibration.map_files.surface_map import (
+    MapFileError,
+    SurfaceMap,
+    check_pitch,
+    check_size,
+    sag_from_counts,
+    sag_per_count,
+)
 
 #: magic: (format, header size in bytes)
 HEADERS = {0x881B036F: (1, 834), 0x881B0370: (2, 834), 0x881B0371: (3, 4096)}

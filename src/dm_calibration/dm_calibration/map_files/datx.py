@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .datx_structure import SIGNATURE, check_end, check_place, check_storage
-from .surface_map import (
+from dm_calibration.map_files.datx_structure import SIGNATURE, check_end, check_place, check_storage
+from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
     check_factor,

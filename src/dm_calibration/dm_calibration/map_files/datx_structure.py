@@ -9,7 +9,7 @@ from typing import Final
 import h5py
 import numpy as np
 
-from .surface_map import MapFileError
+from dm_calibration.map_files.surface_map import MapFileError
 
 SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .surface_map import MapFileError
+from dm_calibration.map_files.surface_map import MapFileError
 
 ASC_TITLE = b"Zygo ASCII Data File"
 XYZ_TITLE = b"Zygo XYZ Data File"

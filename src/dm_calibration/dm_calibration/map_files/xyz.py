@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .surface_map import (
+from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
     check_heights,
@@ -14,7 +14,7 @@ from .surface_map import (
     check_wavelength,
     no_valid_pixels,
 )
-from .text_header import numbers, split_header
+from dm_calibration.map_files.text_header import numbers, split_header
 
 #: Units the value column may be in, as m; None = waves of the file's wavelength.
 UNITS: dict[str, float | None] = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10, "waves": None}

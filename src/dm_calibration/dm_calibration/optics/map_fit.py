@@ -18,9 +18,9 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy import linalg
 
-from .aperture import Aperture, InsufficientDataError
-from .map_moments import MaskedMoments, mask_moments
-from .zernike import MAX_ORDER, TERM_RMS, TERMS, basis
+from dm_calibration.optics.aperture import Aperture, InsufficientDataError
+from dm_calibration.optics.map_moments import MaskedMoments, mask_moments
+from dm_common.optics.zernike import MAX_ORDER, TERM_RMS, TERMS, basis
 
 Array = NDArray[np.float64]
 

@@ -8,20 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .aperture import Aperture
+from dm_calibration.optics.aperture import Aperture
+from dm_common.optics.sample_regions import AREA_FRACTIONS, check_regions, checked_fractions
 
-#: Shares of the aperture's area, 10 % to 100 %.
-AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))
 #: Surfaces that the paper leaves out of the mean of Fig. 5(b): Z_2^0 and Z_2^2.
 OUTSIDE_MEAN = ("pz02", "pz03")
 
 
 #: Pixels of the blocks in which a map is worked through: 0.5 MB.
 _BLOCK_PIXELS = 2**16
-
-
-class EmptyRegionError(ValueError):
-    """A region holds no data; the message names the map and the region."""
 
 
 class ConcentricRegions:
@@ -186,22 +181,3 @@ def _pieces(columns: NDArray[np.intp], ring: NDArray[np.intp], width: int) -> tu
     begin = (np.arange(len(columns))[:, None] * width + columns).ravel()
     filled = np.diff(begin, append=len(columns) * width) > 0
     return begin[filled], np.tile(ring, len(columns))[filled]
-
-
-def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:
-    """(R,) shares of the area as an array; ValueError unless they rise above 0 and up to 1 at most."""
-    fractions = np.asarray(area_fractions, dtype=float)
-    if not (fractions.size and (np.diff(fractions) > 0).all() and fractions[0] > 0 and fractions[-1] <= 1):
-        raise ValueError(f"area_fractions = {fractions.tolist()}: must rise within 0 to 1")
-    return fractions
-
-
-def check_regions(rms: NDArray[np.float64], area_fractions: NDArray[np.float64], labels: Sequence[str]) -> None:
-    """Raise EmptyRegionError for the first NaN in `rms` (M, R)."""
-    empty = np.argwhere(~np.isfinite(rms))
-    if len(empty):
-        row, region = empty[0]
-        raise EmptyRegionError(
-            f"{labels[row]}: the concentric region of {area_fractions[region]:.0%} of the area holds no valid data; "
-            "measure the map again, or check centre and radius of the aperture"
-        )

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.sag import rms
 from dm_calibration.influence.surfaces import MODEL_NAMES
 from dm_calibration.influence.weights import surface_control_error
-from dm_calibration.regression.history import RunHistory, SagLaw, effective_signals
+from dm_calibration.regression.sag_history import RunHistory, SagLaw, effective_signals
 from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import ErrorRegression, Reading, regress_surface_errors
+from dm_common.optics.sag import rms
 
 Floats = NDArray[np.float64]
 

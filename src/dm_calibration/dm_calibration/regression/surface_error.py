@@ -15,7 +15,7 @@ of these readings are kept (:class:`Reading`):
 - MEASURED: signals, measured coefficients, and `model` with the part inside the 21 terms from those, c - G s, and the
   rest as COMMAND. It uses what the paper uses, but the surface must have been measured.
 - HISTORY: as COMMAND, but `model` follows the commands before this one too
-  (:mod:`~dm_calibration.regression.history`), so it knows what the actuators remember, and the figure drifts with the
+  (:mod:`~dm_calibration.regression.sag_history`), so it knows what the actuators remember, and the figure drifts with the
   reference frames. Nothing measured on the surface itself enters, but the frames before and after it do. This is the
   one that works, and the default.
 
@@ -49,13 +49,9 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.sag import rms
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
-from dm_calibration.names import unknown_name
-from dm_calibration.optics.sample_regions import regional_rms
-from dm_calibration.optics.zernike import TERM_RMS, basis
-from dm_calibration.regression.history import RunHistory
+from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.stepwise import (
     P_ENTER,
     P_REMOVE,
@@ -65,6 +61,10 @@ from dm_calibration.regression.stepwise import (
     leave_one_out,
     stepwise,
 )
+from dm_common.names import unknown_name
+from dm_common.optics.sag import rms
+from dm_common.optics.sample_regions import regional_rms
+from dm_common.optics.zernike import TERM_RMS, basis
 
 Floats = NDArray[np.float64]
 
@@ -256,7 +256,7 @@ def _candidates(
     coefficients = [f"c{k + 1:02d}" for k in range(errors.coefficients.shape[1])]
     if reading is Reading.LINEAR:
         return (*signals, *coefficients), np.hstack((errors.signals, errors.coefficients))
-    predicted = _cross_fitted(maps, fit, test, memory=reading is Reading.HISTORY)
+    predicted = _cross_fitted(maps, fit, test, hysteresis=reading is Reading.HISTORY)
     if reading is not Reading.MEASURED:
         model = rms(predicted, maps.points.weight)
         return (MODEL, *signals), np.column_stack((model, errors.signals))
@@ -269,10 +269,10 @@ def _candidates(
     return (MODEL, *signals, *coefficients), np.column_stack((model, errors.signals, errors.coefficients))
 
 
-def _cross_fitted(maps: MapSet, fit: InfluenceFit, test: NDArray[np.bool_], memory: bool) -> Floats:
+def _cross_fitted(maps: MapSet, fit: InfluenceFit, test: NDArray[np.bool_], hysteresis: bool) -> Floats:
     """(M, P) error surfaces of the sample surfaces, each from a fit that has not seen it, m."""
     rows = _rows(maps, fit)
-    history = RunHistory(maps, fit.sag_offset + maps.applied @ fit.influence_sag.T, memory)
+    history = RunHistory(maps, fit.sag_offset + maps.applied @ fit.influence_sag.T, hysteresis)
     fold = np.full(len(rows), FOLDS)
     fold[~test] = np.arange((~test).sum()) % FOLDS
     seen = fit.used & ~np.isin(maps.step, maps.step[rows[test]])  # repeated maps of a state leave together

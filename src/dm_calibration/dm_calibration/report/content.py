@@ -47,7 +47,7 @@ def remeasured(calibration: Calibration) -> str:
 
 def summary(calibration: Calibration) -> Section:
     """What a user must know first."""
-    fit, memory, wavelength = calibration.fit, calibration.memory, calibration.wavelength
+    fit, hysteresis, wavelength = calibration.fit, calibration.hysteresis, calibration.wavelength
     grades = Counter(GRADE_NAMES[grade] for grade in fit.grades)
     rows = [
         ("residual sag of the maps used, in-sample", length(fit.in_sample_rms, wavelength)),
@@ -58,22 +58,23 @@ def summary(calibration: Calibration) -> Section:
         ("actuators", ", ".join(f"{count} {name}" for name, count in grades.items())),
         ("signals seen", f"{fit.signal_min:+.3f} … {fit.signal_max:+.3f}"),
     ]
-    if memory is not None:
+    if hysteresis is not None:
         rows.insert(
             3, ("largest coefficient error of a move in open loop, held out, 95 %",
-                length(memory.held_out_max_zernike, wavelength)),
+                length(hysteresis.held_out_max_zernike, wavelength)),
         )  # fmt: skip
     rows.insert(
-        4 if memory is not None else 3, ("largest coefficient error, re-measured (recipes)", remeasured(calibration))
+        4 if hysteresis is not None else 3,
+        ("largest coefficient error, re-measured (recipes)", remeasured(calibration)),
     )
-    if memory is None:
+    if hysteresis is None:
         kind = (
             "This calibration is linear and without memory: after any move, hysteresis and creep leave an error that "
             "depends on the moves before. The held-out residual holds it."
         )
     else:
         kind = (
-            f"This calibration knows how the mirror remembers ({memory.name}). Its influence function acts on "
+            f"This calibration knows how the mirror remembers ({hysteresis.name}). Its influence function acts on "
             "effective signals, which follow from the history of all moves since the last degauss."
         )
     dropped, warnings = calibration.maps_dropped, len(calibration.limitations)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.influence.mirror import rings
 from dm_calibration.influence.quality import GRADE_NAMES
-from dm_calibration.optics.regions import AREA_FRACTIONS, EmptyRegionError
-from dm_calibration.optics.sample_regions import regional_rms
-from dm_calibration.optics.zernike import NAMES, PISTON_TILT
 from dm_calibration.report import figures
 from dm_calibration.report.document import Picture, Section, Table
 from dm_calibration.report.residuals import Residuals
+from dm_common.mirror import rings
+from dm_common.optics.sample_regions import AREA_FRACTIONS, EmptyRegionError, regional_rms
+from dm_common.optics.zernike import NAMES, PISTON_TILT
 
 NM = 1e9
 
@@ -33,7 +32,7 @@ def influence(calibration: Calibration) -> Section:
         )
         for k in range(fit.actuators)
     ]
-    effective = "effective signal" if calibration.memory is not None else "signal"
+    effective = "effective signal" if calibration.hysteresis is not None else "signal"
     return Section(
         "Influence functions",
         [
@@ -107,8 +106,8 @@ def regions(calibration: Calibration, left: Residuals) -> Section:
 
 def coefficients(calibration: Calibration, left: Residuals) -> Section:
     """Residual by Zernike term."""
-    memory = calibration.memory
-    sigma = memory.zernike_sigma if memory is not None else None
+    hysteresis = calibration.hysteresis
+    sigma = hysteresis.zernike_sigma if hysteresis is not None else None
     first = len(PISTON_TILT)
     rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0)) * NM
     header = ["term", "in-sample rms, nm"] + (["held-out moves, nm"] if sigma is not None else [])

@@ -15,11 +15,11 @@ from scipy.interpolate import RBFInterpolator
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.maps import KINDS
 from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
-from dm_calibration.optics.regions import AREA_FRACTIONS
-from dm_calibration.optics.sampling import SamplePoints
-from dm_calibration.optics.zernike import PISTON_TILT, TERMS
 from dm_calibration.report.colours import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from dm_calibration.report.residuals import Residuals
+from dm_common.optics.sample_regions import AREA_FRACTIONS
+from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import PISTON_TILT, TERMS
 
 Floats = NDArray[np.float64]
 
@@ -160,18 +160,22 @@ def regions_figure(regional: Floats, labels: Sequence[str]) -> Figure:
     return figure
 
 
-def coefficients_figure(left: Residuals, memory_sigma: Floats | None) -> Figure:
+def coefficients_figure(left: Residuals, hysteresis_sigma: Floats | None) -> Figure:
     """rms residual of each Zernike coefficient beyond tilt; beside it what held-out moves showed, when known."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     axes = figure.add_subplot()
     first = len(PISTON_TILT)
     place = np.arange(first, left.coefficients.shape[1])
     rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0))[first:]
-    share = 0.8 if memory_sigma is None else 0.4
+    share = 0.8 if hysteresis_sigma is None else 0.4
     axes.bar(place - (0.8 - share) / 2, rms * NM, share, color=BLUE, label="maps of the fit (in-sample)")
-    if memory_sigma is not None:
+    if hysteresis_sigma is not None:
         axes.bar(
-            place + 0.2, memory_sigma[first:] * NM, share, color=ORANGE, label="held-out moves, noise of maps removed"
+            place + 0.2,
+            hysteresis_sigma[first:] * NM,
+            share,
+            color=ORANGE,
+            label="held-out moves, noise of maps removed",
         )
     names = [f"$Z_{{{term.n}}}^{{{term.m}}}$" + f"\n{term.kind}" * bool(term.kind) for term in TERMS[first:]]
     axes.set_xticks(place, names[: len(place)], fontsize=8)

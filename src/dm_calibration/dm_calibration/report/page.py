@@ -10,11 +10,11 @@ import numpy as np
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
-from dm_calibration.report import content, content_fit, content_memory
+from dm_calibration.report import content, content_fit, content_hysteresis
 from dm_calibration.report.document import Section, one_html, pdf_pages
-from dm_calibration.report.memory_figures import loop_opening
+from dm_calibration.report.hysteresis_figures import loop_opening
 from dm_calibration.report.residuals import residuals
-from dm_calibration.whole_file import write_whole
+from dm_calibration.store.atomic_write import write_whole
 
 
 class Written(NamedTuple):
@@ -40,8 +40,8 @@ def sections(calibration: Calibration, file: Path | None = None) -> list[Section
         content_fit.regions(calibration, left),
         content_fit.coefficients(calibration, left),
         content_fit.influence(calibration),
-        content_memory.hysteresis(calibration),
-        content_memory.recipes(calibration),
+        content_hysteresis.hysteresis(calibration),
+        content_hysteresis.recipes(calibration),
         content.every_map(calibration),
     ]
 
@@ -65,7 +65,7 @@ def write_report(calibration: Calibration, folder: Path, file: Path | None = Non
 
 def figures_of(calibration: Calibration) -> dict[str, Any]:
     """The main figures, for programs."""
-    fit, memory = calibration.fit, calibration.memory
+    fit, hysteresis = calibration.fit, calibration.hysteresis
     names, counts = np.unique([GRADE_NAMES[grade] for grade in fit.grades], return_counts=True)
     result: dict[str, Any] = {
         "id": calibration.id,
@@ -84,13 +84,13 @@ def figures_of(calibration: Calibration) -> dict[str, Any]:
         "condition_number": fit.condition_number,
         "grades": dict(zip(names.tolist(), counts.tolist(), strict=True)),
         "limitations": list(calibration.limitations),
-        "memory": None,
+        "hysteresis": None,
     }
-    if memory is not None:
-        result["memory"] = {
-            "law": memory.name,
-            "held_out_max_zernike_nm": memory.held_out_max_zernike * 1e9,
-            "loop_opening": loop_opening(memory.law),
-            "creep_per_decade": memory.law.creep_rate,
+    if hysteresis is not None:
+        result["hysteresis"] = {
+            "law": hysteresis.name,
+            "held_out_max_zernike_nm": hysteresis.held_out_max_zernike * 1e9,
+            "loop_opening": loop_opening(hysteresis.law),
+            "creep_per_decade": hysteresis.law.creep_rate,
         }
     return result

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.hysteresis.hysteresis_fit import effective_maps
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import make_design
-from dm_calibration.influence.sag import fill_gaps, remove_piston_tilt
-from dm_calibration.memory.memory_fit import effective_maps
+from dm_common.optics.sag import fill_gaps, remove_piston_tilt
 
 Floats = NDArray[np.float64]
 
@@ -41,8 +41,8 @@ def residuals(calibration: Calibration) -> Residuals:
         TooFewMapsError, ValueError: maps that no fit can be made of; those of a stored calibration can.
     """
     fit, maps = calibration.fit, calibration.maps
-    if calibration.memory is not None:
-        maps = effective_maps(maps, calibration.memory.law)
+    if calibration.hysteresis is not None:
+        maps = effective_maps(maps, calibration.hysteresis.law)
     used = maps.select(fit.used)
     design = make_design(used)
     drift = design.matrix[:, : design.drift]

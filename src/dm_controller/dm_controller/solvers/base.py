@@ -14,10 +14,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.influence.sag import remove_piston_tilt
-from dm_calibration.optics.sampling import SamplePoints
-from dm_calibration.optics.zernike import PISTON_TILT, TERM_RMS, basis
-from dm_controller.model import InfluenceModel
+from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
+from dm_controller.mirror_model import InfluenceModel
 from dm_controller.solvers.bounded import SLACK, Limits
 from dm_controller.target import FocusTarget
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dm_calibration.influence.sag import remove_piston_tilt
-from dm_calibration.influence.weights import command_row_weights
-from dm_calibration.optics.regions import AREA_FRACTIONS
-from dm_controller.model import InfluenceModel
+from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
+from dm_controller.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows, points_of
 from dm_controller.solvers.bounded import Limits
 

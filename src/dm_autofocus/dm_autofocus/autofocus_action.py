@@ -1,0 +1,228 @@
+"""The action `autofocus`: search the sharpest focus, and stay on it when asked to."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dm_msgs.action import Autofocus
+from dm_msgs.msg import Capabilities, ErrorCode
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+
+from dm_autofocus.autofocus_view import FocusedView, Look, ViewError
+from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
+from dm_autofocus.search import TELLING, Peak, PeakSearch, Phase, SearchConfig
+from dm_autofocus.sharpness import Region, check_region
+from dm_autofocus.tracking import TrackConfig, Tracker
+from dm_common.ros.worker import WorkerActionServer
+
+#: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
+MARGIN = 0.002
+
+
+def ready_capabilities(view: FocusedView) -> Capabilities:
+    """The mirror's capabilities. Raises ViewError when it cannot be focused."""
+    capabilities = view.capabilities
+    if capabilities is None:
+        raise ViewError(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
+    if capabilities.quality == Capabilities.UNCALIBRATED:
+        raise ViewError(ErrorCode.NOT_CALIBRATED, capabilities.message)
+    return capabilities
+
+
+def tolerance_of(values: Mapping[str, Any], capabilities: Capabilities) -> float:
+    """Finest step of curvature [1/m]: as configured, else the depth of focus of the calibrated aperture."""
+    configured = float(values["search.tolerance"])
+    return configured or depth_of_focus(capabilities.aperture_radius, values["optics.wavelength"])
+
+
+class AutofocusAction:
+    """Serves `autofocus` in worker threads; the newest goal pre-empts.
+
+    Args:
+        node: hosts the action.
+        view: goes and looks.
+        values: parameters of the node.
+        optics: to tell distances.
+        publish: (phase, look): tells others of an image that counted.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        view: FocusedView,
+        values: Mapping[str, Any],
+        optics: FocusOptics,
+        publish: Callable[[Phase, Look], None],
+    ) -> None:
+        self._view, self._values, self._optics, self._publish = view, values, optics, publish
+        self._server = WorkerActionServer(node, Autofocus, "autofocus", self._run, exclusive="preempt")
+
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is running."""
+        return self._server.busy
+
+    def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
+        started, view, result = time.monotonic(), self._view, Autofocus.Result()
+        view.start()
+        try:
+            config, region = self._config(goal_handle.request)
+            peak, config = self._search(goal_handle, config, region)
+            self._tell(result, peak)
+            if goal_handle.request.track:
+                self._track(goal_handle, config, region, peak, result)
+            outcome, result.error_code = "succeed", ErrorCode.OK
+            result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_in_words(result.dioptre)}"
+            if peak.at_limit:
+                result.message += "; at the end of the range: the object may lie beyond it"
+        except ViewError as error:
+            outcome = "canceled" if error.error_code == ErrorCode.CANCELED else "abort"
+            result.error_code, result.message = error.error_code, str(error)
+        finally:
+            view.release()
+        result.images, result.images_dropped = view.counted, view.dropped
+        result.duration = time.monotonic() - started
+        return outcome, result
+
+    def _config(self, goal: Any) -> tuple[SearchConfig, Region]:
+        """The search that a goal asks for. Raises ViewError."""
+        values, capabilities = self._values, ready_capabilities(self._view)
+        margin = MARGIN * (capabilities.curvature_max - capabilities.curvature_min)
+        low, high = capabilities.curvature_min + margin, capabilities.curvature_max - margin
+        if goal.curvature_min != 0 or goal.curvature_max != 0:
+            wanted = (goal.curvature_min, goal.curvature_max)
+            if not (low - margin <= wanted[0] < wanted[1] <= high + margin):
+                raise ViewError(
+                    ErrorCode.OUT_OF_RANGE,
+                    f"curvature_min, curvature_max = {wanted[0]:+.4f}, {wanted[1]:+.4f} 1/m: must be a rising range "
+                    f"inside {low:+.4f} to {high:+.4f} 1/m, or both 0",
+                )
+            low, high = max(wanted[0], low), min(wanted[1], high)
+        try:
+            region = check_region(goal.region if len(goal.region) else values["region"])
+            tolerance = tolerance_of(values, capabilities)
+            return SearchConfig(
+                low,
+                high,
+                tolerance,
+                max(TELLING, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance))),
+                values["search.fine_points"],
+                values["search.approach"],
+                values["search.least_contrast"],
+            ), region
+        except ValueError as error:
+            raise ViewError(ErrorCode.INVALID_ARGUMENT, str(error)) from error
+
+    def _search(self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region) -> tuple[Peak, SearchConfig]:
+        """Search from beginning to end and stand on the peak; without one, where the mirror stood before.
+
+        Returns:
+            The peak, and the search with the range that was possible: it depends on the actuators' history too.
+        """
+        before = self._view.curvature
+        search = PeakSearch(config)
+        while not search.done:
+            step = search.step
+            try:
+                look = self._visit(goal_handle, step.curvature, region if step.measured else None)
+            except ViewError as error:
+                if error.error_code != ErrorCode.UNREACHABLE:
+                    raise
+                self._draw_in(search, error)
+                continue
+            if look is None:
+                search.feed(None)
+                continue
+            phase = search.phase
+            search.feed(look.sharpness)
+            self._report(goal_handle, phase, look, step.curvature, search.measured, max(config.steps, search.measured))
+        if search.peak is None:
+            if math.isfinite(before):
+                self._visit(goal_handle, before, None)
+            raise ViewError(
+                ErrorCode.NOT_CONVERGED,
+                "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
+                "the range; the mirror is back where it was",
+            )
+        self._visit(goal_handle, search.step.curvature, None)
+        return search.peak, search.config
+
+    def _draw_in(self, search: PeakSearch, error: ViewError) -> None:
+        try:
+            search.refuse()
+        except ValueError as reason:
+            raise ViewError(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
+
+    def _track(
+        self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region, peak: Peak, result: Any
+    ) -> None:
+        """Stay on the peak until cancelled or pre-empted: ends by ViewError only."""
+        values = self._values
+        trials = TrackConfig(values["track.dither"] * config.tolerance, values["track.drop"], values["track.patience"])
+        tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
+        standing = peak.curvature
+        while True:
+            wanted = tracker.step.curvature
+            if wanted != standing:
+                self._visit(goal_handle, wanted, None)
+                standing = wanted
+            look = self._look(goal_handle, region)
+            tracker.feed(look.sharpness)
+            self._report(goal_handle, Phase.TRACK, look, wanted, 0, 0)
+            if tracker.lost:
+                try:
+                    peak, config = self._search(goal_handle, config, region)
+                    standing = peak.curvature
+                except ViewError as error:
+                    if error.error_code != ErrorCode.NOT_CONVERGED:
+                        raise
+                    # Nothing to see now: what is seen here from now on is the new normal.
+                    peak, standing = Peak(tracker.centre, look.sharpness, False), math.nan
+                tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
+            self._tell(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
+
+    def _visit(self, goal_handle: ServerGoalHandle, curvature: float, region: Region | None) -> Look | None:
+        """Go to a curvature and, given a region, look."""
+        self._view.go(curvature, lambda: self._told_to_stop(goal_handle))
+        self._check_stop(goal_handle)
+        return None if region is None else self._look(goal_handle, region)
+
+    def _look(self, goal_handle: ServerGoalHandle, region: Region) -> Look:
+        look = self._view.look(region, lambda: self._told_to_stop(goal_handle))
+        self._check_stop(goal_handle)
+        assert look is not None  # only a stop leaves without one
+        return look
+
+    def _told_to_stop(self, goal_handle: ServerGoalHandle) -> bool:
+        return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
+
+    def _check_stop(self, goal_handle: ServerGoalHandle) -> None:
+        if goal_handle.is_cancel_requested:
+            raise ViewError(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
+        if self._server.preempted(goal_handle):
+            raise ViewError(ErrorCode.PREEMPTED, "a newer goal took over")
+
+    def _report(
+        self, goal_handle: ServerGoalHandle, phase: Phase, look: Look, curvature: float, step: int, steps: int
+    ) -> None:
+        self._publish(phase, look)
+        goal_handle.publish_feedback(
+            Autofocus.Feedback(phase=int(phase), step=step, steps=steps, curvature=curvature, sharpness=look.sharpness)
+        )
+
+    def _tell(self, result: Any, peak: Peak) -> None:
+        result.curvature, result.power, result.at_limit = peak.curvature, 2 * peak.curvature, peak.at_limit
+        result.dioptre = self._optics.dioptre_for(peak.curvature)
+        result.distance = distance_of(result.dioptre)
+        result.sharpness = peak.sharpness
+
+
+def _in_words(dioptre: float) -> str:
+    """A focus distance for a person."""
+    if math.isnan(dioptre):
+        return "nearer than any object"
+    return f"{1 / dioptre:.2f} m ({dioptre:+.4f} dioptre)" if dioptre > 0 else f"infinity ({dioptre:+.4f} dioptre)"

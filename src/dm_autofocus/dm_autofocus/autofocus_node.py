@@ -1,0 +1,154 @@
+"""Node `autofocus`: a camera's images in, focus requests out; focus by object distance and by dioptre."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any
+
+from dm_msgs.msg import AutofocusState, Capabilities, ErrorCode, FocusRequest
+from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities, tolerance_of
+from dm_autofocus.autofocus_parameters import PARAMETERS
+from dm_autofocus.autofocus_view import FocusedView, Look, ViewError
+from dm_autofocus.optics import FocusOptics, OpticsError, dioptre_of, distance_of
+from dm_autofocus.search import Phase
+from dm_autofocus.sharpness import check_region
+from dm_common.ros import diagnostics, qos
+from dm_common.ros.executor import run_node
+from dm_common.ros.parameters import declare
+from dm_common.ros.worker import ServiceCallError, WorkerService, call, never_silent
+
+
+class AutofocusNode(Node):
+    """See docs/camera.md for the interfaces; optics, sharpness and search are in `dm_autofocus`."""
+
+    def __init__(self, **keywords: Any) -> None:
+        super().__init__("autofocus", **keywords)
+        self._values = declare(self, PARAMETERS)
+        check_region(self._values["region"])
+        self._optics = FocusOptics.from_rest_distance(
+            self._values["optics.rest_distance"],
+            self._values["optics.relay_magnification"],
+            self._values["optics.incidence"],
+            self._values["optics.pupil_offset"],
+        )
+        self._view = FocusedView(self, self._values)
+        self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.STATE)
+        self._set_focus = self.create_client(SetFocus, "set_focus")
+        self._action = AutofocusAction(self, self._view, self._values, self._optics, self._publish)
+        WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance)
+        answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
+        self.create_service(GetFocusRange, "get_focus_range", answer)
+        self._watched: Any = None
+        self._trouble = ""
+        if self._values["monitor_rate"] > 0:
+            period = 1 / self._values["monitor_rate"]
+            self.create_timer(period, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        diagnostics.Diagnostics(self, "", self._health)
+
+    # --- focus by distance ---
+
+    def _on_set_focus_distance(
+        self, request: SetFocusDistance.Request, response: SetFocusDistance.Response
+    ) -> SetFocusDistance.Response:
+        try:
+            if request.distance != 0 and request.dioptre != 0:
+                raise ViewError(
+                    ErrorCode.INVALID_ARGUMENT,
+                    f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
+                )
+            if self._action.busy:
+                raise ViewError(ErrorCode.BUSY, "a search or tracking (action autofocus) is running; cancel it first")
+            response.dioptre = dioptre_of(request.distance) or request.dioptre
+            response.distance = distance_of(response.dioptre)
+            response.curvature = self._optics.curvature_for(response.dioptre)
+            response.power = 2 * response.curvature
+            wanted = SetFocus.Request(request=FocusRequest(curvature=response.curvature), dry_run=request.dry_run)
+            answer = call(self._set_focus, wanted, self._values["move_timeout"])
+            response.state = answer.state
+            response.error_code, response.message = answer.error_code, answer.message
+            if answer.error_code == ErrorCode.UNREACHABLE and self._view.capabilities is not None:
+                response.message += f"; the camera focuses {self._range_in_words(self._view.capabilities)}"
+        except OpticsError as error:
+            response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
+        except ViewError as error:
+            response.error_code, response.message = error.error_code, str(error)
+        except ServiceCallError as error:
+            response.error_code, response.message = ErrorCode.TIMEOUT, f"focus_controller: {error}"
+        return response
+
+    def _on_get_focus_range(
+        self, _request: GetFocusRange.Request, response: GetFocusRange.Response
+    ) -> GetFocusRange.Response:
+        try:
+            capabilities = ready_capabilities(self._view)
+        except ViewError as error:
+            response.error_code, response.message = error.error_code, str(error)
+            return response
+        response.curvature_min, response.curvature_max = capabilities.curvature_min, capabilities.curvature_max
+        response.dioptre_min, response.dioptre_max = self._dioptres(capabilities)
+        response.distance_far = distance_of(response.dioptre_min)
+        response.distance_near = distance_of(response.dioptre_max) if response.dioptre_max > 0 else math.nan
+        response.curvature_tolerance = tolerance_of(self._values, capabilities)
+        response.message = self._range_in_words(capabilities)
+        return response
+
+    def _dioptres(self, capabilities: Capabilities) -> tuple[float, float]:
+        """Range of dioptres; its near end is inf when the focus comes up to the reference point."""
+        low, high = (self._optics.dioptre_for(c) for c in (capabilities.curvature_min, capabilities.curvature_max))
+        return low, math.inf if math.isnan(high) else high
+
+    def _range_in_words(self, capabilities: Capabilities) -> str:
+        low, high = self._dioptres(capabilities)
+        if high <= 0:
+            return f"beyond infinity only ({low:+.4f} to {high:+.4f} dioptre): check optics.rest_distance"
+        far = f"{1 / low:.2f} m" if low > 0 else "infinity"
+        return f"from {1 / high:.2f} m to {far} ({low:+.4f} to {high:+.4f} dioptre)"
+
+    # --- what this node says ---
+
+    def _publish(self, phase: Phase, look: Look) -> None:
+        curvature = self._view.curvature
+        state = AutofocusState(phase=int(phase), sharpness=look.sharpness, curvature=curvature, power=2 * curvature)
+        state.header = look.header
+        state.dioptre = self._optics.dioptre_for(curvature) if math.isfinite(curvature) else math.nan
+        state.distance = distance_of(state.dioptre)
+        self._state.publish(state)
+
+    def _watch(self) -> None:
+        """While idle, a figure of the newest image now and then."""
+        image = self._view.newest
+        if self._action.busy or image is None or image is self._watched:
+            return
+        self._watched = image
+        try:
+            self._publish(Phase.IDLE, self._view.judge(image, check_region(self._values["region"])))
+            self._trouble = ""
+        except (ViewError, ValueError) as error:
+            self._trouble = str(error)
+            self.get_logger().warning(self._trouble, throttle_duration_sec=5.0)
+
+    def _health(self) -> diagnostics.Health:
+        values = {"images_counted": self._view.counted, "images_dropped": self._view.dropped}
+        try:
+            ready_capabilities(self._view)
+            if self._view.newest is None:
+                raise ViewError(ErrorCode.TIMEOUT, f"no image on {self.resolve_topic_name('image_raw')} yet")
+            if self._trouble:
+                raise ViewError(ErrorCode.INVALID_ARGUMENT, self._trouble)
+        except ViewError as error:
+            return diagnostics.Health(diagnostics.WARN, str(error), values)
+        return diagnostics.Health(diagnostics.OK, "searching or tracking" if self._action.busy else "ready", values)
+
+
+def main() -> int:
+    """Entry point of the node."""
+    return run_node(AutofocusNode, sys.argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,224 @@
+"""What `autofocus` does to the mirror and sees of it: go to a curvature, look at it there."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorState, Capabilities, ErrorCode, FocusRequest, FocusState
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+
+from dm_autofocus.gate import SettledGate
+from dm_autofocus.images import ImageError, grey
+from dm_autofocus.sharpness import METRICS, Region, cut
+from dm_common.ros import qos
+
+#: As cameras publish; depth 1: an image that was not fetched in time is dropped for the next.
+IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class ViewError(Exception):
+    """Going or looking failed: an ErrorCode and a sentence."""
+
+    def __init__(self, error_code: int, message: str) -> None:
+        super().__init__(message)
+        self.error_code = error_code
+
+
+@dataclass(frozen=True)
+class Look:
+    """Sharpness of an image and the header it came with."""
+
+    sharpness: float
+    header: Any
+
+
+def seconds(stamp: Any) -> float:
+    """A time stamp in s."""
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
+class FocusedView:
+    """Moves by `focus_request` and looks through `image_raw`. `go` and `look` wait: call them from a worker thread.
+
+    Args:
+        node: hosts the topics.
+        values: parameters `metric`, `images_per_step`, `image_timeout`, `move_timeout`, `settle_time`, `stamp_lead`.
+
+    Attributes:
+        capabilities: the latest; None before the first.
+        curvature: as taken last, whoever asked for it [1/m]; NaN before.
+        target: as asked for by `go` last [1/m]; NaN after `release`.
+        newest: the latest image; None before the first.
+        counted, dropped: images since `start`.
+    """
+
+    def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
+        self._values = values
+        self._news = threading.Condition()
+        self._gate = SettledGate(values["settle_time"], values["stamp_lead"])
+        self.capabilities: Capabilities | None = None
+        self.curvature = math.nan
+        self.newest: Image | None = None
+        self.counted = self.dropped = 0
+        self._driver: ActuatorState | None = None
+        self._answer: FocusState | None = None
+        self.target = math.nan
+        self._asked: deque[float] = deque(maxlen=8)  # answers to these are no intrusion, however late
+        self._intruder: float | None = None
+        self._looking = False
+        self._fresh: Image | None = None
+        self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
+        self._topic = node.resolve_topic_name("image_raw")
+        node.create_subscription(Image, "image_raw", self._on_image, IMAGES)
+        node.create_subscription(FocusState, "focus_state", self._on_focus_state, qos.STATE)
+        node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
+        node.create_subscription(Capabilities, "capabilities", self._on_capabilities, qos.LATCHED)
+
+    # --- what comes in ---
+
+    def _on_capabilities(self, message: Capabilities) -> None:
+        self.capabilities = message
+
+    def _on_image(self, message: Image) -> None:
+        with self._news:
+            self.newest = message
+            if not (self._looking and self._gate.open_for(seconds(message.header.stamp))):
+                self.dropped += 1
+                return
+            self.dropped += self._fresh is not None
+            self._fresh = message
+            self._news.notify_all()
+
+    def _on_focus_state(self, message: FocusState) -> None:
+        with self._news:
+            if message.applied:
+                self.curvature = message.curvature
+            if math.isnan(self.target):
+                return
+            if message.curvature == self.target:
+                self._answer = self._answer or message
+            elif message.applied and message.curvature not in self._asked:
+                self._intruder = message.curvature
+            self._news.notify_all()
+
+    def _on_actuator_state(self, message: ActuatorState) -> None:
+        with self._news:
+            self._driver = message
+            self._tell_gate()
+            self._news.notify_all()
+
+    def _tell_gate(self) -> None:
+        answer, driver = self._answer, self._driver
+        if answer is None or driver is None or not answer.applied:
+            return
+        wanted = np.asarray(answer.signals)
+        reached = len(driver.requested) == len(wanted) and bool(np.allclose(driver.requested, wanted, atol=1e-9))
+        self._gate.written(seconds(driver.header.stamp), driver.moving, reached)
+
+    # --- what is done ---
+
+    def start(self) -> None:
+        """The mirror is this node's until `release`; count images from here."""
+        self._intruder = None
+        self.counted = self.dropped = 0
+
+    def go(self, curvature: float, stop: Callable[[], bool] = lambda: False) -> None:
+        """Ask for a curvature [1/m] and wait until its shape stands. Returns early when `stop()`.
+
+        Raises:
+            ViewError: refused, no answer, another node moves the mirror, or the move does not end.
+        """
+        with self._news:
+            self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
+            self._answer, self.target = None, curvature
+            self._asked.append(curvature)
+        self._request.publish(FocusRequest(curvature=curvature, mode=FocusRequest.MODE_DIRECT))
+        limit = self._values["move_timeout"]
+        if not self._wait(lambda: self._answer is not None, limit, stop):
+            raise ViewError(
+                ErrorCode.TIMEOUT, f"no answer to a focus request within {limit:g} s: is focus_controller running?"
+            )
+        answer = self._answer
+        if answer is None:
+            return
+        if not answer.applied:
+            raise ViewError(answer.error_code or ErrorCode.INTERNAL, answer.message)
+        with self._news:
+            self._gate.sent(seconds(answer.header.stamp), answer.predicted_duration)
+            self._tell_gate()
+        if not self._wait(lambda: math.isfinite(self._gate.settled_at), limit, stop):
+            reason = self._driver.message if self._driver is not None else "no actuator_state from pdm_driver"
+            raise ViewError(ErrorCode.TIMEOUT, f"the move did not end within {limit:g} s: {reason}")
+
+    def release(self) -> None:
+        """The mirror may be moved by others from here on."""
+        self.target, self._intruder = math.nan, None
+
+    def look(self, region: Region, stop: Callable[[], bool] = lambda: False) -> Look | None:
+        """Median sharpness of the next images that show the settled shape; None when `stop()`.
+
+        Raises:
+            ViewError: no such image came in time, or it cannot be used.
+        """
+        looks: list[Look] = []
+        with self._news:
+            self._fresh, self._looking = None, True
+        try:
+            while len(looks) < self._values["images_per_step"]:
+                if not self._wait(lambda: self._fresh is not None, self._values["image_timeout"], stop):
+                    raise ViewError(ErrorCode.TIMEOUT, self._why_no_image())
+                with self._news:
+                    message, self._fresh = self._fresh, None
+                if message is None:
+                    return None
+                looks.append(self.judge(message, region))
+                self.counted += 1
+        finally:
+            self._looking = False
+        return Look(statistics.median(look.sharpness for look in looks), looks[-1].header)
+
+    def judge(self, message: Image, region: Region) -> Look:
+        """Sharpness of an image in a region.
+
+        Raises:
+            ViewError: the image cannot be used.
+        """
+        try:
+            sharpness = METRICS[self._values["metric"]](cut(grey(message), region))
+        except (ImageError, ValueError) as error:
+            raise ViewError(ErrorCode.INVALID_ARGUMENT, f"{self._topic}: {error}") from error
+        return Look(sharpness, message.header)
+
+    def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
+        """Wait for a condition or `stop()`; False when neither came in time. Raises ViewError on another's move."""
+        deadline = time.monotonic() + timeout_s
+        with self._news:
+            while not (condition() or stop()):
+                if self._intruder is not None:
+                    raise ViewError(
+                        ErrorCode.PREEMPTED,
+                        f"another node asked for a curvature of {self._intruder:+.4f} 1/m meanwhile",
+                    )
+                if time.monotonic() > deadline:
+                    return False
+                self._news.wait(0.05)  # `stop` gives no notice
+        return True
+
+    def _why_no_image(self) -> str:
+        text = f"no image of the settled focus on {self._topic} within {self._values['image_timeout']:g} s: "
+        if self.newest is None:
+            return text + "none came at all; is the camera running?"
+        early = self._gate.settled_at - seconds(self.newest.header.stamp)
+        if early > 0:
+            return text + f"the newest is stamped {early:.3f} s before the shape stood; do the clocks agree?"
+        return text + "they stopped coming"

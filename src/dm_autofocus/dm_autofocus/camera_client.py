@@ -1,0 +1,65 @@
+"""A plain Python face of the camera pipeline: no callbacks, no executors. See docs/camera.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from dm_msgs.action import Autofocus
+from dm_msgs.srv import GetFocusRange, SetFocusDistance
+
+from dm_client.client import DeformableMirrorClient
+
+
+class CameraFocusClient(DeformableMirrorClient):
+    """A client of one mirror's nodes and of the node `autofocus` beside them. Use as a context manager.
+
+    Args:
+        namespace: of the mirror, "" for none.
+        domain: ROS domain; None = the environment's.
+        timeout_s: how long to wait for a service that should answer at once.
+    """
+
+    def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
+        super().__init__(namespace, domain, timeout_s)
+        # Early, so that the node has discovered them by the time the first is used.
+        self._client(SetFocusDistance, "set_focus_distance")
+        self._client(GetFocusRange, "get_focus_range")
+        self._client(Autofocus, "autofocus")
+
+    def __enter__(self) -> CameraFocusClient:
+        return self
+
+    def focus_range(self) -> GetFocusRange.Response:
+        """Between which object distances the camera can focus."""
+        return self.call(GetFocusRange, "get_focus_range", GetFocusRange.Request())
+
+    def focus_distance(self, distance: float, *, dry_run: bool = False) -> SetFocusDistance.Response:
+        """Focus on an object at `distance` (m; 0 or inf = infinity)."""
+        request = SetFocusDistance.Request(distance=float(distance), dry_run=dry_run)
+        return self.call(SetFocusDistance, "set_focus_distance", request)
+
+    def focus_dioptre(self, dioptre: float, *, dry_run: bool = False) -> SetFocusDistance.Response:
+        """Focus on 1 / distance (1/m; 0 = infinity), as libcamera and Android count."""
+        request = SetFocusDistance.Request(dioptre=float(dioptre), dry_run=dry_run)
+        return self.call(SetFocusDistance, "set_focus_distance", request)
+
+    def autofocus(
+        self,
+        region: Sequence[float] = (),
+        *,
+        curvature_range: tuple[float, float] = (0.0, 0.0),
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 60.0,
+    ) -> Autofocus.Result:
+        """Search the sharpest focus in a region of the image and stand there.
+
+        Args:
+            region: left, top, width, height as shares 0..1 of the image; empty = as configured.
+            curvature_range: search only here [1/m]; (0, 0) = the whole reachable range.
+            on_feedback: called after each image that counted.
+            timeout_s: longest time the search may take.
+        """
+        goal = Autofocus.Goal(region=[float(value) for value in region])
+        goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
+        return self.run_action(Autofocus, "autofocus", goal, on_feedback, timeout_s)

@@ -1,0 +1,25 @@
+from setuptools import find_packages, setup
+
+package_name = "dm_autofocus"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # tells `colcon test` to use pytest
+    zip_safe=True,
+    maintainer="Deformable mirror maintainers",
+    maintainer_email="maintainers@deformable-mirror.example",
+    description="Camera images in, focus requests out: autofocus with a deformable mirror",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "autofocus = dm_autofocus.autofocus_node:main",
+        ],
+    },
+)

@@ -1,0 +1,1 @@
+"""Launch files, configurations and the registry of the suite's nodes."""

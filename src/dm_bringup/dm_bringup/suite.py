@@ -1,0 +1,188 @@
+"""Start and stop the nodes of the suite as processes, where `ros2 launch` is not at hand."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import yaml
+
+#: (node, module) in the order of their start; they stop in reverse, so that the bench outlives the driver's last ramp.
+NODES = (
+    ("virtual_bench", "dm_simulation.virtual_bench_node"),
+    ("pdm_driver", "dm_driver.pdm_driver_node"),
+    ("interferometer", "dm_calibration.interferometer_node"),
+    ("calibration", "dm_calibration.calibration_node"),
+    ("focus_controller", "dm_controller.focus_controller_node"),
+    ("autofocus", "dm_autofocus.autofocus_node"),
+)
+#: Those that run only when the configuration has a section for them.
+OPTIONAL = ("virtual_bench", "autofocus")
+
+Config = dict[str, dict[str, Any]]
+
+
+class ConfigError(ValueError):
+    """The configuration file cannot be used; the message says where and why."""
+
+
+def load_config(path: Path) -> Config:
+    """Read a ROS 2 parameter file into {node: {parameter: value}}.
+
+    Raises:
+        ConfigError: not readable, not YAML, or not of the form of a parameter file.
+    """
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not a YAML file: {error}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
+    known = [name for name, _module in NODES]
+    result: Config = {}
+    for key, section in content.items():
+        name = str(key).rsplit("/", 1)[-1]
+        if name not in known:
+            raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(known)}")
+        if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
+            raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
+        result[name] = section["ros__parameters"]
+    return result
+
+
+def save_config(config: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """Write a ROS 2 parameter file that applies in any namespace."""
+    content = {f"/**/{name}": {"ros__parameters": dict(values)} for name, values in config.items()}
+    path.write_text(yaml.safe_dump(content, sort_keys=False))
+
+
+@contextlib.contextmanager
+def own_domain() -> Iterator[int]:
+    """Lend a ROS domain that no other demo or test on this machine uses at the same time."""
+    folder = Path(tempfile.gettempdir()) / f"dm-domains-{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    for domain in range(1, 100):
+        handle: IO[str] = (folder / str(domain)).open("w")
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            handle.close()
+            continue
+        try:
+            yield domain
+        finally:
+            handle.close()
+        return
+    raise RuntimeError("no free ROS domain: 99 runs at once?")
+
+
+def stop_processes(processes: Collection[subprocess.Popen[bytes]], timeout_s: float = 15.0) -> None:
+    """Interrupt `processes` together and wait for all of them; one that does not end in time is killed."""
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+    deadline = time.monotonic() + timeout_s
+    for process in processes:
+        try:
+            process.wait(max(deadline - time.monotonic(), 0.0))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+class Suite:
+    """The nodes named in a configuration, each in a process of its own. Use as a context manager.
+
+    The virtual bench and the autofocus run only when the configuration has a section for them.
+
+    Args:
+        config: {node: {parameter: value}}.
+        folder: where the parameter file and the nodes' logs go.
+        domain: ROS domain; None = the environment's.
+        namespace: one per mirror.
+        echo: True shows the nodes' output on this terminal instead of writing logs.
+        nodes: names of those to start; None = all.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        folder: Path,
+        domain: int | None = None,
+        namespace: str = "",
+        echo: bool = False,
+        nodes: Sequence[str] | None = None,
+    ) -> None:
+        self.folder = folder
+        self._config = config
+        self._namespace = namespace
+        self._echo = echo
+        self._nodes = [name for name, _module in NODES] if nodes is None else nodes
+        self._environment = dict(os.environ)
+        if domain is not None:
+            self._environment["ROS_DOMAIN_ID"] = str(domain)
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Suite:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        parameters = self.folder / "config.yaml"
+        save_config(self._config, parameters)
+        for name, module in NODES:
+            if name in self._nodes and (name not in OPTIONAL or name in self._config):
+                self._start(name, module, parameters)
+        return self
+
+    def _start(self, name: str, module: str, parameters: Path) -> None:
+        command = [sys.executable, "-m", module, "--ros-args", "--params-file", str(parameters)]
+        if self._namespace:
+            command += ["-r", f"__ns:=/{self._namespace.strip('/')}"]
+        with contextlib.ExitStack() as stack:
+            output = None if self._echo else stack.enter_context(self.log(name).open("wb"))
+            # Their own process group: Ctrl-C on the terminal is passed on by us, in order, not to all at once.
+            self._processes[name] = subprocess.Popen(
+                command, stdout=output, stderr=subprocess.STDOUT, env=self._environment, start_new_session=True
+            )
+
+    def log(self, name: str) -> Path:
+        """The log file of a node."""
+        return self.folder / f"{name}.log"
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by the names of the nodes."""
+        return {name: process.pid for name, process in self._processes.items()}
+
+    def ended(self) -> list[str]:
+        """Names of the nodes that are no longer running."""
+        return [name for name, process in self._processes.items() if process.poll() is not None]
+
+    def check(self) -> None:
+        """Raise RuntimeError with the end of its log when a node has ended."""
+        for name in self.ended():
+            status = self._processes[name].returncode
+            tail = "" if self._echo else "\n" + "\n".join(self.log(name).read_text(errors="replace").splitlines()[-8:])
+            raise RuntimeError(f"the node {name} ended with status {status}{tail}")
+
+    def stop(self, timeout_s: float = 15.0) -> None:
+        """Stop all nodes, the emulated hardware last; a node that does not end in time is killed."""
+        hardware = [process for name, process in self._processes.items() if name == "virtual_bench"]
+        nodes = [process for process in self._processes.values() if process not in hardware]
+        for group in (nodes, hardware):
+            stop_processes(group, timeout_s)
+
+    def __exit__(
+        self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
+    ) -> None:
+        self.stop()

@@ -1,0 +1,1 @@
+"""acquisition of dm_calibration."""

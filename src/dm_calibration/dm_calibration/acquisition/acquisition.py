@@ -1,0 +1,275 @@
+"""Getting new map files out of the instrument: by a trigger command, or from the watched folder. Knows no ROS."""
+
+from __future__ import annotations
+
+import queue
+import re
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch
+from dm_calibration.acquisition.ingest import Measurement
+from dm_calibration.acquisition.inotify import ClosedFiles
+from dm_calibration.acquisition.trigger import PLACEHOLDER, TriggerError, run_trigger
+from dm_calibration.map_files import MapFileError, NoValidPixelsError
+
+_POLL_OUTPUT_S = 0.01
+
+
+class MapTimeoutError(Exception):
+    """No new map arrived in time."""
+
+
+class AcquisitionStoppedError(Exception):
+    """The node was deactivated during a measurement."""
+
+
+class NothingToAcquireError(Exception):
+    """Neither a trigger command nor a watched folder is configured."""
+
+
+@dataclass(frozen=True)
+class AcquisitionSettings:
+    """Where maps come from.
+
+    Attributes:
+        folder: watched folder; None = watch nothing.
+        patterns: names of the files to take from it.
+        stable_time: s for which a file must stand still.
+        trigger_command: argument list; empty = a person or the instrument itself starts the measurement.
+        trigger_suffix: ending of the file name that replaces `{path}` in the command.
+        trigger_timeout: s for the command.
+    """
+
+    folder: Path | None
+    patterns: Sequence[str]
+    stable_time: float
+    trigger_command: Sequence[str] = ()
+    trigger_suffix: str = ".datx"
+    trigger_timeout: float = 30.0
+
+    @property
+    def names_output(self) -> bool:
+        """Whether the trigger command is told which file to write."""
+        return any(PLACEHOLDER in argument for argument in self.trigger_command)
+
+    def check(self) -> None:
+        """Raise ValueError when the settings contradict each other."""
+        if self.trigger_command and self.folder is None:
+            raise ValueError("trigger_command needs watch_folder, where its map files arrive; watch_folder is empty")
+        if self.trigger_command and not self.trigger_command[0]:
+            raise ValueError("trigger_command = ['', ...]: the first entry must name a program")
+        if not re.fullmatch(r"(\.[A-Za-z0-9_-]{1,16}){1,2}", self.trigger_suffix):
+            raise ValueError(
+                f"trigger_output_suffix = {self.trigger_suffix!r}: must be an ending such as .datx, and name no folder"
+            )
+
+
+@dataclass(frozen=True)
+class Acquired:
+    """A measurement that was asked for.
+
+    Attributes:
+        began_ns, ended_ns: when the trigger command started and ended, on the clock given to Acquisition; None when
+            the file came without a trigger.
+    """
+
+    measurement: Measurement
+    began_ns: int | None = None
+    ended_ns: int | None = None
+
+
+class Acquisition:
+    """Watches the folder in a thread, and takes measurements on request.
+
+    A file that a request waits for goes to that request only; every other new file goes to `on_file`.
+    """
+
+    def __init__(
+        self,
+        settings: AcquisitionSettings,
+        read: Callable[[Path], Measurement],
+        now_ns: Callable[[], int],
+        on_file: Callable[[Path], None],
+        on_trouble: Callable[[str], None],
+    ) -> None:
+        """Prepare; nothing runs before :meth:`start`.
+
+        Args:
+            read: reads a map file, raising MapFileError for files that are not (yet) whole.
+            now_ns: clock for the times in Acquired.
+            on_file: called in the watching thread with each new file.
+            on_trouble: called there with a reason in words, once each: a file refused unread, or the folder unreadable.
+        """
+        settings.check()
+        self.settings = settings
+        self.folder_trouble = ""
+        self._read = read
+        self._now_ns = now_ns
+        self._on_file = on_file
+        self._on_trouble = on_trouble
+        self._watch: FolderWatch | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._handover = threading.Lock()
+        self._waiting: queue.SimpleQueue[Path] | None = None
+        self._waiting_since = 0.0
+        self._numbers = count(1)
+
+    def start(self) -> None:
+        """Begin to watch; what is in the folder now is not new."""
+        self._stop.clear()
+        if self.settings.folder is not None:
+            self._watch = FolderWatch(self.settings.folder, self.settings.patterns, self.settings.stable_time)
+            self._poll(self._watch)
+            self._thread = threading.Thread(target=self._run, args=(self._watch,), name="folder_watch", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End watching and any measurement that is under way."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(5)
+            self._thread = None
+
+    def acquire(self, timeout_s: float) -> Acquired:
+        """Trigger a measurement, or wait for the next new file when there is no trigger command.
+
+        Raises:
+            TriggerError: the trigger command failed.
+            MapTimeoutError: no new map in time.
+            AcquisitionStoppedError: :meth:`stop` was called meanwhile.
+            MapFileError and what else `read` raises: the file that arrived is no good.
+            NothingToAcquireError: neither a trigger command nor a folder is configured.
+        """
+        watch = self._watch
+        if watch is None:
+            raise NothingToAcquireError("neither trigger_command nor watch_folder is configured: use ingest_file")
+        deadline = time.monotonic() + timeout_s
+        if not self.settings.trigger_command:
+            return Acquired(self._next_file(watch, deadline, None))
+        trigger_s = min(self.settings.trigger_timeout, timeout_s)
+        began = self._now_ns()
+        if self.settings.names_output:
+            output = self._new_name(watch)
+            self._trigger(output, trigger_s)
+            ended = self._now_ns()
+            return Acquired(self._expected_file(output, deadline), began, ended)
+        times: list[int] = []
+
+        def trigger() -> None:
+            self._trigger(None, trigger_s)
+            times.append(self._now_ns())
+
+        measurement = self._next_file(watch, deadline, trigger)
+        return Acquired(measurement, began, times[0])
+
+    def _trigger(self, output: Path | None, timeout_s: float) -> None:
+        try:
+            run_trigger(self.settings.trigger_command, output, timeout_s, self._stop)
+        except TriggerError:
+            self._check_stopped()
+            raise
+
+    def _check_stopped(self) -> None:
+        if self._stop.is_set():
+            raise AcquisitionStoppedError("the interferometer was deactivated during the measurement")
+
+    def _new_name(self, watch: FolderWatch) -> Path:
+        """A file name not used before, kept out of the watch: the measurement that asks for it takes it, or nobody."""
+        if not watch.folder.is_dir():
+            raise MapTimeoutError(f"watch_folder = {str(watch.folder)!r}: no such folder")
+        output = watch.folder / f"measure_{time.time_ns()}_{next(self._numbers)}{self.settings.trigger_suffix}"
+        watch.ignore(output)
+        return output
+
+    def _expected_file(self, path: Path, deadline: float) -> Measurement:
+        """Read the file the trigger was told to write, which may still be growing."""
+        seen: tuple[int, int] | None = None
+        since = time.monotonic()
+        trouble: MapFileError | None = None
+        while True:
+            self._check_stopped()
+            now = time.monotonic()
+            if path.is_symlink():
+                raise MapFileError(f"{path}: a symbolic link, must be a regular file")
+            if path.exists():
+                status = path.stat()
+                if (status.st_size, status.st_mtime_ns) != seen:
+                    seen, since = (status.st_size, status.st_mtime_ns), now
+                    try:
+                        return self._read(path)
+                    except NoValidPixelsError:
+                        raise
+                    except MapFileError as error:
+                        trouble = error
+                elif trouble is not None and now - since >= self.settings.stable_time:
+                    raise trouble
+            if now >= deadline:
+                raise trouble or MapTimeoutError(f"the trigger command ended, but {path} did not appear in time")
+            time.sleep(_POLL_OUTPUT_S)
+
+    def _next_file(self, watch: FolderWatch, deadline: float, trigger: Callable[[], None] | None) -> Measurement:
+        """Read the next file in the folder that is written from now on, after `trigger()` if there is one."""
+        arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
+        with self._handover:
+            self._waiting, self._waiting_since = arrivals, time.monotonic()
+        try:
+            if trigger is not None:
+                trigger()
+            while True:
+                self._check_stopped()
+                remaining = deadline - time.monotonic()
+                try:
+                    return self._read(arrivals.get(timeout=min(max(remaining, 0.001), 0.1)))
+                except queue.Empty:
+                    if remaining <= 0:
+                        reason = self.folder_trouble or f"no new map file in {watch.folder} in time"
+                        raise MapTimeoutError(reason) from None
+        finally:
+            with self._handover:
+                self._waiting = None
+
+    def _run(self, watch: FolderWatch) -> None:
+        period = min(max(self.settings.stable_time / 4, 0.02), 0.25)
+        closed = ClosedFiles(watch.folder)
+        due = time.monotonic() + period
+        try:
+            while not self._stop.is_set():
+                names = closed.wait(due - time.monotonic())
+                sightings = watch.closed(names, time.monotonic())
+                if time.monotonic() >= due:
+                    sightings += self._poll(watch)
+                    due = time.monotonic() + period
+                for sighting in sightings:
+                    if sighting.refused:
+                        self._on_trouble(f"{sighting.path}: {sighting.refused}")
+                    else:
+                        self._hand_over(sighting)
+        finally:
+            closed.close()
+
+    def _poll(self, watch: FolderWatch) -> list[FileEvent]:
+        try:
+            sightings = watch.poll(time.monotonic())
+        except OSError as error:
+            trouble = f"watch_folder = {str(watch.folder)!r} cannot be read: {error.strerror or error}"
+            if not self.folder_trouble:
+                self._on_trouble(trouble)
+            self.folder_trouble = trouble
+            return []
+        self.folder_trouble = ""
+        return sightings
+
+    def _hand_over(self, sighting: FileEvent) -> None:
+        with self._handover:
+            # A file from before the request shows the mirror as it was then.
+            if self._waiting is not None and sighting.written >= self._waiting_since:
+                self._waiting.put(sighting.path)
+                self._waiting = None  # one file per request
+                return
+        self._on_file(sighting.path)

@@ -1,0 +1,145 @@
+"""Watching a folder for files that another machine writes. Knows no ROS.
+
+A file is taken when its size and time have stood still for a while, or at once when this machine's kernel tells that
+its writer has closed it and it is as long as it says itself. Nothing depends on clocks of two machines agreeing:
+stillness is judged by this machine's monotonic clock.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import stat
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from dm_calibration.map_files.completeness import is_complete
+
+
+class Signature(NamedTuple):
+    """What changes when a file is written."""
+
+    inode: int
+    size: int
+    modified_ns: int
+
+
+@dataclass
+class _Candidate:
+    signature: Signature
+    since: float  # monotonic time at which it was first seen with this signature
+    done: bool = False  # taken or refused in this state
+
+
+class FileEvent(NamedTuple):
+    """A file that is ready, or refused with the reason in words.
+
+    `written` is the monotonic time at which its last change was seen.
+    """
+
+    path: Path
+    written: float
+    refused: str = ""
+
+
+class FolderWatch:
+    """Finds files that are new in a folder (not below it), each state of a file once.
+
+    Files that exist at the first look that succeeds are not new, until they are written again.
+    """
+
+    def __init__(self, folder: Path, patterns: Sequence[str], stable_time: float) -> None:
+        """Nothing is touched before the first :meth:`poll`: the folder may be on a disk that is mounted later.
+
+        Args:
+            patterns: shell patterns of file names, case-insensitive; names that begin with a dot never match.
+            stable_time: s for which size and time must not change.
+        """
+        self.folder = folder
+        self._patterns = [pattern.lower() for pattern in patterns]
+        self._stable_time = stable_time
+        self._known: dict[str, _Candidate] | None = None
+        self._ignored: set[str] = set()
+
+    def ignore(self, path: Path) -> None:
+        """Never report this file, whatever becomes of it."""
+        self._ignored.add(path.name)
+
+    def poll(self, now: float) -> list[FileEvent]:
+        """Look once; `now` is a monotonic time in s.
+
+        Returns what became ready since the last look, oldest first.
+
+        Raises:
+            OSError: the folder cannot be read now; what is known is kept.
+        """
+        listed = self._list()
+        if self._known is None:
+            self._known = {name: _Candidate(signature, now, done=True) for name, signature in listed.items()}
+        known = {name: candidate for name, candidate in self._known.items() if name in listed}
+        ready: list[tuple[int, FileEvent]] = []
+        for name, signature in listed.items():
+            candidate = known.get(name)
+            if candidate is None or candidate.signature != signature:
+                known[name] = _Candidate(signature, now)
+            elif not candidate.done and now - candidate.since >= self._stable_time:
+                candidate.done = True
+                ready.append((signature.modified_ns, self._judge(name, candidate.since)))
+        self._known = known
+        return [sighting for _time, sighting in sorted(ready)]
+
+    def closed(self, names: Iterable[str], now: float) -> list[FileEvent]:
+        """Look at files whose writer has just closed them, as far as they are known to be whole, which need not wait.
+
+        Others are left to :meth:`poll`, so are those that it would refuse.
+        """
+        ready = []
+        for name in names:
+            if self._known is None or name in self._ignored or not self._matches(name):
+                continue
+            try:
+                status = (self.folder / name).stat()
+            except OSError:
+                continue
+            signature = Signature(status.st_ino, status.st_size, status.st_mtime_ns)
+            candidate = self._known.get(name)
+            if candidate is None or candidate.signature != signature:
+                candidate = self._known[name] = _Candidate(signature, now)
+            sighting = self._judge(name, now)
+            if not candidate.done and not sighting.refused and is_complete(sighting.path):
+                candidate.done = True
+                ready.append(sighting)
+        return ready
+
+    def _list(self) -> dict[str, Signature]:
+        """Signatures of the matching names; for links, of what they point to."""
+        found = {}
+        with os.scandir(self.folder) as entries:
+            for entry in entries:
+                if entry.name in self._ignored or not self._matches(entry.name):
+                    continue
+                try:
+                    status = entry.stat()
+                except OSError:  # gone again, or a link to nowhere
+                    continue
+                found[entry.name] = Signature(status.st_ino, status.st_size, status.st_mtime_ns)
+        return found
+
+    def _matches(self, name: str) -> bool:
+        return not name.startswith(".") and any(fnmatch.fnmatchcase(name.lower(), p) for p in self._patterns)
+
+    def _judge(self, name: str, written: float) -> FileEvent:
+        path = self.folder / name
+        try:
+            target = path.resolve(strict=True)
+            if not target.is_relative_to(self.folder.resolve()):
+                return FileEvent(path, written, "a symbolic link that leads out of the watched folder")
+            if not stat.S_ISREG(target.stat().st_mode):
+                return FileEvent(path, written, "not a regular file")
+            if path.is_symlink() and target.parent == self.folder.resolve() and self._matches(target.name):
+                return FileEvent(path, written, f"a link to {target.name}, which is taken under its own name")
+        except OSError as error:
+            return FileEvent(path, written, f"{error.strerror}")
+        return FileEvent(target if path.is_symlink() else path, written)

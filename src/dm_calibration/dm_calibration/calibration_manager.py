@@ -1,0 +1,208 @@
+"""The mirror that is connected, the stored calibrations, and the one in use."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from dm_msgs.msg import ErrorCode
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_errors import Refused
+from dm_calibration.calibrator import Provenance, mismatch
+from dm_calibration.procedure.event_frames import map_hashes
+from dm_calibration.store.calibration_store import CalibrationStore, StoreError, UnknownCalibrationError
+from dm_common.mirror import Mirror
+from dm_common.recipes import RecipeBook, RecipeError
+
+
+class CalibrationManager:
+    """Shared by the topics, services and the action of the node; every method may be called from any thread.
+
+    Attributes:
+        store: the folder of calibration files.
+    """
+
+    def __init__(
+        self,
+        store: CalibrationStore,
+        aperture_tolerance: Callable[[], float],
+        now_ns: Callable[[], int],
+        publish: Callable[[Calibration | None, Path | None], None],
+    ) -> None:
+        """`publish` is called with the calibration in use and its file at every change."""
+        self.store = store
+        self._aperture_tolerance, self._now_ns, self._publish = aperture_tolerance, now_ns, publish
+        self._lock = threading.RLock()
+        # Held while a stored calibration is changed, so that no change gets lost; writing may take long.
+        self._changing = threading.Lock()
+        self._mirror: Mirror | None = None
+        self._in_use: Calibration | None = None
+
+    @property
+    def mirror(self) -> Mirror | None:
+        """The mirror the driver describes; None before it did."""
+        with self._lock:
+            return self._mirror
+
+    @property
+    def in_use(self) -> Calibration | None:
+        """The calibration in use."""
+        with self._lock:
+            return self._in_use
+
+    def known_mirror(self, wait_s: float = 0.0) -> Mirror:
+        """The mirror. A worker thread may wait for a driver that is still starting.
+
+        Raises:
+            Refused: it is not known yet.
+        """
+        deadline = time.monotonic() + wait_s
+        while (mirror := self.mirror) is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        if mirror is None:
+            raise Refused(ErrorCode.DRIVER_UNAVAILABLE, "no mirror_info yet: is pdm_driver running and configured?")
+        return mirror
+
+    def set_mirror(self, mirror: Mirror) -> str:
+        """Take over the mirror. Returns why the calibration in use was withdrawn, in words; "" = it was not."""
+        with self._lock:
+            self._mirror = mirror
+            wrong = self.mismatch(self._in_use) if self._in_use else ""
+            if not wrong:
+                return ""
+            withdrawn = self._in_use.id if self._in_use else ""
+            self.use(None)
+            return f"calibration {withdrawn} withdrawn: {wrong}"
+
+    def mismatch(self, calibration: Calibration) -> str:
+        """Why `calibration` does not belong to the mirror, in words; "" = it does, or no mirror is known."""
+        mirror = self.mirror
+        return mismatch(calibration, mirror, self._aperture_tolerance()) if mirror else ""
+
+    def check_fits(self, calibration: Calibration) -> None:
+        """Raise Refused unless `calibration` belongs to the mirror."""
+        self.known_mirror()
+        if wrong := self.mismatch(calibration):
+            raise Refused(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
+
+    def use(self, calibration: Calibration | None) -> None:
+        """Use `calibration`, which is in the store, from now on."""
+        with self._lock:
+            self._in_use = calibration
+            self._publish(calibration, self.store.find(calibration.id) if calibration else None)
+
+    def publish_again(self) -> None:
+        """Publish the calibration in use anew."""
+        with self._lock:
+            if self._in_use is None:
+                return
+            try:
+                file = self.store.find(self._in_use.id)
+            except UnknownCalibrationError:  # removed meanwhile; what is in use stays
+                file = None
+            self._publish(self._in_use, file)
+
+    def load(self, name: str) -> Calibration:
+        """Load by id or file, or the newest that fits when `name` is empty, and use it.
+
+        Raises:
+            Refused: no mirror, or the calibration belongs to another; the one in use stays.
+            UnknownCalibrationError, CalibrationFileError: see the store.
+        """
+        mirror = self.known_mirror()
+        if name:
+            calibration = self.store.load(name)
+            self.check_fits(calibration)
+        else:
+            readable = (entry.calibration for entry in self.store.entries() if entry.calibration)
+            newest = next((candidate for candidate in readable if not self.mismatch(candidate)), None)
+            if newest is None:
+                raise Refused(
+                    ErrorCode.NOT_CALIBRATED, f"no calibration in {self.store.folder} fits mirror {mirror.serial!r}"
+                )
+            calibration = newest
+        self.use(calibration)
+        return calibration
+
+    def change(self, calibration_id: str, changed: Callable[[Calibration], Calibration]) -> Calibration:
+        """Change the calibration in use, in its file as well, and publish it again.
+
+        Args:
+            calibration_id: must be the one in use.
+            changed: makes the new calibration, with the same id and raw data, from the one in use.
+
+        Raises:
+            Refused: another calibration is in use, or none.
+            StoreError: it could not be written; file and calibration in use are as they were.
+        """
+        with self._changing:
+            before = self._checked_in_use(calibration_id)
+            after = changed(before)
+            self.store.replace(after)
+            with self._lock:
+                self._checked_in_use(calibration_id)
+                self.use(after)
+            return after
+
+    def _checked_in_use(self, calibration_id: str) -> Calibration:
+        calibration = self.in_use
+        if calibration is None:
+            raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use: load_calibration first")
+        if calibration.id != calibration_id:
+            raise Refused(
+                ErrorCode.CALIBRATION_MISMATCH,
+                f"calibration_id = {calibration_id!r}: the calibration in use is {calibration.id!r}",
+            )
+        return calibration
+
+    def add_recipes(self, calibration_id: str, book: RecipeBook) -> Calibration:
+        """Keep recipes with the calibration in use, which they were built on; those of the same shape are replaced.
+
+        Raises:
+            Refused: another calibration is in use, recipes of a mirror with another number of actuators, or
+                numbers that are not finite.
+            RecipeError: no recipes, or made from another condition.
+            StoreError: see :meth:`change`.
+        """
+        if not book.recipes:
+            raise RecipeError("recipes: must hold at least one")
+        for recipe in book.recipes:
+            for name in ("curvature", "conic_constant", "max_zernike", "rms"):
+                if not math.isfinite(value := getattr(recipe, name)):
+                    raise Refused(ErrorCode.NOT_FINITE, f"recipes: {name} = {value}: must be a finite number")
+
+        def changed(calibration: Calibration) -> Calibration:
+            count, has = len(book.recipes[0].effective), calibration.fit.actuators
+            if count != has:
+                raise Refused(
+                    ErrorCode.CALIBRATION_MISMATCH,
+                    f"recipes: have {count} effective signals each, calibration {calibration.id} {has} actuators",
+                )
+            return replace(calibration, recipes=calibration.recipes.merged(book))
+
+        return self.change(calibration_id, changed)
+
+    def keep(self, calibration: Calibration) -> Path:
+        """Store `calibration` and read it back; one that is there already, whole, stays as it is. Returns its file.
+
+        Raises:
+            StoreError: it cannot be written, or what is read back is not what was measured.
+            CalibrationFileError: what is read back is damaged.
+        """
+        try:
+            file = self.store.find(calibration.id)
+        except UnknownCalibrationError:
+            file = self.store.save(calibration)
+        if map_hashes(self.store.load(calibration.id).maps) != map_hashes(calibration.maps):
+            raise StoreError(f"calibration {calibration.id}: the maps in {file} are not those that were measured")
+        return file
+
+    def provenance(self, name: str, serial: str, note: str) -> Provenance:
+        """A new id and the time for a calibration of mirror `name`, `serial`."""
+        now = self._now_ns()
+        return Provenance(self.store.new_id(name, serial, now), now, note.replace("\0", ""))

@@ -1,0 +1,121 @@
+"""How well a run will tell the memory law, from its commands alone, before anything moves.
+
+A coefficient of a map is ``figure + sum_n H_n e_n`` with effective signals ``e_n = sum_f w_f x_fn`` of features x. To
+first order the errors of the gains H and of the weights w that the run leaves are those of two linear regressions on
+its commands, (X'X)^-1 sigma^2 each; what they do to the check moves of the run is what its held-out maps will show.
+Features are those of the richest candidate, which costs most maps. What no number of maps takes away is a floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.hysteresis.features import crept, fading_feature, play_features, relaxation
+from dm_calibration.influence.fit import PISTON_TILT
+from dm_common.hysteresis.duhem import DuhemOperator
+
+Floats = NDArray[np.float64]
+
+#: Plays and powers of the richest candidate, the slope of a typical fading operator, a typical creep rate.
+PLAYS, POWERS, SLOPE, CREEP_RATE = 20, 3, 1.5, 0.01
+#: Standard deviation of a coefficient of one map where no calibration tells it, m.
+TYPICAL_NOISE = 2e-10
+#: Standard deviation of a coefficient that stays however long the run is, m: steps of the electronics, creep older than
+#: the run, a law that is nearly right only. What held-out maps of twins show where (X'X)^-1 says much less, from 300
+#: maps on.
+FLOOR = 3.5e-10
+#: Draws for quantiles of the largest of many errors.
+DRAWS = 4000
+#: Directions of the features weaker than this share of the strongest are not told apart, and not needed.
+RESOLVED = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedAccuracy:
+    """What a run promises of moves that it has not seen.
+
+    Attributes:
+        sigma: (K - 3,) standard deviation of the coefficients beyond tilt, m; without an influence function (N,)
+            of the effective signals, normalised by the noise of one map.
+        max_zernike: 95 % quantile of the largest of them, in the same unit; compares with
+            `HysteresisFit.held_out_max_zernike`.
+    """
+
+    sigma: Floats
+    max_zernike: float
+
+
+def expected_accuracy(
+    signals: Floats,
+    time: Floats,
+    check: NDArray[np.bool_],
+    noise: float = TYPICAL_NOISE,
+    influence: Floats | None = None,
+) -> ExpectedAccuracy:
+    """The expected error of the check moves of a run that begins with a degauss just before its first map.
+
+    Args:
+        signals: (M, N) commands, one map each.
+        time: (M,) s, when the maps will be taken.
+        check: (M,) which moves test the law.
+        noise: standard deviation of a coefficient of one map, m.
+        influence: (K, N) m per unit signal, from any earlier calibration; None = not known: every actuator counts as
+            seen by itself.
+
+    Raises:
+        ValueError: no check moves, or fewer other maps than actuators and features.
+    """
+    if not check.any():
+        raise ValueError("check: the run has no moves that test the law")
+    start = float(time[0]) - 1.0
+    settled = relaxation(time, start)
+    gains = np.column_stack((np.ones(len(time)), settled, (time - start) / np.ptp(time), signals))
+    if (~check).sum() <= gains.shape[1]:
+        raise ValueError(f"{(~check).sum()} maps: must be more than {gains.shape[1]} to tell gains and figure")
+    share = _leverage(gains[~check], gains[check]).mean()
+    response = np.eye(signals.shape[1]) if influence is None else influence[PISTON_TILT:].T
+    scale, floor = (1.0, 0.0) if influence is None else (noise, FLOOR)
+    # Gains of every response are a regression of their own; the weights are shared by all.
+    covariance = np.eye(response.shape[1]) * (share * scale**2 + floor**2)
+    features = _features(signals, time, start)
+    free = np.linalg.qr(gains[~check, :3])[0]
+    seen = features[~check]
+    seen = seen - np.einsum("mg,kg,kfn->mfn", free, free, seen, optimize=True)
+    covariance += scale**2 * _shared_error(seen, features[check], response)
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
+    return ExpectedAccuracy(np.sqrt(np.diag(covariance)), float(np.quantile(np.abs(draws).max(axis=1), 0.95)))
+
+
+def _features(signals: Floats, time: Floats, start: float) -> Floats:
+    """(M, F, N), the creep of the signal among them; without the signal itself, whose weight is in the gains."""
+    radius = np.concatenate(([0.0], (np.arange(PLAYS) + 0.5) / PLAYS))
+    plays = play_features(signals, radius, POWERS)
+    own_creep = crept(signals[:, None, :], time, start)
+    fading = fading_feature(signals, DuhemOperator(np.array([SLOPE])))
+    static = np.concatenate((plays[:, 1:], fading), axis=1)
+    return np.concatenate((static + CREEP_RATE * crept(static, time, start), own_creep), axis=1)
+
+
+def _leverage(seen: Floats, asked: Floats) -> Floats:
+    """(Q,) variance of predictions at rows `asked` (Q, U), from rows `seen` (M, U) of unit variance."""
+    _, strength, axes = np.linalg.svd(seen, full_matrices=False)
+    told = strength > RESOLVED * strength[0]
+    return np.asarray(np.square(asked @ axes[told].T / strength[told]).sum(axis=1))
+
+
+def _shared_error(seen: Floats, asked: Floats, response: Floats) -> Floats:
+    """(D, D) mean covariance of the responses of moves `asked` (Q, F, N) from weights told by `seen` (M, F, N).
+
+    Args:
+        response: (N, D) of unit signals; every response with unit variance.
+    """
+    count = seen.shape[1]
+    columns = (seen @ response).transpose(1, 0, 2).reshape(count, -1)
+    size, axes = np.linalg.eigh(columns @ columns.T)
+    told = size > RESOLVED**2 * size[-1]
+    root = axes[:, told] / np.sqrt(size[told])
+    moved = (asked @ response).transpose(0, 2, 1) @ root  # (Q, D, F)
+    return np.asarray(np.einsum("qdf,qef->de", moved, moved, optimize=True) / len(asked))

@@ -1,0 +1,89 @@
+"""Commands that show hysteresis and creep of all actuators at once.
+
+Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order:
+sag shows N displacements per map, so one run serves all. Now and then a shape is held for creep to be seen. The last
+fifth are moves as in use, low-order shapes of random size and order, kept to test the law that the others gave.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.mirror import Mirror
+
+Floats = NDArray[np.float64]
+
+#: Share of the maps that test the law.
+CHECK_SHARE = 0.2
+#: Repeated maps of the mirror at rest, which tell the noise of a map.
+REPEATS = 8
+#: Fewest and most maps of a run, repeats not counted.
+MAPS_MIN, MAPS_MAX = 60, 2000
+#: Swings as a share of the range.
+SWINGS = (1.0, 1.0, 0.6, 0.3)
+#: Share of the shapes that are held, and for how long, s.
+HELD_SHARE = 0.1
+HELD_S = (1.0, 20.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """Commands in order.
+
+    Attributes:
+        signals: (M, N) legal shapes, repeats not included.
+        dwell: (M,) s to hold each beyond the settle time before its map.
+        check: (M,) which test the law.
+    """
+
+    signals: Floats
+    dwell: Floats
+    check: NDArray[np.bool_]
+
+
+def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
+    """`maps` commands for `mirror`; the same for the same seed.
+
+    Raises:
+        ValueError: too few or too many maps.
+    """
+    if not MAPS_MIN <= maps <= MAPS_MAX:
+        raise ValueError(f"hysteresis_maps = {maps}: must be {MAPS_MIN} to {MAPS_MAX}")
+    rng = np.random.default_rng(seed)
+    checks = round(CHECK_SHARE * maps)
+    shapes = np.vstack((_random(mirror, maps - checks, rng), _as_in_use(mirror, checks, rng)))
+    held = rng.random(maps) < HELD_SHARE
+    low, high = np.log(HELD_S)
+    dwell = np.where(held, np.exp(rng.uniform(low, high, maps)), 0.0)
+    check = np.arange(maps) >= maps - checks
+    return Excitation(shapes, dwell, check)
+
+
+def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
+    """(count, N) independent signals; where neighbours must stay near each other, about a common level that moves."""
+    middle = 0.5 * (mirror.signal_max + mirror.signal_min)
+    half_range = 0.5 * (mirror.signal_max - mirror.signal_min)
+    swing = rng.choice(SWINGS, (count, 1))
+    own = swing * min(half_range, 0.5 * mirror.neighbour_difference_max)
+    level = rng.uniform(-1.0, 1.0, (count, 1)) * np.maximum(swing * half_range - own, 0.0)
+    return np.asarray(middle + level + own * rng.uniform(-1.0, 1.0, (count, mirror.actuators)))
+
+
+def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
+    """(count, N) bowls with some astigmatism, coma and scatter, inside the limits."""
+    middle = 0.5 * (mirror.signal_max + mirror.signal_min)
+    half_range = 0.5 * (mirror.signal_max - mirror.signal_min)
+    reach = float(np.hypot(mirror.x, mirror.y).max())
+    x, y = mirror.x / reach, mirror.y / reach
+    patterns = np.stack((2.0 * (x**2 + y**2) - 1.0, x**2 - y**2, 2.0 * x * y, x * (3.0 * (x**2 + y**2) - 2.0)))
+    size = rng.uniform(-1.0, 1.0, (count, len(patterns))) * np.array([0.7, 0.1, 0.1, 0.05])
+    shapes = size @ patterns + 0.03 * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
+    if len(mirror.neighbours):
+        a, b = np.asarray(mirror.neighbours).T
+        steepest = np.abs(shapes[:, a] - shapes[:, b]).max(axis=1)
+        allowed = mirror.neighbour_difference_max / half_range
+        shapes *= np.minimum(1.0, 0.999 * allowed / np.maximum(steepest, 1e-12))[:, None]
+    return np.asarray(middle + half_range * np.clip(shapes, -1.0, 1.0))

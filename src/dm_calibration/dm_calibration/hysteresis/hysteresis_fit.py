@@ -1,0 +1,201 @@
+"""From the maps of a run to the law of a mirror, with what it may be trusted to predict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.hysteresis.features import relaxation
+from dm_calibration.hysteresis.identify import CANDIDATES, Candidate, Identification, Run, identify
+from dm_calibration.hysteresis.responses import responses_of
+from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of
+from dm_calibration.influence.fit import PISTON_TILT
+from dm_calibration.influence.maps import CHECK, MapSet
+from dm_common.hysteresis.model import HysteresisModel, follow
+from dm_common.optics.zernike import TERM_RMS
+
+Floats = NDArray[np.float64]
+
+#: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
+#: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.
+OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
+#: Draws for quantiles of the largest of many correlated errors.
+DRAWS = 4000
+#: Moves of the random histories that tell what not knowing the history means.
+HISTORY_MOVES = 12
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisFit:
+    """The memory of one mirror.
+
+    Attributes:
+        name: class of the law, in words.
+        law: see :class:`~dm_common.hysteresis.model.HysteresisModel`.
+        zernike_sigma: (K,) m, standard deviation of the coefficients of a predicted move, on maps that had no part in
+            the fit, the maps' own noise taken off; 0 for piston and tilt.
+        held_out_max_zernike: m, 95th percentile of the largest of them.
+        unknown_sigma: standard deviation of an effective signal when the history is not known.
+        maps: number that the law was identified from.
+        remarks: sentences on how the law was chosen.
+    """
+
+    name: str
+    law: HysteresisModel
+    zernike_sigma: Floats
+    held_out_max_zernike: float
+    unknown_sigma: float
+    maps: int
+    remarks: tuple[str, ...]
+
+
+def fit_hysteresis(
+    maps: MapSet, progress: Callable[[str], None] = lambda step: None, candidates: Sequence[Candidate] = CANDIDATES
+) -> HysteresisFit:
+    """Identify the law from the maps of one run, in the order measured, which begins with a degauss.
+
+    Maps of kind CHECK test the law before they join the final fit.
+
+    Args:
+        candidates: classes of laws to choose from.
+
+    Raises:
+        ExcitationError: the maps do not show the memory.
+        TooFewMapsError: no map can be used.
+        ValueError: time stamps that run backwards.
+    """
+    time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
+    run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment)
+    test = np.array([kind == CHECK for kind in maps.kind])
+    found, run = _without_outliers(run, test, candidates, progress)
+    covariance = _error_covariance(found, run, maps.terms)
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
+    sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
+    return HysteresisFit(
+        name=found.fit.candidate.name,
+        law=found.fit.law,
+        zernike_sigma=sigma,
+        held_out_max_zernike=float(np.quantile(np.abs(draws).max(axis=1), 0.95)),
+        unknown_sigma=unknown_history_sigma(found.fit.law),
+        maps=int(run.responses.usable.sum()),
+        remarks=(*_remarks(found), *_left_out(maps, run)),
+    )
+
+
+def _without_outliers(
+    run: Run, test: NDArray[np.bool_], candidates: Sequence[Candidate], progress: Callable[[str], None]
+) -> tuple[Identification, Run]:
+    """The law of the maps that one law explains, and the run with those alone counting; the commands all stay."""
+    for _ in range(OUTLIER_ROUNDS):
+        found = identify(run, test, candidates, progress=progress)
+        size = np.linalg.norm(found.fit.residual, axis=1)
+        usable = run.responses.usable
+        outlier = usable & (size > OUTLIER * np.median(size[usable]))
+        if not outlier.any() or outlier.sum() > OUTLIERS_MAX * usable.sum():
+            break
+        run = replace(run, responses=replace(run.responses, usable=usable & ~outlier))
+    return found, run
+
+
+def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
+    labels = [label for label, usable in zip(maps.label, run.responses.usable, strict=True) if not usable]
+    if not labels:
+        return ()
+    more = f" and {len(labels) - 5} more" if len(labels) > 5 else ""
+    return (f"Memory: {len(labels)} maps say nothing of the law or contradict it: {', '.join(labels[:5])}{more}.",)
+
+
+def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
+    """`maps` of one run with effective signals in the place of those applied.
+
+    Raises:
+        ValueError: time stamps that run backwards.
+    """
+    time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
+    moved, parts = maps.moved_s(), parts_of(maps.segment)
+    start = dict(zip(range(len(parts)), [-BEFORE_FIRST_MAP_S, *starts_of(parts, time, moved)], strict=True))
+
+    def followed(part: slice) -> Floats:
+        state = law.demagnetised(maps.actuators, start[parts.index(part)])
+        return follow(law, state, maps.applied[part], time[part], moved[part])[0]
+
+    effective = in_parts(parts, followed)
+    if law.creep_rate:
+        fading = np.zeros((len(maps), len(parts)))
+        for number, part in enumerate(parts):
+            fading[part, number] = law.creep_rate * relaxation(time[part], start[number])
+        effective += fading @ _crept_before(maps, effective, fading)
+    return replace(maps, applied=effective)
+
+
+def _crept_before(maps: MapSet, effective: Floats, fading: Floats) -> Floats:
+    """(S, N) effective signals that the mirror had crept to before each degauss, from what fades in the figure.
+
+    Without this the fading goes into the figure, which then belongs to the time of the run only. Expected to be of
+    order 1, like all effective signals; that keeps patterns quiet which the maps hardly show.
+
+    Args:
+        fading: (M, S) how much of it each map still shows.
+    """
+    responses = responses_of(maps)
+    keep, count = responses.usable, responses.coefficients
+    parts = fading.shape[1]
+    design = np.column_stack((np.ones(len(maps)), fading, effective))[keep]
+    values = responses.values[keep]
+    solution = np.linalg.lstsq(design, values, rcond=1e-10)[0]
+    freedom = max(len(design) - design.shape[1], 1)
+    scatter = np.sqrt(np.square(values - design @ solution).sum(axis=0) / freedom)
+    scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
+    uncertainty = np.sqrt(np.diag(np.linalg.pinv(design.T @ design))[1 : 1 + parts])
+    crept = []
+    for faded, sigma in zip(solution[1 : 1 + parts], uncertainty, strict=True):
+        if not sigma > 0.0:  # no map of that part can be used
+            crept.append(np.zeros(maps.actuators))
+            continue
+        influence = solution[1 + parts :] / (scatter * sigma)
+        crept.append(
+            np.linalg.solve(influence @ influence.T + np.eye(len(influence)), influence @ (faded / (scatter * sigma)))
+        )
+    return np.array(crept)
+
+
+def unknown_history_sigma(law: HysteresisModel, seed: int = 0, actuators: int = 500) -> float:
+    """Standard deviation of the static effective signal at one signal over random histories."""
+    rng = np.random.default_rng(seed)
+    signals = rng.uniform(-1.0, 1.0, actuators)
+    ends = []
+    for _ in range(2):
+        state = law.demagnetised(actuators, 0.0)
+        for _ in range(HISTORY_MOVES):
+            state = law.move(state, rng.uniform(-1.0, 1.0, actuators), 0.0)
+        ends.append(law.move(state, signals, 0.0).position)
+    return float(np.std(ends[1] - ends[0]) / np.sqrt(2.0))
+
+
+def _error_covariance(found: Identification, run: Run, terms: int) -> Floats:
+    """(K - 3, K - 3) m^2 of the coefficients of moves predicted, without the noise of their maps."""
+    count = run.responses.coefficients
+    scale = TERM_RMS[PISTON_TILT:terms]
+    rows = found.held_out[:, :count] / scale
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    covariance = rows.T @ rows / len(rows)
+    same = (np.diff(run.signals, axis=0) == 0.0).all(axis=1)
+    same[[part.start - 1 for part in run.parts[1:]]] = False  # a degauss lies between
+    repeated = np.flatnonzero(same) + 1
+    if repeated.size >= 3:
+        values = run.responses.values[:, :count] / scale
+        noise = 0.5 * np.mean(np.square(values[repeated] - values[repeated - 1]), axis=0)
+        covariance = covariance - np.diag(noise)
+    size, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
+
+
+def _remarks(found: Identification) -> tuple[str, ...]:
+    best = found.fit.candidate.name
+    others = ", ".join(f"{name} {score:.2f}" for name, score in found.scores.items() if name != best)
+    sentences = [f"Memory: {best} predicts the maps left out best; error of other laws relative to it: {others}."]
+    sentences += [f"Memory: {name} was not taken: {reason}." for name, reason in found.refused.items()]
+    return tuple(sentences)

@@ -1,0 +1,70 @@
+"""What maps say of the actuators, as numbers of like uncertainty: coefficients, and sag beyond them in few modes.
+
+Coefficients come from all pixels of a map and are good to a fraction of a nanometre; sag at the sampling points is
+coarser, since a point with missing neighbours is the mean of the others. Beyond the coefficients a mirror of N
+actuators shows at most N patterns, so the sag is projected onto those, and each kind is divided by its scatter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.fit import PISTON_TILT
+from dm_calibration.influence.gaps import usable_sag
+from dm_calibration.influence.maps import MapSet
+from dm_common.optics.sag import fill_gaps
+from dm_common.optics.zernike import TERM_RMS, basis
+
+Floats = NDArray[np.float64]
+
+#: Patterns weaker than this share of the strongest are noise.
+WEAKEST_PATTERN = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Measured numbers of M maps.
+
+    Attributes:
+        values: (M, K - 3 + B) m rms: coefficients beyond tilt, as rms sag each, and patterns beyond them.
+        coefficients: K - 3.
+        usable: (M,) maps that say something; rows of others are 0.
+    """
+
+    values: Floats
+    coefficients: int
+    usable: NDArray[np.bool_]
+
+
+def responses_of(maps: MapSet) -> Responses:
+    """Reduce `maps`; patterns and missing points come from a linear influence function.
+
+    Raises:
+        TooFewMapsError: no map can be used.
+    """
+    usable = np.asarray(np.isfinite(maps.sag).any(axis=1) & np.isfinite(maps.coefficients).all(axis=1))
+    sag = usable_sag(maps, ["" if good else "no data" for good in usable])
+    weight = np.sqrt(maps.points.weight)
+    modes = basis(maps.points.x, maps.points.y)
+    design = np.column_stack((np.ones(len(maps)), maps.applied))[usable]
+    model: Floats = maps.coefficients[usable] @ modes.T
+    solution = np.zeros((0, 0))
+    for _ in range(4):  # the gaps' own share shrinks to nothing in some rounds
+        filled = fill_gaps(sag[usable], model, maps.points)
+        solution = np.asarray(np.linalg.lstsq(design, filled, rcond=None)[0], dtype=np.float64)
+        model = design @ solution
+    orthogonal: Floats = np.linalg.qr(weight[:, None] * modes)[0]
+
+    def beyond(rows: Floats) -> Floats:
+        weighted = rows * weight
+        return np.asarray(weighted - (weighted @ orthogonal) @ orthogonal.T)
+
+    _, strength, patterns = np.linalg.svd(beyond(solution[1:]), full_matrices=False)
+    patterns = patterns[strength > WEAKEST_PATTERN * strength[0]]
+    scale = TERM_RMS[PISTON_TILT : maps.terms]
+    values = np.zeros((len(maps), len(scale) + len(patterns)))
+    values[usable] = np.hstack((maps.coefficients[usable, PISTON_TILT:] * scale, beyond(filled) @ patterns.T))
+    return Responses(values, len(scale), usable)

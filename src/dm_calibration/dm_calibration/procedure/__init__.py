@@ -1,0 +1,1 @@
+"""procedure of dm_calibration."""

@@ -1,0 +1,125 @@
+"""A mirror that was bumped in the middle of a run, told by its reference frames.
+
+All reference frames show the same command. Between two of them the picture may change by what hysteresis left behind
+and by a little drift; a tilt, a shift on the camera or another figure beyond that is somebody's elbow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.maps import MapRecord
+from dm_common.optics.zernike import TERM_RMS
+
+Floats = NDArray[np.float64]
+
+_PISTON_TILT = 3
+#: An aperture found on a map may wander by so many pixels.
+_WANDER_PX = 1.5
+
+
+@dataclass(frozen=True)
+class BumpOptions:
+    """Largest changes between two reference frames; 0 = not looked at.
+
+    Attributes:
+        tilt_max: of the sag at the edge by tilt, m.
+        shift_max: of the aperture on the map, m at the mirror.
+        figure_max: of the rms figure, beyond what hysteresis may have left, m.
+        hysteresis_allowance: share of their moves by which actuators may miss their mark.
+    """
+
+    tilt_max: float = 3e-6
+    shift_max: float = 0.1e-3
+    figure_max: float = 50e-9
+    hysteresis_allowance: float = 0.10
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    label: str
+    coefficients: Floats
+    centre: Floats
+
+
+class BumpCheck:
+    """Compares each reference frame with the one before it."""
+
+    def __init__(self, options: BumpOptions, rest: Floats) -> None:
+        """`rest`: (N,) signals of the reference frames."""
+        self._options, self._rest = options, rest
+        self._last: _Look | None = None
+        self._moved = np.zeros_like(rest)
+        # Sums of squares: what the maps showed, rms m, and what was commanded. Their ratio is the size of a response.
+        self._shown = self._commanded = 0.0
+
+    def take(self, record: MapRecord, centre: tuple[float, float], reference: bool) -> None:
+        """Take a good map, which later reference frames are compared with."""
+        if reference:
+            self._last = _Look(record.label, record.coefficients, np.array(centre))
+            self._moved = np.zeros_like(self._moved)
+            return
+        away = record.applied - self._rest
+        self._moved = np.maximum(self._moved, np.abs(away))
+        if self._last is not None and np.isfinite(record.coefficients).all():
+            self._shown += _figure_rms(record.coefficients - self._last.coefficients) ** 2
+            # A common signal lifts the plate without bending it.
+            self._commanded += float(np.square(away - away.mean()).sum())
+
+    def swung(self, signal: float) -> None:
+        """All actuators went `signal` away from rest, as in a degauss."""
+        self._moved = np.maximum(self._moved, abs(signal))
+
+    def change(
+        self, record: MapRecord, centre: tuple[float, float], pixel: float = 0.0, interrupted: bool = False
+    ) -> str:
+        """How the reference frame `record` differs from the one before it, in words; "" = as it should.
+
+        Args:
+            centre: of the aperture on the map, m.
+            pixel: m.
+            interrupted: somebody may have aligned the instrument since; a tilt does not matter then.
+        """
+        last, options = self._last, self._options
+        if last is None or record.coefficients.shape != last.coefficients.shape:
+            return ""
+        difference = record.coefficients - last.coefficients
+        tilt = float(np.hypot(difference[1], difference[2]))
+        if options.tilt_max and not interrupted and tilt > options.tilt_max:
+            return (
+                f"the tilt changed by {tilt * 1e6:.2f} um at the edge since {last.label} "
+                f"(bump.tilt_max {options.tilt_max * 1e6:.2f} um)"
+            )
+        shift = float(np.hypot(*(np.array(centre) - last.centre)))
+        if options.shift_max and shift > max(options.shift_max, _WANDER_PX * pixel):
+            return (
+                f"the mirror moved by {shift * 1e3:.3f} mm on the map since {last.label} "
+                f"(bump.shift_max {options.shift_max * 1e3:.3f} mm)"
+            )
+        left = self._left_behind()
+        figure = _figure_rms(difference)
+        if options.figure_max and figure > options.figure_max + left:
+            return (
+                f"the figure changed by {figure * 1e9:.0f} nm rms since {last.label} (bump.figure_max "
+                f"{options.figure_max * 1e9:.0f} nm and up to {left * 1e9:.0f} nm that hysteresis may have left)"
+            )
+        return ""
+
+    def _left_behind(self) -> float:
+        """The largest rms sag that hysteresis may have left since the last reference frame, m."""
+        if not self._moved.any():
+            return 0.0
+        if not self._commanded:
+            return float("inf")  # no map yet tells how large a response is
+        response = np.sqrt(self._shown / self._commanded)
+        # Added up without coherence: each actuator errs by its own.
+        return float(self._options.hysteresis_allowance * response * np.linalg.norm(self._moved))
+
+
+def _figure_rms(coefficients: Floats) -> float:
+    """Rms sag without piston and tilt, m."""
+    terms = slice(_PISTON_TILT, coefficients.size)
+    return float(np.linalg.norm(coefficients[terms] * TERM_RMS[_PISTON_TILT : coefficients.size]))

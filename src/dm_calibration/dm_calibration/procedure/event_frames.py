@@ -1,0 +1,140 @@
+"""Events of a run as bytes, each sealed with a hash, so that a torn or damaged one is known as such.
+
+A frame is a mark, two lengths, a head in JSON, the raw bytes of the arrays and a SHA-256. The hash goes over the hash
+of the frame before it as well: no frame can get lost between two others, or be put in from another run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.procedure.outcome import Doubted, Dropped, Event, MapTaken, Segment, Setup, Solved, Unseen
+from dm_common.optics.sampling import SamplePoints
+
+_MARK = b"DMJ1"
+_LENGTHS = struct.Struct("<II")
+_SEAL = hashlib.sha256().digest_size
+#: Larger heads or payloads are not of this suite [bytes].
+_SIZE_MAX = 1 << 26
+
+
+@dataclass(frozen=True)
+class Storing:
+    """The calibration made of the run is about to be stored under `id`, as created at `created_ns`."""
+
+    id: str
+    created_ns: int
+
+
+_EVENTS: dict[str, Any] = {
+    kind.__name__: kind for kind in (Setup, Segment, MapTaken, Unseen, Dropped, Solved, Doubted, Storing)
+}
+_PARTS: dict[str, Any] = {"record": MapRecord, "points": SamplePoints}
+
+#: The seal that the first frame of a run follows.
+FIRST = b"\0" * _SEAL
+
+
+def encode(event: Event | Storing, before: bytes) -> tuple[bytes, bytes]:
+    """`event` as a frame that follows the seal `before`, and its own seal."""
+    arrays: list[bytes] = []
+    head = {"event": type(event).__name__, "fields": _plain(event, arrays)}
+    text, payload = json.dumps(head).encode(), b"".join(arrays)
+    body = b"".join((_MARK, _LENGTHS.pack(len(text), len(payload)), text, payload))
+    seal = hashlib.sha256(before + body).digest()
+    return body + seal, seal
+
+
+def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
+    """The events of whole frames from the beginning on: event, end of its frame, seal. Ends at the first that is not.
+
+    Raises:
+        ValueError: a frame is whole but of another version.
+    """
+    seal, position = FIRST, 0
+    start = len(_MARK) + _LENGTHS.size
+    while len(content) - position >= start + _SEAL and content[position : position + len(_MARK)] == _MARK:
+        head, payload = _LENGTHS.unpack_from(content, position + len(_MARK))
+        end = position + start + head + payload
+        if max(head, payload) > _SIZE_MAX or end + _SEAL > len(content):
+            return
+        found = content[end : end + _SEAL]
+        if hashlib.sha256(seal + content[position:end]).digest() != found:
+            return
+        text = content[position + start : position + start + head]
+        event = _event(json.loads(text), memoryview(content)[position + start + head : end])
+        position, seal = end + _SEAL, found
+        yield event, position, seal
+
+
+def _event(head: dict[str, Any], payload: memoryview) -> Event | Storing:
+    try:
+        event: Event | Storing = _rebuilt(_EVENTS[head["event"]], head["fields"], payload)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"event {head.get('event')!r} of another version: {error}") from error
+    return event
+
+
+def _plain(value: Any, arrays: list[bytes]) -> dict[str, Any]:
+    """Fields of a dataclass for JSON; arrays go to `arrays`, their type, shape and place stay."""
+    result: dict[str, Any] = {}
+    for field in fields(value):
+        item = getattr(value, field.name)
+        if isinstance(item, np.ndarray):
+            place = sum(map(len, arrays))
+            arrays.append(np.ascontiguousarray(item, dtype="<f8").tobytes())
+            result[field.name] = {"shape": item.shape, "at": place}
+        elif is_dataclass(item):
+            result[field.name] = _plain(item, arrays)
+        else:
+            result[field.name] = item
+    return result
+
+
+def _rebuilt(kind: Any, values: dict[str, Any], payload: memoryview) -> Any:
+    made: dict[str, Any] = {}
+    for name, value in values.items():
+        if name in _PARTS:
+            made[name] = _rebuilt(_PARTS[name], value, payload)
+        elif isinstance(value, dict):
+            shape = tuple(value["shape"])
+            count = int(np.prod(shape))
+            array = np.frombuffer(payload, dtype="<f8", count=count, offset=value["at"])
+            made[name] = array.astype(np.float64).reshape(shape)
+        elif isinstance(value, list):
+            made[name] = tuple(value)
+        else:
+            made[name] = value
+    return kind(**made)
+
+
+def map_hashes(maps: MapSet) -> list[str]:
+    """SHA-256 over what was measured in each map: equal only when every bit is."""
+    unknown = np.full(maps.terms, np.nan)
+    return [
+        record_hash(
+            MapRecord(
+                maps.label[k], maps.kind[k], int(maps.step[k]), maps.signals[k], maps.applied[k],
+                int(maps.stamp_ns[k]), maps.coefficients[k], maps.sigma[k], maps.sag[k],
+                float(maps.residual_rms[k]), float(maps.valid_fraction[k]), maps.file[k], maps.sha256[k],
+                None if np.array_equal(maps.nominal[k], unknown, equal_nan=True) else maps.nominal[k],
+                int(maps.moved_ns[k]), int(maps.segment[k]),
+            )
+        )
+        for k in range(len(maps))
+    ]  # fmt: skip
+
+
+def record_hash(record: MapRecord) -> str:
+    """The same of one map."""
+    arrays: list[bytes] = []
+    head = json.dumps(_plain(record, arrays))
+    return hashlib.sha256(head.encode() + b"".join(arrays)).hexdigest()

@@ -1,0 +1,165 @@
+"""One map of a commanded state: tried again when it fails, compared with the others, checked for a bump."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.fit import FitOptions
+from dm_calibration.influence.maps import REFERENCE, MapRecord
+from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
+from dm_calibration.procedure.map_checks import check_comparable
+from dm_calibration.procedure.outcome import NOWHERE, Doubted, Event, MapTaken, Outcome, Setup
+from dm_calibration.procedure.plan import Step, StepKind
+from dm_common.measurement import MAP_REJECTED, Bench, BenchError, Measurement, MeasurementError
+from dm_common.mirror import Mirror
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ProcedureOptions:
+    """Tries and checks of the measurements.
+
+    Attributes:
+        measure_retries: further tries after a measurement that failed.
+        failures_max: states in a row without a map after which the run is given up.
+        maps_per_state: maps taken in each commanded state.
+        aperture_tolerance: largest relative deviation of a map's aperture radius from the mirror's.
+        wavelength_tolerance: largest relative difference of wavelengths between maps.
+        fit: options of the fit that the surfaces with a prescribed shape are solved from.
+        bump: what reference frames may differ by.
+    """
+
+    measure_retries: int = 1
+    failures_max: int = 3
+    maps_per_state: int = 1
+    aperture_tolerance: float = 0.02
+    wavelength_tolerance: float = 1e-4
+    fit: FitOptions = field(default_factory=FitOptions)
+    bump: BumpOptions = field(default_factory=BumpOptions)
+
+
+class MapAcquisition:
+    """Takes the maps of one run and adds them to its outcome."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        mirror: Mirror,
+        options: ProcedureOptions,
+        outcome: Outcome,
+        note: Callable[[Event], None],
+        look_around: Callable[[], None],
+        guard: Callable[[], None],
+    ) -> None:
+        """`note` takes each event; `look_around` is asked before a map, `guard` after it: their errors end the run."""
+        self._bench, self._mirror, self._options = bench, mirror, options
+        self.outcome, self._note, self._look_around, self._guard = outcome, note, look_around, guard
+        self._bump = BumpCheck(options.bump, mirror.rest)
+        self._swung = False
+        for record, centre in zip(outcome.records, outcome.centres, strict=True):
+            self._bump.take(record, centre, record.kind == REFERENCE)
+
+    def swung(self) -> None:
+        """The actuators went through their whole range since the last map, nobody knows where the mirror went."""
+        self._bump.swung(0.5 * (self._mirror.signal_max - self._mirror.signal_min))
+        self._swung = True
+
+    def take(self, label: str, step: Step, number: int, applied: Floats) -> None:
+        """Take a map of the present state.
+
+        Args:
+            number: of the state in the run.
+            applied: (N,) as written.
+
+        Raises:
+            MeasurementError: no try gave one.
+            BenchError: a reference frame shows that the mirror was bumped, and another map of it does too.
+        """
+        taken = self._taken(label, step, number, applied)
+        self._note(taken)
+        self._bump.take(taken.record, taken.centre, step.kind is StepKind.REFERENCE)
+        self._swung = False
+
+    def _taken(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
+        for attempt in range(self._options.measure_retries + 1):
+            self._look_around()
+            try:
+                measured = self._measured(label)
+                break
+            except MeasurementError as error:
+                if attempt == self._options.measure_retries:
+                    tries = f" ({attempt + 1} tries)" if attempt else ""
+                    raise MeasurementError(error.code, f"{error}{tries}") from error
+        taken = self._as_event(label, step, number, applied, measured)
+        if step.kind is StepKind.REFERENCE:
+            suspicion = self._bump.change(taken.record, taken.centre, measured.pitch, self._swung)
+            if suspicion:  # a bad map, or a mirror that stands otherwise: another map tells
+                measured = self._measured(label)
+                taken = self._as_event(label, step, number, applied, measured)
+                if suspicion := self._bump.change(taken.record, taken.centre, measured.pitch, self._swung):
+                    self._stop_bumped(label, suspicion)
+        return taken
+
+    def _stop_bumped(self, label: str, suspicion: str) -> None:
+        """End the run; what was measured since the last good reference frame is in doubt."""
+        if self._swung:
+            raise BenchError(
+                MAP_REJECTED,
+                f"{label}: {suspicion}: the mirror does not stand as it did before the run was interrupted. Put it "
+                "back, or begin anew (`dm calibrate --fresh`)",
+            )
+        frames = [index for index, record in enumerate(self.outcome.records) if record.kind == REFERENCE]
+        doubtful = len(self.outcome.records) - frames[-1] - 1
+        self._note(Doubted(frames[-1] + 1, f"in doubt, bumped before {label}"))
+        raise BenchError(
+            MAP_REJECTED,
+            f"{label}: {suspicion}: the mirror or the interferometer was bumped. The {doubtful} maps since are in "
+            "doubt; put the mirror back and start again to go on from the last good reference frame",
+        )
+
+    def _as_event(self, label: str, step: Step, number: int, applied: Floats, measured: Measurement) -> MapTaken:
+        if self.outcome.points is None:
+            self._note(Setup.of(measured))
+        assert step.signals is not None
+        record = MapRecord(
+            label=label,
+            kind=step.kind.value,
+            step=number,
+            signals=step.signals,
+            applied=applied,
+            stamp_ns=measured.stamp_ns,
+            coefficients=measured.coefficients,
+            sigma=measured.sigma,
+            sag=measured.sag,
+            residual_rms=measured.residual_rms,
+            valid_fraction=measured.valid_fraction,
+            file=measured.file,
+            sha256=measured.sha256,
+            nominal=step.nominal,
+            moved_ns=measured.moved_ns,
+            segment=self.outcome.segment,
+        )
+        centre = NOWHERE
+        if measured.radius_px > 0.0:
+            metres = self._mirror.working_radius / measured.radius_px
+            centre = (measured.centre[0] * metres, measured.centre[1] * metres)
+        return MapTaken(record, measured.radius > 0.0, centre)
+
+    def _measured(self, label: str) -> Measurement:
+        """A map that can be compared with the others."""
+        measured = self._bench.measure(label)
+        self._guard()
+        options = self._options
+        check_comparable(
+            measured,
+            self.outcome,
+            self._mirror.working_radius,
+            options.aperture_tolerance,
+            options.wavelength_tolerance,
+        )
+        return measured

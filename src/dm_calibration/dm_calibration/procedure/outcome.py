@@ -1,0 +1,208 @@
+"""What a run has measured so far, as the sum of what happened to it.
+
+Each thing that happens is an event. A live run takes its events one by one and keeps each on disk
+(:mod:`dm_calibration.procedure.run_journal`); a run that was cut off is what its kept events add up to. Both go through
+:meth:`Outcome.take`, so they cannot differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.influence.regression import TooFewMapsError
+from dm_common.measurement import Measurement
+from dm_common.optics.sampling import SamplePoints
+
+Floats = NDArray[np.float64]
+
+#: A place that nobody told.
+NOWHERE = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The first map came: what all maps must share. Fields as in :class:`~dm_common.measurement.Measurement`."""
+
+    points: SamplePoints
+    wavelength: float
+    system_error_subtracted: int
+    instrument: str = ""
+    pitch: float = 0.0
+    camera: tuple[int, int] = (0, 0)
+
+    @classmethod
+    def of(cls, measured: Measurement) -> Setup:
+        """The setup that `measured` was taken with."""
+        return cls(
+            measured.points, measured.wavelength, measured.system_error_subtracted, measured.instrument,
+            measured.pitch, measured.camera,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The history of the actuators begins anew: after a degauss, or where an interrupted run goes on.
+
+    Attributes:
+        number: 0 for the first.
+        stamp_ns: wall time, ns since the epoch.
+    """
+
+    number: int
+    stamp_ns: int = 0
+
+
+@dataclass(frozen=True)
+class MapTaken:
+    """A map was measured.
+
+    Attributes:
+        record: of it.
+        radius_known: whether it tells its aperture radius.
+        centre: of the aperture on the map, m; NaN = not told.
+    """
+
+    record: MapRecord
+    radius_known: bool = True
+    centre: tuple[float, float] = NOWHERE
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """A command without a map, kept because the actuators remember it."""
+
+    record: MapRecord
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A map of `step` could not be had; `whole`: the step is given up."""
+
+    step: int
+    reason: str
+    whole: bool = False
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The signals of a shape were solved from an influence function: the shape and what was reduced, in words."""
+
+    target: str
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class Doubted:
+    """All but the first `kept` maps are in doubt, for `reason`; their steps are open again."""
+
+    kept: int
+    reason: str
+
+
+Event = Setup | Segment | MapTaken | Unseen | Dropped | Solved | Doubted
+
+
+@dataclass
+class Outcome:
+    """What a run has measured so far.
+
+    Attributes:
+        records: the maps, in order.
+        points: the sampling points of all of them; None before the first.
+        wavelength: m; 0 = unknown.
+        system_error_subtracted: as in Measurement, the same for all maps.
+        instrument, pitch, camera: as in Measurement, the same for all maps.
+        radius_known: whether the maps tell their aperture radius.
+        dropped: "label: reason" of each map or state that gave none.
+        remarks: what was measured differently than asked.
+        targets: the shapes that were solved, in words.
+        segment: number of the present segment: see :class:`Segment`.
+        centres: of the aperture on each map of `records`, m; NaN = not told.
+    """
+
+    records: list[MapRecord] = field(default_factory=list)
+    points: SamplePoints | None = None
+    wavelength: float = 0.0
+    system_error_subtracted: int = -1
+    instrument: str = ""
+    pitch: float = 0.0
+    camera: tuple[int, int] = (0, 0)
+    radius_known: bool = True
+    dropped: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    targets: list[str] = field(default_factory=list)
+    segment: int = 0
+    centres: list[tuple[float, float]] = field(default_factory=list)
+    _given_up: dict[int, int] = field(default_factory=dict)
+    # Of what came after the last map: drops, and commands without a map.
+    _failing: list[Dropped] = field(default_factory=list)
+    _unseen: int = 0
+
+    def take(self, event: Event) -> None:
+        """Add `event`."""
+        match event:
+            case Setup():
+                self.points, self.wavelength = event.points, event.wavelength
+                self.system_error_subtracted = event.system_error_subtracted
+                self.instrument, self.pitch, self.camera = event.instrument, event.pitch, event.camera
+            case Segment():
+                self._begin(event.number)
+            case MapTaken():
+                self._add(event.record, event.centre)
+                self.radius_known &= event.radius_known
+                self._failing, self._unseen = [], 0
+            case Unseen():
+                self._add(event.record, NOWHERE)
+                self._unseen += 1
+            case Dropped():
+                self.dropped.append(event.reason)
+                self._failing.append(event)
+                self._given_up[event.step] = self._given_up.get(event.step, 0) + (1_000_000 if event.whole else 1)
+            case Solved():
+                if event.target not in self.targets:  # solved again after an interruption
+                    self.targets.append(event.target)
+                    self.remarks += [event.remark] if event.remark else []
+            case Doubted():
+                self._doubt(event)
+
+    def tried(self, step: int) -> int:
+        """Maps of the state `step` that were taken or given up."""
+        return sum(record.step == step for record in self.records) + self._given_up.get(step, 0)
+
+    def maps(self) -> MapSet:
+        """All maps measured.
+
+        Raises:
+            TooFewMapsError: there is none.
+        """
+        if self.points is None or not self.records:
+            raise TooFewMapsError("no map was measured; " + "; ".join(self.dropped[:3]))
+        return MapSet.from_records(self.records, self.points)
+
+    def _add(self, record: MapRecord, centre: tuple[float, float]) -> None:
+        self.records.append(record)
+        self.centres.append(centre)
+
+    def _begin(self, number: int) -> None:
+        """A new segment. What failed last is tried again: that may be why the run ended."""
+        if number and self._failing:
+            del self.dropped[-len(self._failing) :]
+            for drop in self._failing:
+                self._given_up.pop(drop.step, None)
+        if number and self._unseen:
+            del self.records[-self._unseen :], self.centres[-self._unseen :]
+        self.segment, self._failing, self._unseen = number, [], 0
+
+    def _doubt(self, event: Doubted) -> None:
+        doubtful = self.records[event.kept :]
+        self.dropped += [
+            f"{record.label}: {event.reason}" for record in doubtful if np.isfinite(record.coefficients).any()
+        ]
+        for record in doubtful:
+            self._given_up.pop(record.step, None)
+        del self.records[event.kept :], self.centres[event.kept :]
+        self._failing, self._unseen = [], 0

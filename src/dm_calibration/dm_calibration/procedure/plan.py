@@ -1,0 +1,208 @@
+"""What a calibration measures, in order: degauss, reference frames, pokes, surfaces of Table 1."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.hysteresis.excitation import REPEATS, excitation
+from dm_calibration.influence import surfaces
+from dm_common.mirror import Mirror, scale_to_limits
+
+Floats = NDArray[np.float64]
+
+#: Commands between two reference frames of a MEMORY plan; creep takes up most of what drifts.
+HYSTERESIS_REFERENCE_EVERY = 100
+
+
+class PlanKind(IntEnum):
+    """What to measure; the values are those of dm_msgs/Calibrate."""
+
+    FULL = 0
+    POKES = 1
+    SURFACES = 2
+    POKE_CHECK = 3
+    HYSTERESIS = 4
+
+
+class StepKind(Enum):
+    """What a step does; the measured kinds are those of :mod:`dm_calibration.influence.maps`."""
+
+    DEGAUSS = "degauss"
+    REFERENCE = "reference"
+    POKE = "poke"
+    SURFACE = "surface"
+    EXCITATION = "excitation"
+    CHECK = "check"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a plan.
+
+    Attributes:
+        label: unique in the plan.
+        kind: see StepKind.
+        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes.
+        nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
+        dwell: to hold the shape beyond the settle time, s.
+    """
+
+    label: str
+    kind: StepKind
+    signals: Floats | None = None
+    nominal: Floats | None = None
+    dwell: float = 0.0
+
+    @property
+    def needs_model(self) -> bool:
+        """Whether the signals must be solved from an influence function first."""
+        return self.kind is StepKind.SURFACE and self.signals is None
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """How to measure.
+
+    Attributes:
+        poke_amplitude: half-swing of a push-pull poke, normalised.
+        reference_every: steps between two reference frames.
+        surfaces: names of Table 1; empty = all.
+        degauss: whether to start with a degauss.
+        hysteresis_maps: commands of a MEMORY plan.
+    """
+
+    poke_amplitude: float = 0.5
+    reference_every: int = 10
+    surfaces: Sequence[str] = ()
+    degauss: bool = True
+    hysteresis_maps: int = 300
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.poke_amplitude <= 1.0:
+            raise ValueError(f"poke_amplitude = {self.poke_amplitude}: must be above 0, at most 1")
+        if self.reference_every < 1:
+            raise ValueError(f"reference_every = {self.reference_every}: must be at least 1")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The steps in order, and what differs from what was asked, in words."""
+
+    kind: PlanKind
+    steps: tuple[Step, ...]
+    remarks: tuple[str, ...] = field(default=())
+
+    @property
+    def needs_model(self) -> bool:
+        return any(step.needs_model for step in self.steps)
+
+
+def make_plan(kind: PlanKind, mirror: Mirror, options: PlanOptions | None = None) -> Plan:
+    """The plan of one calibration run.
+
+    Raises:
+        UnknownNameError: a surface that Table 1 does not have, naming the near ones.
+        ValueError: a surface asked for by name that this mirror cannot have, or an option out of its range.
+    """
+    options = options or PlanOptions()
+    if kind is PlanKind.HYSTERESIS:
+        return _hysteresis_plan(mirror, options)
+    remarks: list[str] = []
+    states: list[Step] = []
+    names = surfaces.check_names(options.surfaces)
+    if kind is not PlanKind.SURFACES:
+        states += _pokes(mirror, options.poke_amplitude, remarks)
+    if kind in (PlanKind.FULL, PlanKind.SURFACES):
+        states += _surfaces(names, mirror, bool(options.surfaces), remarks)
+    steps = _with_references(states, mirror, options.reference_every)
+    if options.degauss:
+        steps.insert(0, Step("degauss", StepKind.DEGAUSS))
+    return Plan(kind, tuple(steps), tuple(remarks))
+
+
+def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
+    """A degauss, repeated maps at rest, and the excitation.
+
+    Raises:
+        ValueError: a run that would not begin with a degauss, or of too few or too many maps.
+    """
+    if not options.degauss:
+        raise ValueError("skip_degauss = true: the memory can only be identified from a degauss on")
+    commands = excitation(mirror, options.hysteresis_maps)
+    steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
+    steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]
+    for k, (signals, dwell, check) in enumerate(
+        zip(commands.signals, commands.dwell, commands.check, strict=True)
+    ):  # fmt: skip
+        kind = StepKind.CHECK if check else StepKind.EXCITATION
+        steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell)))
+        if (k + 1) % HYSTERESIS_REFERENCE_EVERY == 0:
+            steps.append(Step(f"reference {2 + k // HYSTERESIS_REFERENCE_EVERY}", StepKind.REFERENCE, mirror.rest))
+    return Plan(PlanKind.HYSTERESIS, tuple(steps))
+
+
+def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple[Step, surfaces.Surface]:
+    """`step` with the signals and nominal coefficients that `model` gives it, and the surface they come from."""
+    surface = surfaces.model_surface(step.label, model, mirror)
+    return Step(step.label, step.kind, surface.signals, surface.nominal), surface
+
+
+def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
+    """Push and pull of each actuator about mid range, pushed first; the two directions follow each other at once."""
+    half_range = 0.5 * (mirror.signal_max - mirror.signal_min)
+    steps = []
+    smallest = 1.0
+    for k in range(mirror.actuators):
+        for sign, mark in ((1.0, "+"), (-1.0, "-")):
+            signals = mirror.rest
+            signals[k] += sign * amplitude * half_range
+            # A poke scaled about the mean would move every actuator; shrinking the poke keeps the others at rest.
+            _, factor = scale_to_limits(signals, mirror)
+            if factor < 1.0:  # and a hair less: the driver checks the limit exactly
+                signals[k] = mirror.rest[k] + factor * (1.0 - 1e-12) * (signals[k] - mirror.rest[k])
+            smallest = min(smallest, factor)
+            steps.append(Step(f"poke{mark}{k + 1:02d}", StepKind.POKE, signals))
+    if smallest < 1.0:
+        remarks.append(f"pokes reduced to {smallest:.0%} of +-{amplitude:g} to keep the mirror's limits")
+    return steps
+
+
+def _surfaces(names: Sequence[str], mirror: Mirror, asked: bool, remarks: list[str]) -> list[Step]:
+    steps = []
+    for name in names:
+        if reason := surfaces.missing_on(name, mirror):
+            if asked:
+                raise ValueError(f"surface {reason}")
+            remarks.append(f"left out: {reason}")
+        elif name in surfaces.MODEL_NAMES:
+            steps.append(Step(name, StepKind.SURFACE))
+        else:
+            surface = surfaces.signal_surface(name, mirror)
+            steps.append(Step(name, StepKind.SURFACE, surface.signals))
+            if surface.remark:
+                remarks.append(surface.remark)
+    if mirror.actuators > surfaces.TABLE_CHANNELS and not asked:
+        remarks.append(f"Table 1 has a surface of their own for channels 1 to {surfaces.TABLE_CHANNELS} only")
+    return steps
+
+
+def _with_references(states: Sequence[Step], mirror: Mirror, every: int) -> list[Step]:
+    """`states` with a reference frame before, after each `every` steps, and after the last."""
+    steps: list[Step] = []
+    frames = 0
+
+    def reference() -> Step:
+        nonlocal frames
+        frames += 1
+        return Step(f"reference {frames}", StepKind.REFERENCE, mirror.rest)
+
+    for i, state in enumerate(states):
+        if i % every == 0:
+            steps.append(reference())
+        steps.append(state)
+    return [*steps, reference()]

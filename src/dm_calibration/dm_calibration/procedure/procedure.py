@@ -1,0 +1,227 @@
+"""The calibration procedure: go through a plan, command, settle, measure, and lose no good map to a bad one.
+
+It knows no ROS: what moves the mirror and what measures it are callables. A run that was cut off goes on from what it
+had measured: with a degauss, since nobody knows what the actuators went through meanwhile, and a reference frame.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.influence.fit import fit_influence
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.influence.surfaces import LinearModel
+from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
+from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, Unseen
+from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, solve_step
+from dm_common.measurement import (
+    MAP_REJECTED,
+    Bench,
+    BenchError,
+    Cancelled,
+    Measurement,
+    MeasurementError,
+)
+from dm_common.mirror import Mirror
+
+__all__ = [
+    "MAP_REJECTED",
+    "Bench",
+    "BenchError",
+    "Cancelled",
+    "Measurement",
+    "MeasurementError",
+    "Outcome",
+    "Procedure",
+    "ProcedureOptions",
+    "Progress",
+]
+
+Floats = NDArray[np.float64]
+
+#: Maps of the mirror at rest with which a memory run goes on: they tell where the figure stands now.
+RESUME_MAPS = 3
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where the procedure stands: step `done` of `steps`."""
+
+    label: str
+    kind: StepKind
+    done: int
+    steps: int
+    dropped: int
+    residual_rms: float
+
+
+class Procedure:
+    """One run of a plan on a bench. `outcome` can be read at any time, also after a failure."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        mirror: Mirror,
+        bench: Bench,
+        options: ProcedureOptions | None = None,
+        *,
+        model: LinearModel | None = None,
+        progress: Callable[[Progress], None] = lambda progress: None,
+        cancelled: Callable[[], bool] = lambda: False,
+        outcome: Outcome | None = None,
+        keep: Callable[[Event], None] = lambda event: None,
+        guard: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Prepare a run.
+
+        Args:
+            model: solves the surfaces with a prescribed shape; None = one fitted to the maps of this run so far.
+            outcome: of a run of the same plan that was cut off; None = begin.
+            keep: called with each event before it counts; what it raises ends the run.
+            guard: asked before each step; what it raises ends the run.
+        """
+        self.outcome = outcome or Outcome(remarks=list(plan.remarks))
+        self._plan, self._mirror, self._bench = plan, mirror, bench
+        self._options = options or ProcedureOptions()
+        self._model = model
+        self._progress, self._cancelled, self._keep, self._guard = progress, cancelled, keep, guard
+        self._failures = 0
+        self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._look_around, guard)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every state of the plan was measured or given up."""
+        return all(self._is_done(number, step) for number, step in enumerate(self._plan.steps))
+
+    def run(self) -> Outcome:
+        """Go through all steps that are still to be done.
+
+        The caller brings the mirror back to rest afterwards, however this ends.
+
+        Raises:
+            Cancelled: `cancelled()` became true; noticed within one step.
+            BenchError: the mirror failed, the interferometer gave no map for several states in a row, or the mirror
+                was bumped.
+        """
+        steps = self._plan.steps
+        if not self.complete:
+            if self.outcome.records:
+                self._go_on()
+            for number, planned in enumerate(steps):
+                if not self._is_done(number, planned):
+                    self._do(planned, number)
+        self._report(steps[-1].label, steps[-1].kind, len(steps))
+        return self.outcome
+
+    def _is_done(self, number: int, step: Step) -> bool:
+        if step.kind is StepKind.DEGAUSS:
+            return bool(self.outcome.records)
+        return self.outcome.tried(number) >= self._options.maps_per_state
+
+    def _do(self, planned: Step, number: int) -> None:
+        self._look_around()
+        self._report(planned.label, planned.kind, number)
+        if planned.kind is StepKind.DEGAUSS:
+            self._bench.degauss()
+            self._note(Segment(0, time.time_ns()))
+        elif (step := self._solved(planned, number)) is not None:
+            self._measure_state(step, number, self._options.maps_per_state)
+
+    def _go_on(self) -> None:
+        """Begin a new segment after an interruption: wipe the memory, look at the mirror at rest."""
+        last = self.outcome.records[-1].label
+        done = next(number for number, step in enumerate(self._plan.steps) if not self._is_done(number, step))
+        self._look_around()
+        if self._plan.steps[0].kind is StepKind.DEGAUSS:
+            self._report(f"degauss (resumed after {last})", StepKind.DEGAUSS, done)
+            self._bench.degauss()
+        self._note(Segment(self.outcome.segment + 1, time.time_ns()))
+        self._maps.swung()
+        step = Step(f"reference resumed {self.outcome.segment}", StepKind.REFERENCE, self._mirror.rest)
+        self._report(step.label, step.kind, done)
+        repeats = max(self._options.maps_per_state, RESUME_MAPS if self._plan.kind is PlanKind.HYSTERESIS else 1)
+        number = len(self._plan.steps) + self.outcome.segment
+        self._measure_state(step, number, repeats)
+        if self._failures:
+            raise BenchError(MAP_REJECTED, f"{step.label} gave no map, without which the run cannot go on")
+
+    def _report(self, label: str, kind: StepKind, done: int) -> None:
+        residual_rms = self.outcome.records[-1].residual_rms if self.outcome.records else 0.0
+        self._progress(
+            Progress(label, kind, done, len(self._plan.steps), len(self.outcome.dropped), residual_rms)
+        )  # fmt: skip
+
+    def _look_around(self) -> None:
+        if self._cancelled():
+            raise Cancelled("cancelled")
+        self._guard()
+
+    def _note(self, event: Event) -> None:
+        """On disk first, so that nothing counts that could get lost."""
+        self._keep(event)
+        self.outcome.take(event)
+
+    def _solved(self, step: Step, number: int) -> Step | None:
+        """`step` with its signals; None, with the reason in `dropped`, when no model can be had."""
+        if not step.needs_model:
+            return step
+        try:
+            if self._model is None:
+                self._model = fit_influence(self._maps_before_solving(), self._options.fit, rings=self._mirror.rings)
+            solved, surface = solve_step(step, self._model, self._mirror)
+        except TooFewMapsError as error:
+            reason = f"{step.label}: no influence function to solve its signals from: {error}"
+            self._note(Dropped(number, reason, whole=True))
+            return None
+        self._note(Solved(surface.target, surface.remark))
+        return solved
+
+    def _maps_before_solving(self) -> MapSet:
+        """The maps before the first solved shape: the same whether the run was interrupted after it or not."""
+        maps = self.outcome.maps()
+        solved = np.isfinite(maps.nominal).any(axis=1)
+        return maps.select(~np.logical_or.accumulate(solved))
+
+    def _measure_state(self, step: Step, number: int, repeats: int) -> None:
+        assert step.signals is not None
+        applied = self._bench.apply(step.signals)
+        if not self._bench.settle(step.dwell):
+            raise Cancelled("cancelled while settling")
+        taken = 0
+        failure = MeasurementError(MAP_REJECTED, "")
+        for repeat in range(self.outcome.tried(number), repeats):
+            label = step.label if repeat == 0 else f"{step.label} ({repeat + 1})"
+            try:
+                self._maps.take(label, step, number, applied)
+                taken += 1
+            except MeasurementError as error:
+                self._note(Dropped(number, f"{label}: {error}"))
+                failure = error
+        if not taken:
+            self._note_unseen(step, number, applied)
+        self._failures = 0 if taken else self._failures + 1
+        if self._failures >= self._options.failures_max:
+            raise BenchError(failure.code, f"{self._failures} states in a row gave no map; the last: {failure}")
+
+    def _note_unseen(self, step: Step, number: int, applied: Floats) -> None:
+        """Keep a command without a map where the actuators' memory is to be identified: they remember it all the same.
+
+        Its time is not known; it counts as right after the map before.
+        """
+        records = self.outcome.records
+        if step.kind not in (StepKind.EXCITATION, StepKind.CHECK) or not records:
+            return
+        nothing = np.full_like(records[-1].coefficients, np.nan)
+        assert step.signals is not None
+        unseen = replace(
+            records[-1], label=step.label, kind=step.kind.value, step=number, signals=step.signals,
+            applied=applied, coefficients=nothing, sigma=nothing, sag=np.full_like(records[-1].sag, np.nan),
+            residual_rms=np.nan, valid_fraction=0.0, file="", sha256="", nominal=None, moved_ns=0,
+        )  # fmt: skip
+        self._note(Unseen(unseen))

@@ -1,0 +1,160 @@
+"""Which run a `Calibrate` goal goes on with, and what makes two runs the same. Knows no ROS."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.calibration import software_version
+from dm_calibration.procedure.event_frames import Storing
+from dm_calibration.procedure.outcome import Outcome
+from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions
+from dm_calibration.procedure.run_journal import RunJournal
+from dm_calibration.procedure.unfinished_runs import Found, UnfinishedRuns
+from dm_calibration.store.calibration_store import StoreError
+from dm_common.mirror import Mirror
+
+#: Room that must be there for each map, in the journal and then in the calibration [bytes].
+ROOM_PER_MAP = 20_000
+
+
+@dataclass(frozen=True)
+class OpenRun:
+    """A run with its journal.
+
+    Attributes:
+        outcome: so far.
+        storing: the calibration it may have been stored as already; None = it had not come so far.
+        resumed: what it goes on from, in words; "" = it begins.
+        notes: what became of other unfinished runs, in words.
+    """
+
+    journal: RunJournal
+    outcome: Outcome
+    storing: Storing | None = None
+    resumed: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ResumeOptions:
+    """Whether to go on with a run.
+
+    Attributes:
+        age_max: s since its last event; 0 = never.
+        fresh: do not go on with any, this time.
+        now_ns: time of the clock that maps are stamped with, ns; 0 = not known.
+    """
+
+    age_max: float
+    fresh: bool = False
+    now_ns: int = 0
+
+
+def mirror_facts(mirror: Mirror) -> dict[str, Any]:
+    """What tells one mirror from another, and one configuration of it, for JSON."""
+    return {
+        "name": mirror.name,
+        "serial": mirror.serial,
+        "working_radius_m": mirror.working_radius,
+        "signal_min": mirror.signal_min,
+        "signal_max": mirror.signal_max,
+        "neighbour_difference_max": mirror.neighbour_difference_max,
+        "layout_sha256": _hash(mirror.x, mirror.y, mirror.neighbours),
+    }
+
+
+def identity_of(
+    plan: Plan, options: PlanOptions, mirror: Mirror, settings: Mapping[str, Any], driver: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a goal must share with an unfinished run to go on with it.
+
+    Args:
+        settings: of the goal beside the plan's options.
+        driver: what the driver tells of its wiring and limits.
+    """
+    described = [(step.label, step.kind.value, step.dwell) for step in plan.steps]
+    signals = [step.signals for step in plan.steps if step.signals is not None]
+    steps = hashlib.sha256(json.dumps(described).encode()).hexdigest()
+    facts = {
+        "plan": plan.kind.name,
+        "plan_options": asdict(options),
+        "plan_sha256": _hash(*signals) + steps,
+        "mirror": mirror_facts(mirror),
+        "settings": dict(settings),
+        "driver": dict(driver),
+    }
+    # As it comes back from a file: tuples become lists.
+    result: dict[str, Any] = json.loads(json.dumps(facts))
+    return result
+
+
+def open_run(
+    runs: UnfinishedRuns,
+    identity: Mapping[str, Any],
+    plan: Plan,
+    options: ResumeOptions,
+    maps_per_state: int = 1,
+    note: str = "",
+) -> OpenRun:
+    """Go on with the newest unfinished run of the same identity, or begin one.
+
+    Raises:
+        StoreError: the journal cannot be written, or there is no room for all maps.
+    """
+    notes = [f"unfinished run {words}: it waits for its own goal" for words in runs.others(identity)]
+    chosen: Found | None = None
+    for found in runs.find(identity, plan.remarks):
+        reason = "a newer one goes on" if chosen else _why_not(found, plan, options)
+        if not reason:
+            chosen = found
+            continue
+        runs.set_aside(found.folder)
+        notes.append(f"unfinished run {found.id} ({found.kept.maps} maps) is set aside: {reason}")
+    notes += [f"{name} deleted: too many unfinished runs" for name in runs.prune()]
+    missing = ROOM_PER_MAP * len(plan.steps) * maps_per_state
+    if chosen is None:
+        about = {"software_version": software_version(), "created_ns": time.time_ns(), "note": note}
+        journal = runs.begin(identity, about)
+        try:
+            journal.check_room(missing)
+        except StoreError:
+            journal.remove()
+            raise
+        return OpenRun(journal, Outcome(remarks=list(plan.remarks)), notes=tuple(notes))
+    kept = chosen.kept
+    if kept.torn:
+        notes.append(f"unfinished run {chosen.id}: the last {kept.torn} bytes are not whole and do not count")
+    words = f"resumed run {chosen.id} with {len(kept.outcome.records)} maps"
+    journal = RunJournal.reopen(chosen.folder)
+    journal.check_room(missing)
+    return OpenRun(journal, kept.outcome, kept.storing, words, tuple(notes))
+
+
+def _why_not(found: Found, plan: Plan, options: ResumeOptions) -> str:
+    """Why an unfinished run is not to go on, in words; "" = it is."""
+    age = 1e-9 * (time.time_ns() - found.kept.last_ns)
+    if options.fresh:
+        return "a fresh run was asked for"
+    if not options.age_max:
+        return "resume_max_age = 0"
+    if age > options.age_max:
+        return f"it is {age:.0f} s old, resume_max_age is {options.age_max:.0f} s"
+    latest = max((record.stamp_ns for record in found.kept.outcome.records), default=0)
+    if plan.kind is PlanKind.HYSTERESIS and options.now_ns and options.now_ns < latest:
+        return f"the clock is {1e-9 * (latest - options.now_ns):.0f} s before its last map: creep needs times that rise"
+    return ""
+
+
+def _hash(*arrays: NDArray[Any]) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

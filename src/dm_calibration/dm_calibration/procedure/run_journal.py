@@ -1,0 +1,200 @@
+"""The journal of one run: each event is on the disk before it counts, so that a power cut loses nothing.
+
+A folder ``<id>/`` holds ``manifest.json`` (plan, settings, mirror, software; written once, whole or not at all) and
+``events`` (appended and synced frame by frame). A frame that a power cut tore is cut off when the run goes on. Only
+coefficients and samples are kept, some kilobytes a map; the full maps stay in the interferometer's folder, and the
+journal has their names and hashes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dm_calibration.procedure.event_frames import FIRST, Storing, decode, encode
+from dm_calibration.procedure.outcome import Event, MapTaken, Outcome, Segment
+from dm_calibration.store.atomic_write import write_whole
+from dm_calibration.store.calibration_store import StoreError
+
+SCHEMA = "dm_calibration/unfinished"
+SCHEMA_VERSION = 1
+MANIFEST, EVENTS = "manifest.json", "events"
+
+
+class JournalError(ValueError):
+    """A journal cannot be read; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a journal holds.
+
+    Attributes:
+        outcome: the run so far.
+        maps: measured, those in doubt included.
+        last_ns: wall time of the last write, ns since the epoch.
+        storing: the calibration that was about to be stored; None = the run had not come so far.
+        torn: bytes after the last whole frame.
+    """
+
+    outcome: Outcome
+    maps: int
+    last_ns: int
+    storing: Storing | None
+    torn: int
+
+
+class RunJournal:
+    """The journal of a run that is going on. Use :meth:`create` or :meth:`reopen`."""
+
+    def __init__(self, folder: Path, handle: int, end: int, seal: bytes) -> None:
+        self.folder = folder
+        self._handle, self._end, self._seal = handle, end, seal
+
+    @classmethod
+    def create(cls, folder: Path, manifest: Mapping[str, Any]) -> RunJournal:
+        """A new, empty journal.
+
+        Raises:
+            StoreError: disk full, read-only, ...
+        """
+        content = json.dumps({"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **manifest}, indent=1)
+        try:
+            write_whole(folder / EVENTS, b"")
+            write_whole(folder / MANIFEST, content.encode())
+            return cls(folder, os.open(folder / EVENTS, os.O_WRONLY | os.O_NOFOLLOW), 0, FIRST)
+        except OSError as error:
+            with suppress(OSError):
+                shutil.rmtree(folder)
+            raise StoreError(f"no run can be kept in {folder.parent}: {error.strerror or error}") from error
+
+    @classmethod
+    def reopen(cls, folder: Path) -> RunJournal:
+        """The journal in `folder`, to go on after its last whole frame.
+
+        Raises:
+            StoreError: it cannot be opened or written.
+            JournalError: it cannot be read.
+        """
+        frames = _frames(folder)
+        end, seal = frames[-1][1:] if frames else (0, FIRST)
+        try:
+            handle = os.open(folder / EVENTS, os.O_WRONLY | os.O_NOFOLLOW)
+            os.ftruncate(handle, end)
+        except OSError as error:
+            raise StoreError(f"the run in {folder} cannot go on: {error.strerror or error}") from error
+        return cls(folder, handle, end, seal)
+
+    def check_room(self, size: int) -> None:
+        """Try to write `size` bytes, before anything moves; the journal stays as it is.
+
+        Raises:
+            StoreError: disk full, read-only, ...
+        """
+        try:
+            try:
+                position = self._end
+                while position < self._end + size:
+                    position += os.pwrite(self._handle, b"\0" * min(size, 1 << 20), position)
+                os.fdatasync(self._handle)
+            finally:
+                os.ftruncate(self._handle, self._end)
+        except OSError as error:
+            raise StoreError(
+                f"no room for the maps of a run, {size / 1e6:.1f} MB, in {self.folder.parent}: "
+                f"{error.strerror or error}"
+            ) from error
+
+    def keep(self, event: Event | Storing) -> None:
+        """Append `event`; it is on the disk when this returns.
+
+        Raises:
+            StoreError: disk full, read-only, ...; the journal is as it was.
+        """
+        frame, seal = encode(event, self._seal)
+        try:
+            view, position = memoryview(frame), self._end
+            while view:
+                written = os.pwrite(self._handle, view, position)
+                view, position = view[written:], position + written
+            os.fdatasync(self._handle)
+        except OSError as error:
+            with suppress(OSError):
+                os.ftruncate(self._handle, self._end)
+            what = f"map {event.record.label}" if isinstance(event, MapTaken) else type(event).__name__.lower()
+            raise StoreError(
+                f"{what} could not be kept in {self.folder}: {error.strerror or error}; the run up to it is kept"
+            ) from error
+        self._end, self._seal = self._end + len(frame), seal
+
+    def close(self) -> None:
+        """Let go of the file; the run stays unfinished."""
+        handle, self._handle = self._handle, -1
+        if handle >= 0:
+            os.close(handle)
+
+    def remove(self) -> None:
+        """The run is finished: close and delete its journal. What cannot be deleted stays."""
+        self.close()
+        # The manifest goes first: without it the rest is no run any more.
+        with suppress(OSError):
+            (self.folder / MANIFEST).unlink()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of the journal in `folder`.
+
+    Raises:
+        JournalError: damaged, foreign, or of another schema.
+    """
+    try:
+        content = json.loads((folder / MANIFEST).read_text())
+    except (OSError, ValueError) as error:
+        raise JournalError(f"{folder.name}: {MANIFEST} cannot be read: {error}") from error
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        raise JournalError(f"{folder.name}: not a run of this suite")
+    if content.get("schema_version") != SCHEMA_VERSION:
+        raise JournalError(
+            f"{folder.name}: schema version {content.get('schema_version')}: this software reads {SCHEMA_VERSION}"
+        )
+    return content
+
+
+def read_run(folder: Path, remarks: tuple[str, ...] = ()) -> Kept:
+    """What the journal in `folder` holds.
+
+    Args:
+        remarks: of the plan; the outcome begins with them.
+
+    Raises:
+        JournalError: it cannot be read.
+    """
+    outcome = Outcome(remarks=list(remarks))
+    storing: Storing | None = None
+    maps = 0
+    frames = _frames(folder)
+    end = frames[-1][1] if frames else 0
+    for event, _end, _seal in frames:
+        if isinstance(event, Storing):
+            storing = event
+            continue
+        if isinstance(event, Segment):
+            storing = None
+        maps += isinstance(event, MapTaken)
+        outcome.take(event)
+    status = (folder / EVENTS).stat()
+    return Kept(outcome, maps, status.st_mtime_ns, storing, status.st_size - end)
+
+
+def _frames(folder: Path) -> list[tuple[Event | Storing, int, bytes]]:
+    try:
+        return list(decode((folder / EVENTS).read_bytes()))
+    except (OSError, ValueError) as error:
+        raise JournalError(f"{folder.name}: {EVENTS} cannot be read: {error}") from error

@@ -1,0 +1,156 @@
+"""The folder of runs that were cut off: which of them a new goal goes on with, and what becomes of the others.
+
+A run goes on when plan, settings and mirror are the same and it is not too old. A run that is not to go on is set
+aside, never deleted at once: its maps may still be wanted. One node at a time works in the folder.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dm_msgs.msg import ErrorCode
+
+from dm_calibration.calibration_errors import Refused
+from dm_calibration.procedure.run_journal import JournalError, Kept, RunJournal, read_manifest, read_run
+from dm_calibration.store.calibration_store import StoreError
+
+#: Name of the folder among the calibrations.
+FOLDER = "unfinished"
+#: Ending of runs that were set aside.
+ASIDE = ".set-aside"
+#: So many of those are kept, the newest.
+ASIDE_MAX = 5
+#: Runs with other settings that wait for their goal are kept up to this number, the newest.
+WAITING_MAX = 20
+
+_LOCK = ".lock"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A run to go on with."""
+
+    folder: Path
+    kept: Kept
+
+    @property
+    def id(self) -> str:
+        return self.folder.name
+
+
+class UnfinishedRuns:
+    """Runs in ``<calibrations>/unfinished``. Use as a context manager while a run goes on: only one may."""
+
+    def __init__(self, calibrations: Path) -> None:
+        self.folder = calibrations / FOLDER
+        self._lock = -1
+
+    def __enter__(self) -> UnfinishedRuns:
+        """Take the folder.
+
+        Raises:
+            Refused: another node calibrates into it.
+            StoreError: it cannot be made.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        except OSError as error:
+            raise StoreError(f"no run can be kept in {self.folder}: {error.strerror or error}") from error
+        try:
+            # Ends with the process, also with kill -9.
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            words = f"another node is calibrating into {self.folder.parent}: wait for it or stop it"
+            raise Refused(ErrorCode.BUSY, words) from None
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        os.close(self._lock)
+
+    def begin(self, identity: Mapping[str, Any], about: Mapping[str, Any]) -> RunJournal:
+        """The journal of a new run.
+
+        Args:
+            identity: what a goal must share to go on with this run.
+            about: what is kept for people.
+
+        Raises:
+            StoreError: disk full, read-only, ...
+        """
+        stem = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        names = (f"{stem}-{number}" if number else stem for number in range(10_000))
+        # Neither may there be one set aside under the name: this run may have to be set aside too.
+        taken = {path.name.removesuffix(ASIDE) for path in self.folder.iterdir()}
+        name = next(name for name in names if name not in taken)
+        return RunJournal.create(self.folder / name, {"identity": identity, **about})
+
+    def find(self, identity: Mapping[str, Any], remarks: tuple[str, ...] = ()) -> list[Found]:
+        """Runs of the same plan, settings and mirror that hold at least a map, the newest first."""
+        found = []
+        for folder in self._runs():
+            try:
+                if read_manifest(folder).get("identity") != identity:
+                    continue
+                kept = read_run(folder, remarks)
+            except JournalError:
+                continue
+            if kept.maps:
+                found.append(Found(folder, kept))
+            else:
+                shutil.rmtree(folder, ignore_errors=True)
+        return sorted(found, key=lambda run: (run.kept.last_ns, run.id), reverse=True)
+
+    def others(self, identity: Mapping[str, Any]) -> list[str]:
+        """Each unfinished run that a goal with `identity` does not go on with, and why, in words."""
+        words = []
+        for folder in self._runs():
+            try:
+                theirs = read_manifest(folder)["identity"]
+            except (JournalError, KeyError) as error:
+                words.append(f"{folder.name}: {error}")
+                continue
+            if theirs != identity:
+                differing = sorted(name for name in {*theirs, *identity} if theirs.get(name) != identity.get(name))
+                words.append(f"{folder.name}: other {', '.join(differing)}")
+        return words
+
+    def set_aside(self, folder: Path) -> Path:
+        """Keep the run in `folder`, but do not go on with it.
+
+        Raises:
+            StoreError: read-only, ...
+        """
+        target = folder.with_name(folder.name + ASIDE)
+        try:
+            folder.rename(target)
+        except OSError as error:
+            raise StoreError(f"run {folder.name} cannot be set aside: {error.strerror or error}") from error
+        return target
+
+    def prune(self) -> list[str]:
+        """Delete the oldest of too many runs; returns their names."""
+        aside = sorted(self.folder.glob(f"*{ASIDE}"), reverse=True)
+        removed = aside[ASIDE_MAX:] + sorted(self._runs(), reverse=True)[WAITING_MAX:]
+        for folder in removed:
+            with suppress(OSError):
+                shutil.rmtree(folder)
+        return [folder.name for folder in removed]
+
+    def _runs(self) -> list[Path]:
+        if not self.folder.is_dir():
+            return []
+        return [
+            path
+            for path in self.folder.iterdir()
+            if path.is_dir() and not path.is_symlink() and not path.name.startswith(".") and path.suffix != ASIDE
+        ]

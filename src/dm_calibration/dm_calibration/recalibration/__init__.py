@@ -1,0 +1,1 @@
+"""recalibration of dm_calibration."""

@@ -1,0 +1,234 @@
+"""Gains and figure of a calibrated mirror, followed by recursive least squares over maps that arrive later.
+
+In the reduced values of a map (:class:`~dm_calibration.hysteresis.reduction.Reduction`) a calibration says ``v = v0 + V e``
+with the effective signals e. Later it is ``v = v0 + d + V diag(e) (1 + g)``: gains have changed by the shares g, the
+figure by d. Both walk at random, so what is known of them fades with time; each map is one step of the Kalman filter,
+which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section 11.3).
+
+A map that departs further from its prediction than chance allows is a bad map, or the mirror is another one: the caller
+must not take it in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import norm
+
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
+from dm_calibration.hysteresis.reduction import Reduction
+from dm_calibration.influence.fit import PISTON_TILT, InfluenceFit
+from dm_calibration.influence.maps import MapSet
+from dm_common.optics.sag import fill_gaps, remove_piston_tilt, rms
+from dm_common.optics.zernike import TERM_RMS
+
+Floats = NDArray[np.float64]
+
+DAY_S = 86400.0
+#: Least variance of a value that is laid to its map's noise, as a share of what the calibration's maps scatter.
+NOISE_SHARE_MIN = 0.1
+#: The same in m^2, for maps without any noise.
+NOISE_MIN = 1e-24
+#: Gains of actuators that hardly show are not known worse than this.
+GAIN_SIGMA_MAX = 0.05
+
+
+@dataclass(frozen=True)
+class DriftRates:
+    """How fast a mirror is expected to change; standard deviations after one day, growing with the root of time.
+
+    Attributes:
+        gain: relative, of each gain; half of the variance is common to all (temperature).
+        figure: m rms.
+    """
+
+    gain: float = 3e-4
+    figure: float = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """What later maps have told of a mirror. Never changed in place.
+
+    Attributes:
+        gain: (N,) relative changes.
+        offset: (R,) m rms, change of the figure in reduced values.
+        covariance: (N + R, N + R) of both.
+        stamp_ns: time it holds for.
+    """
+
+    gain: Floats
+    offset: Floats
+    covariance: Floats
+    stamp_ns: int
+
+    @property
+    def largest_gain(self) -> tuple[float, int]:
+        """The largest relative change of a gain, and the index of its actuator."""
+        index = int(np.abs(self.gain).argmax())
+        return float(self.gain[index]), index
+
+    @property
+    def offset_rms(self) -> float:
+        """Change of the figure, m rms."""
+        return float(np.linalg.norm(self.offset))
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A map against its prediction.
+
+    Attributes:
+        max_zernike: m, largest difference of a coefficient beyond tilt.
+        rms: m rms of the difference in sag, piston and tilt removed.
+        surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
+            all values, and the largest single one over the largest to be expected of so many.
+        updated: the drift with this map taken in.
+    """
+
+    max_zernike: float
+    rms: float
+    surprise: float
+    updated: Drift
+
+
+class DriftFilter:
+    """Follows one mirror's :class:`Drift`.
+
+    Args:
+        fit: the influence function, of effective signals when `memory` is known.
+        maps: what it was fitted to: shows how far a map scatters about its prediction.
+        memory: None = not identified.
+        signal_sigma: standard deviation of an effective signal where no memory is identified, normalised.
+        rates: see there.
+
+    Raises:
+        ValueError: the maps of a memory have time stamps that run backwards.
+    """
+
+    def __init__(
+        self, fit: InfluenceFit, maps: MapSet, hysteresis: HysteresisFit | None, signal_sigma: float, rates: DriftRates
+    ) -> None:
+        self._fit = fit
+        self.reduction = Reduction(fit.points, fit.influence_sag, maps.terms)
+        self._gain = self.reduction.reduce(fit.influence_zernike.T, fit.influence_sag.T).T
+        self._offset = self.reduction.reduce(fit.zernike_offset, fit.sag_offset)
+        scatter = self._scatter(maps if hysteresis is None else effective_maps(maps, hysteresis.law))
+        if hysteresis is not None:
+            signal_sigma = self._law_sigma(hysteresis)
+        self._law = signal_sigma**2 * (self._gain @ self._gain.T)
+        self._noise = np.maximum(scatter - np.diag(self._law), NOISE_SHARE_MIN * scatter) + NOISE_MIN
+        self._growth = self._covariance(rates)
+
+    def start(self, stamp_ns: int) -> Drift:
+        """What the calibration itself knows, at its time."""
+        fit, values = self._fit, self.reduction.size
+        shows = fit.response > 0.0
+        share = np.divide(fit.standard_error, fit.response, out=np.full(fit.actuators, GAIN_SIGMA_MAX), where=shows)
+        gain = np.square(np.minimum(share, GAIN_SIGMA_MAX))
+        offset = (self._noise + np.diag(self._law)) / max(int(fit.used.sum()), 1) + fit.drift_rms**2 / values
+        return Drift(np.zeros(fit.actuators), np.zeros(values), np.diag(np.concatenate((gain, offset))), stamp_ns)
+
+    def compare(
+        self, drift: Drift, coefficients: Floats, sag: Floats, effective: Floats, stamp_ns: int, repeat: int = 0
+    ) -> Comparison:
+        """Compare a map with what `drift` makes of `effective`; nothing is changed.
+
+        Args:
+            coefficients: (K,) m.
+            sag: (P,) m, NaN = no data.
+            effective: (N,) effective signals at the time of the map.
+            stamp_ns: of the map; a time before the drift's is taken as the drift's.
+            repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
+                does not average out, so repeats count for less and less.
+        """
+        actuators = len(effective)
+        elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns)) / DAY_S
+        prior = drift.covariance + elapsed * self._growth
+        design = np.hstack((self._gain * effective, np.eye(self.reduction.size)))
+        changed = changed_fit(self._fit, self.reduction, drift)
+        predicted_sag = changed.sag_offset + changed.influence_sag @ effective
+        predicted = changed.zernike_offset + changed.influence_zernike @ effective
+        filled = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0]
+        innovation = self.reduction.reduce(coefficients - predicted, filled - predicted_sag)
+
+        shared = prior @ design.T
+        # What the calibration itself does not know of its influence function, beyond gains.
+        leverage = effective @ self._fit.signal_covariance @ effective
+        expected = design @ shared + (1.0 + leverage) * np.diag(self._noise) + (1.0 + repeat) ** 2 * self._law
+        factor = cho_factor(expected)
+        correction = shared @ cho_solve(factor, innovation)
+        # Joseph form: symmetric and positive whatever the rounding.
+        kalman = cho_solve(factor, shared.T).T
+        left = np.eye(len(prior)) - kalman @ design
+        noise = expected - design @ shared
+        covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
+        departure, weight = (
+            remove_piston_tilt((filled - predicted_sag)[None], self._fit.points)[0],
+            self._fit.points.weight,
+        )
+        updated = Drift(
+            drift.gain + correction[:actuators],
+            drift.offset + correction[actuators:],
+            0.5 * (covariance + covariance.T),
+            max(stamp_ns, drift.stamp_ns),
+        )
+        return Comparison(
+            max_zernike=float(np.abs(coefficients - predicted)[PISTON_TILT:].max()),
+            rms=float(rms(departure, weight)),
+            surprise=_surprise(innovation, expected, factor),
+            updated=updated,
+        )
+
+    def changed(self, drift: Drift) -> InfluenceFit:
+        """The influence function as it is now."""
+        return changed_fit(self._fit, self.reduction, drift)
+
+    def _scatter(self, maps: MapSet) -> Floats:
+        """(R,) variance of the calibration's maps about the fit, m^2."""
+        used = maps.select(self._fit.used)
+        model = self._fit.sag_offset + used.applied @ self._fit.influence_sag.T
+        values = self.reduction.reduce(used.coefficients, fill_gaps(used.sag, model, used.points))
+        residual = values - self._offset - used.applied @ self._gain.T
+        freedom = max(len(used) - self._fit.actuators - 1, 1)
+        return np.asarray(np.square(residual).sum(axis=0) / freedom)
+
+    def _law_sigma(self, hysteresis: HysteresisFit) -> float:
+        """Standard deviation of an effective signal that explains the held-out error of the coefficients."""
+        count = self.reduction.coefficients
+        reach = np.square(self._gain[:count]).sum()
+        error = np.square(hysteresis.zernike_sigma[PISTON_TILT:] * TERM_RMS[PISTON_TILT : PISTON_TILT + count]).sum()
+        return float(np.sqrt(error / reach))
+
+    def _covariance(self, rates: DriftRates) -> Floats:
+        """(N + R, N + R) that one day adds."""
+        actuators, values = self._fit.actuators, self.reduction.size
+        growth = np.zeros((actuators + values, actuators + values))
+        growth[:actuators, :actuators] = 0.5 * rates.gain**2 * (np.eye(actuators) + 1.0)
+        growth[actuators:, actuators:] = rates.figure**2 / values * np.eye(values)
+        return growth
+
+
+def changed_fit(fit: InfluenceFit, reduction: Reduction, drift: Drift) -> InfluenceFit:
+    """`fit` with gains and figure as `drift` has found them."""
+    coefficients, sag = reduction.expand(drift.offset)
+    return replace(
+        fit,
+        influence_zernike=fit.influence_zernike * (1.0 + drift.gain),
+        influence_sag=fit.influence_sag * (1.0 + drift.gain),
+        zernike_offset=fit.zernike_offset + coefficients,
+        sag_offset=fit.sag_offset + sag,
+    )
+
+
+def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool]) -> float:
+    """`innovation` (R,) over its `expected` covariance (R, R)."""
+    size = len(innovation)
+    together = np.sqrt(innovation @ cho_solve(factor, innovation) / size)
+    # Median of the largest of so many normal numbers.
+    largest = norm.isf(0.5 * (1.0 - 0.5 ** (1.0 / size)))
+    single = np.abs(innovation / np.sqrt(np.diag(expected))).max() / largest
+    return float(max(together, single))

@@ -1,0 +1,285 @@
+"""Maps that arrive between calibrations: over the interferometer's topics, or measured for `update_calibration`."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorState, ErrorCode, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.msg import Calibration as CalibrationMsg
+from dm_msgs.srv import Measure, UpdateCalibration
+from rclpy.node import Node
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
+from dm_calibration.calibration_manager import CalibrationManager
+from dm_calibration.calibration_messages import put_updates, report_from
+from dm_calibration.calibration_parameters import update_options
+from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
+from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
+from dm_calibration.store.calibration_store import StoreError
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.measurement import Measurement
+from dm_common.messages import measurement_from, stamp_ns
+from dm_common.ros import diagnostics, qos
+from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.worker import WorkerService
+
+#: Wall time for the driver to report after a map, s (it does so every 0.5 s).
+REPORT_WAIT_S = 3.0
+#: Least wall time between two messages on `calibration` that updates cause, s.
+PUBLISH_PERIOD_S = 1.0
+#: Halves of maps that wait for the other half, and stamps of maps remembered so that none counts twice.
+HALVES_KEPT = 8
+STAMPS_KEPT = 64
+
+
+class MapListener:
+    """Gives maps that arrive to :class:`RecalibrationManager` and publishes what they change.
+
+    Args:
+        bench: measures for the service.
+        busy: whether a calibration is running; its maps are not taken.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        values: Mapping[str, Any],
+        desk: CalibrationManager,
+        bench: BenchServices,
+        busy: Callable[[], bool],
+    ) -> None:
+        self._node, self._values, self._desk, self._bench, self._busy = node, values, desk, bench, busy
+        self._updates = RecalibrationManager(desk.store.folder, lambda: update_options(values))
+        self._history = AppliedHistory()
+        self._law: HysteresisModel | None = None
+        self._turn = threading.Lock()  # one map at a time; held over measuring and judging
+        self._halves: dict[int, dict[str, Any]] = {}
+        self._judged: deque[int] = deque(maxlen=STAMPS_KEPT)
+        self._taken = self._refused = 0
+        self._last_refusal = ""
+        self._dirty = self._was_stale = False
+        self._published_at = float("-inf")
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="updates")
+        node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
+        node.create_subscription(ZernikeCoefficients, "zernike", lambda m: self._on_half("zernike", m), qos.STATE)
+        node.create_subscription(SurfaceSamples, "surface_samples", lambda m: self._on_half("samples", m), qos.STATE)
+        self._service = WorkerService(node, UpdateCalibration, "update_calibration", self._on_update)
+
+    def stop(self) -> None:
+        """Take no more maps."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    # --- the calibration in use ---
+
+    def begin(self, calibration: Calibration | None) -> None:
+        """Keep `calibration` true from now on."""
+        if calibration is self._updates.calibration:
+            return
+        try:
+            remark = self._updates.begin(calibration)
+        except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, as it was made
+            remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
+        if remark:
+            self._node.get_logger().warning(remark)
+        mirror = self._desk.mirror
+        middle = float(mirror.rest[0]) if mirror is not None else 0.0
+        hysteresis = calibration.hysteresis if calibration is not None else None
+        law = hysteresis.law if hysteresis is not None else None
+        if law is not self._law:  # recipes may have been added to the same calibration
+            self._law = law
+            self._history.follow(law, middle)
+
+    def amend(self, message: CalibrationMsg) -> None:
+        """Put what maps have told since into the message of the calibration in use."""
+        updates, fit = self._updates.updates, self._updates.changed_fit()
+        if updates is not None and fit is not None:
+            self._published_at, self._dirty = time.monotonic(), False
+            put_updates(message, updates, fit, self._doubts(), self._updates.mirror_changed)
+
+    def _doubts(self) -> list[str]:
+        """Sentences on why the calibration may not hold any more."""
+        doubts = []
+        updates = self._updates.updates
+        if updates is not None and self._updates.mirror_changed:
+            doubts.append(
+                f"The last {updates.surprising} maps disagree with this calibration: the mirror has changed, "
+                "calibrate again."
+            )
+        if self._stale:
+            doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
+        return doubts
+
+    @property
+    def _age_s(self) -> float:
+        """Since a map last agreed with the calibration, or since it was made, s."""
+        calibration, updates = self._updates.calibration, self._updates.updates
+        if calibration is None or updates is None:
+            return 0.0
+        now = int(self._node.get_clock().now().nanoseconds)
+        return max(0.0, 1e-9 * (now - max(calibration.stamp_ns, updates.checked_ns)))
+
+    @property
+    def _stale(self) -> bool:
+        return self._age_s > self._values["updates.stale_after"]
+
+    def tick(self) -> None:
+        """Publish what is due; called about once a second by the node."""
+        stale = self._stale
+        due = time.monotonic() - self._published_at >= PUBLISH_PERIOD_S
+        if (self._dirty or stale != self._was_stale) and due:
+            self._was_stale = stale
+            self._desk.publish_again()
+
+    def _changed(self) -> None:
+        """Publish now, or with the next tick when the last message is less than a second old."""
+        self._dirty = True
+        if time.monotonic() - self._published_at >= PUBLISH_PERIOD_S:
+            self._desk.publish_again()
+
+    # --- maps ---
+
+    def _on_state(self, message: ActuatorState) -> None:
+        if not len(message.applied):
+            return
+        try:
+            self._history.observe(report_from(message), 1e-9 * self._node.get_clock().now().nanoseconds)
+        except ValueError as error:
+            self._node.get_logger().error(f"actuator_state refused: {error}", throttle_duration_sec=10.0)
+
+    def _on_half(self, name: str, message: Any) -> None:
+        """Coefficients and samples of one map carry the same stamp."""
+        if not self._values["updates.enable"] or self._busy() or self._updates.calibration is None:
+            return
+        stamp = stamp_ns(message.header.stamp)
+        halves = self._halves.setdefault(stamp, {})
+        halves[name] = message
+        if len(halves) == 2:
+            del self._halves[stamp]
+            self._worker.submit(self._on_map, Measure.Response(**halves))
+        while len(self._halves) > HALVES_KEPT:
+            del self._halves[next(iter(self._halves))]
+
+    def _on_map(self, halves: Measure.Response) -> None:
+        """A map that came over the topics; runs in the worker thread."""
+        log = self._node.get_logger()
+        try:
+            with self._turn:
+                measured = measurement_from(halves)
+                if measured.stamp_ns not in self._judged:
+                    self._judge(measured, dry_run=False)
+        except (ValueError, StoreError, Refused) as error:
+            self._refuse(str(error))
+            log.info(f"map not taken: {error}", throttle_duration_sec=10.0)
+        except Exception as error:  # whatever one map does, the next one must be taken
+            self._refuse(f"{type(error).__name__}: {error}")
+            log.error(f"map not taken: {type(error).__name__}: {error}")
+
+    def _judge(self, measured: Measurement, dry_run: bool) -> Verdict:
+        """Compare a map with the calibration and take it in; `_turn` must be held.
+
+        Raises:
+            Refused: a calibration is running, or the driver is silent.
+            MapNotUsableError, StoreError: see :class:`RecalibrationManager`.
+        """
+        self._judged.append(measured.stamp_ns)
+        still = self._values["updates.still_time"]
+        at = 1e-9 * measured.stamp_ns
+        deadline = time.monotonic() + REPORT_WAIT_S
+        while not self._history.heard_since(at + still):
+            if time.monotonic() > deadline:
+                raise Refused(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
+            time.sleep(0.01)
+        if self._busy():
+            raise Refused(ErrorCode.BUSY, "a calibration is running")
+        verdict = self._updates.take(measured, self._history.standing(at, still), dry_run)
+        if dry_run:
+            return verdict
+        if verdict.accepted:
+            self._taken += 1
+        else:
+            self._refuse(verdict.reason)
+            self._node.get_logger().warning(f"map not taken: {verdict.reason}")
+        self._changed()
+        return verdict
+
+    def _refuse(self, reason: str) -> None:
+        self._refused, self._last_refusal = self._refused + 1, reason
+
+    # --- the service ---
+
+    def _on_update(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> Any:
+        try:
+            if request.forget:
+                self._forget(request, response)
+            else:
+                self._check(request, response)
+        except EXPECTED as error:
+            response.error_code, response.message = error_code(error), str(error)
+            self._node.get_logger().warning(f"update_calibration: {error}")
+        updates = self._updates.updates
+        if updates is not None:
+            response.revision = updates.revision
+            response.gain_drift, response.offset_drift = abs(updates.drift.largest_gain[0]), updates.drift.offset_rms
+        return response
+
+    def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
+        if request.dry_run:
+            raise Refused(ErrorCode.INVALID_ARGUMENT, "forget and dry_run: only one of them may be set")
+        self._check_calibrated()
+        with self._turn:
+            self._updates.forget()
+        self._changed()
+        response.message = "all updates are forgotten"
+
+    def _check(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
+        self._check_calibrated()
+        with self._turn:
+            if self._busy():
+                raise Refused(ErrorCode.BUSY, "a calibration is running")
+            measured = self._bench.measure_as_it_stands("calibration check")
+            try:
+                verdict = self._judge(measured, request.dry_run)
+            except MapNotUsableError as error:
+                if not request.dry_run:
+                    self._refuse(str(error))
+                raise
+        response.accepted, response.message = verdict.accepted, verdict.reason
+        comparison = verdict.comparison
+        response.max_zernike, response.rms = comparison.max_zernike, comparison.rms
+        response.surprise = comparison.surprise
+
+    def _check_calibrated(self) -> None:
+        if self._updates.calibration is None:
+            raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
+
+    # --- health ---
+
+    def health(self) -> tuple[bytes, list[str], dict[str, object]]:
+        """Level, warnings and figures for the node's diagnostics."""
+        updates = self._updates.updates
+        if updates is None:
+            return diagnostics.OK, [], {}
+        warnings = [doubt.rstrip(".") for doubt in self._doubts()]
+        gain, actuator = updates.drift.largest_gain
+        if abs(gain) > self._values["updates.gain_drift_max"]:
+            warnings.append(f"the gain of actuator {actuator + 1} has drifted by {gain:+.2%}")
+        if updates.drift.offset_rms > self._values["updates.offset_drift_max"]:
+            warnings.append(f"the figure has drifted by {updates.drift.offset_rms * 1e9:.1f} nm rms")
+        figures: dict[str, object] = {
+            "gain_drift_percent": round(100.0 * gain, 4),
+            "gain_drift_actuator": actuator + 1,
+            "offset_drift_nm": round(updates.drift.offset_rms * 1e9, 3),
+            "revision": updates.revision,
+            "hours_since_check": round(self._age_s / 3600.0, 3),
+            "maps_taken": self._taken,
+            "maps_refused": self._refused,
+            "last_refusal": self._last_refusal,
+        }
+        return diagnostics.WARN if warnings else diagnostics.OK, warnings, figures

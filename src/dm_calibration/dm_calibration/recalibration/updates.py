@@ -1,0 +1,253 @@
+"""The calibration in use, kept true by maps that arrive later: which are taken, what they change, what is stored.
+
+The calibration's own file is never touched. What later maps have told stands beside it, in ``<id>.updates.hdf5``.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.maps import same_points
+from dm_calibration.procedure.applied_history import MapNotUsableError, Standing
+from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter, DriftRates
+from dm_calibration.store.calibration_store import StoreError
+from dm_calibration.store.update_storage import Updates, UpdatesFileError, basis_hash, read_updates, write_updates
+from dm_common.measurement import Measurement
+
+Floats = NDArray[np.float64]
+
+#: Maps of one unmoved mirror within this time share the error of the memory law, s.
+REPEAT_S = 3600.0
+#: Share by which wavelengths may differ.
+WAVELENGTH_TOLERANCE = 1e-4
+SUFFIX = ".updates.hdf5"
+
+
+@dataclass(frozen=True)
+class UpdateOptions:
+    """What is taken, and how far it may change the calibration.
+
+    Attributes:
+        surprise_max: difference of a map from its prediction, over what is to be expected, beyond which it is bad.
+        surprises_max: bad maps in a row after which the mirror counts as changed.
+        valid_fraction_min: least share of valid pixels.
+        aperture_tolerance: largest relative deviation of a map's aperture radius from the calibration's.
+        signal_sigma: standard deviation of an effective signal where no memory is identified, normalised.
+        rates: how fast the mirror is expected to change.
+    """
+
+    surprise_max: float = 3.0
+    surprises_max: int = 3
+    valid_fraction_min: float = 0.5
+    aperture_tolerance: float = 0.02
+    signal_sigma: float = 0.05
+    rates: DriftRates = field(default_factory=DriftRates)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a map.
+
+    Attributes:
+        accepted: it agreed well enough to be taken in.
+        reason: why not, or what it showed, in words.
+    """
+
+    accepted: bool
+    reason: str
+    comparison: Comparison
+
+
+class RecalibrationManager:
+    """Updates of the calibration in use; every method may be called from any thread.
+
+    Args:
+        folder: of the calibration files.
+        options: asked for at every map; its rates and signal_sigma at every new calibration.
+    """
+
+    def __init__(self, folder: Path, options: Callable[[], UpdateOptions]) -> None:
+        self._folder, self._options = folder, options
+        self._lock = threading.RLock()
+        self._calibration: Calibration | None = None
+        self._filter: DriftFilter | None = None
+        self._updates: Updates | None = None
+        self._basis = ""
+        self._forget_repeats()
+
+    def _forget_repeats(self) -> None:
+        self._repeat, self._since, self._first_ns = 0, float("nan"), 0
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """The calibration in use, as it was made."""
+        with self._lock:
+            return self._calibration
+
+    @property
+    def updates(self) -> Updates | None:
+        """What maps have told since; None without a calibration."""
+        with self._lock:
+            return self._updates
+
+    @property
+    def mirror_changed(self) -> bool:
+        """Whether so many maps in a row disagreed that the calibration is in doubt."""
+        with self._lock:
+            return self._updates is not None and self._updates.surprising >= self._options().surprises_max
+
+    def begin(self, calibration: Calibration | None) -> str:
+        """Keep `calibration` true from now on, with what is stored of it. Returns a remark on damaged files, "" = none.
+
+        Raises:
+            ValueError: the calibration's maps make no sense.
+        """
+        with self._lock:
+            self._calibration, self._filter, self._updates = calibration, None, None
+            self._forget_repeats()
+            if calibration is None:
+                return ""
+            options = self._options()
+            self._basis = basis_hash(calibration)
+            self._filter = DriftFilter(
+                calibration.fit, calibration.maps, calibration.hysteresis, options.signal_sigma, options.rates
+            )
+            fresh = Updates(self._filter.start(calibration.stamp_ns))
+            self._updates = fresh
+            file = self._file(calibration.id)
+            try:
+                stored = read_updates(file, calibration.id, self._basis, fresh.drift)
+            except UpdatesFileError as error:
+                return f"updates of {calibration.id} are ignored: {error}"
+            self._updates = stored or fresh
+            return ""
+
+    def changed_fit(self) -> InfluenceFit | None:
+        """The influence function as maps have found it; None without a calibration."""
+        with self._lock:
+            if self._filter is None or self._updates is None:
+                return None
+            return self._filter.changed(self._updates.drift)
+
+    def take(self, measured: Measurement, standing: Standing, dry_run: bool = False) -> Verdict:
+        """Compare a map of the mirror at `standing` with the calibration, and take it in when it agrees.
+
+        Args:
+            dry_run: compare only.
+
+        Raises:
+            MapNotUsableError: there is no calibration, or the map cannot be compared with it.
+            StoreError: the update could not be stored; nothing has changed.
+        """
+        with self._lock:
+            calibration, updates, drift_filter = self._calibration, self._updates, self._filter
+            if calibration is None or updates is None or drift_filter is None:
+                raise MapNotUsableError("no calibration is in use")
+            options = self._options()
+            check_map(measured, calibration, options)
+            if standing.effective.shape != (calibration.fit.actuators,):
+                raise MapNotUsableError(
+                    f"{standing.effective.size} signals stand at the mirror, the calibration has "
+                    f"{calibration.fit.actuators}"
+                )
+            repeat = self._repeats(measured.stamp_ns, standing)
+            comparison = drift_filter.compare(
+                updates.drift, measured.coefficients, measured.sag, standing.effective, measured.stamp_ns, repeat
+            )
+            accepted = comparison.surprise <= options.surprise_max
+            reason = f"differs by {comparison.surprise:.1f} times what is to be expected" + (
+                "" if accepted else f", more than {options.surprise_max:g}: bad map, or the mirror has changed"
+            )
+            if dry_run:
+                return Verdict(accepted, reason, comparison)
+            if accepted:
+                changed = Updates(comparison.updated, updates.revision + 1, measured.stamp_ns, 0)
+            else:
+                changed = replace(updates, surprising=updates.surprising + 1)
+            self._store(calibration.id, changed)
+            self._updates = changed
+            if accepted:
+                if not repeat:
+                    self._since, self._first_ns = standing.since, measured.stamp_ns
+                self._repeat = repeat + 1
+            elif self.mirror_changed:
+                reason = f"{reason}; {changed.surprising} maps in a row did: the mirror has changed: calibrate again"
+            return Verdict(accepted, reason, comparison)
+
+    def forget(self) -> None:
+        """Drop all updates of the calibration in use.
+
+        Raises:
+            MapNotUsableError: no calibration is in use.
+            StoreError: the file could not be removed; nothing has changed.
+        """
+        with self._lock:
+            if self._calibration is None or self._filter is None:
+                raise MapNotUsableError("no calibration is in use")
+            try:
+                self._file(self._calibration.id).unlink(missing_ok=True)
+            except OSError as error:
+                raise StoreError(f"updates of {self._calibration.id} were not removed: {error.strerror}") from error
+            self._updates = Updates(self._filter.start(self._calibration.stamp_ns))
+            self._forget_repeats()
+
+    def _repeats(self, stamp_ns: int, standing: Standing) -> int:
+        same = standing.since == self._since and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
+        return self._repeat if same else 0
+
+    def _store(self, identifier: str, updates: Updates) -> None:
+        try:
+            write_updates(self._file(identifier), identifier, self._basis, updates)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise StoreError(f"the update of {identifier} was not stored in {self._folder}: {reason}") from error
+
+    def _file(self, identifier: str) -> Path:
+        return self._folder / f"{identifier}{SUFFIX}"
+
+
+def check_map(measured: Measurement, calibration: Calibration, options: UpdateOptions) -> None:
+    """Refuse a map that cannot be compared with `calibration`.
+
+    Raises:
+        MapNotUsableError: naming what differs, its value and what is allowed.
+    """
+    terms = calibration.maps.terms
+    if measured.coefficients.shape != (terms,):
+        raise MapNotUsableError(f"{measured.coefficients.size} Zernike terms, the calibration has {terms}")
+    if not np.isfinite(measured.coefficients).all():
+        raise MapNotUsableError("coefficients: hold values that are not finite")
+    if not same_points(measured.points, calibration.fit.points):
+        raise MapNotUsableError(
+            "sampled at other points than the calibration: set the interferometer's sample_count back"
+        )
+    if not abs(measured.wavelength - calibration.wavelength) <= WAVELENGTH_TOLERANCE * calibration.wavelength:
+        raise MapNotUsableError(
+            f"wavelength {measured.wavelength * 1e9:.3f} nm, the calibration's is "
+            f"{calibration.wavelength * 1e9:.3f} nm (0 = not told)"
+        )
+    radius, tolerance = calibration.aperture_radius, options.aperture_tolerance
+    if measured.radius and not abs(measured.radius - radius) <= tolerance * radius:
+        raise MapNotUsableError(
+            f"aperture radius {measured.radius * 1e3:.3f} mm, the calibration's is {radius * 1e3:.3f} mm "
+            f"+-{tolerance:.1%}"
+        )
+    if not measured.valid_fraction >= options.valid_fraction_min:
+        raise MapNotUsableError(
+            f"{measured.valid_fraction:.1%} of the pixels are valid: must be at least {options.valid_fraction_min:.1%}"
+        )
+    seen = float(np.isfinite(measured.sag) @ calibration.fit.points.weight)
+    if not seen >= options.valid_fraction_min:
+        raise MapNotUsableError(
+            f"{seen:.1%} of the sampled area has data: must be at least {options.valid_fraction_min:.1%}"
+        )
+    if measured.stamp_ns <= calibration.stamp_ns:
+        raise MapNotUsableError("measured before the calibration was finished, by its stamp")

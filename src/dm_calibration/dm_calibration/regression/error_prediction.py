@@ -1,0 +1,118 @@
+"""Services `fit_regression` and `predict_error` of the node `calibration`."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ErrorCode
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_errors import Refused, error_code
+from dm_calibration.calibration_manager import CalibrationManager
+from dm_calibration.calibration_parameters import fit_options
+from dm_calibration.influence.fit import fit_influence
+from dm_calibration.regression.predictor import ErrorPredictor, fit_predictor
+from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions
+from dm_common.messages import doubles
+
+
+class ErrorPrediction:
+    """The regression in use. Both services may be called from threads of their own.
+
+    A regression belongs to one calibration: for another one in use, the first request fits one with the defaults.
+    """
+
+    def __init__(self, desk: CalibrationManager, values: Mapping[str, Any]) -> None:
+        """`values` are the parameters of the node."""
+        self._desk, self._values = desk, values
+        self._lock = threading.Lock()
+        self._of = ""
+        self._predictor: ErrorPredictor | None = None
+
+    def fit(self, request: Any, response: Any) -> None:
+        """Serve `fit_regression`.
+
+        Raises:
+            Refused, ValueError, StoreError: see :mod:`~dm_calibration.calibration_errors`; nothing has changed then.
+        """
+        stored = self._desk.store.load(request.calibration) if request.calibration else self._in_use()
+        options = _selection(request.p_enter, request.p_remove)
+        with self._lock:
+            predictor = self._fitted(stored, request.method or stored.fit.method, options)
+            self._of, self._predictor = stored.id, predictor
+        regression = predictor.regression
+        row = regression.table2
+        response.adjusted_r2, response.f_statistic, response.p_value = row.adjusted_r2, row.f_statistic, row.p_value
+        response.samples = row.n
+        response.variables = list(regression.fit.variables)
+        response.parameters = doubles(regression.fit.parameters)
+        response.held_out_rms = row.leave_one_out_rms
+        response.message = (
+            f"{row.model} on {row.n} surfaces of {stored.id}: {row.k} variables, held-out error "
+            f"{row.leave_one_out_rms * 1e9:.1f} nm rms; R^2 and p are optimistic after selection"
+        )
+
+    def predict(self, request: Any, response: Any) -> None:
+        """Serve `predict_error`.
+
+        Raises:
+            Refused, ValueError: see :mod:`~dm_calibration.calibration_errors`.
+        """
+        calibration = self._in_use()
+        signals = self._checked(np.array(request.signals, dtype=np.float64), calibration)
+        with self._lock:
+            if self._predictor is None or self._of != calibration.id:
+                self._predictor = self._fitted(calibration, calibration.fit.method, None)
+                self._of = calibration.id
+            predictor = self._predictor
+        response.predicted_rms, response.lower, response.upper = predictor.predict(signals)
+        method = predictor.regression.table2.model
+        response.message = f"by {method} on calibration {calibration.id}, over many histories before this command"
+
+    def _in_use(self) -> Calibration:
+        calibration = self._desk.in_use
+        if calibration is None:
+            raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use: calibrate, or load one")
+        return calibration
+
+    def _fitted(self, stored: Calibration, method: str, options: SelectionOptions | None) -> ErrorPredictor:
+        influence = stored.fit
+        try:
+            if method != influence.method:
+                left_out = [label for label, used in zip(stored.maps.label, influence.used, strict=True) if not used]
+                influence = fit_influence(stored.maps, fit_options(self._values, method), exclude=left_out)
+            return fit_predictor(stored.maps, influence, options)
+        except ValueError as error:
+            raise Refused(error_code(error), f"calibration {stored.id}: {error}") from error
+
+    def _checked(self, signals: np.ndarray, calibration: Calibration) -> np.ndarray:
+        actuators = calibration.fit.actuators
+        if signals.size != actuators:
+            raise Refused(
+                ErrorCode.INVALID_LENGTH, f"signals: {signals.size} values, the calibrated mirror needs {actuators}"
+            )
+        if not np.isfinite(signals).all():
+            raise Refused(
+                ErrorCode.NOT_FINITE, f"signals: number {int(np.argmin(np.isfinite(signals))) + 1} is not finite"
+            )
+        mirror = self._desk.mirror
+        low, high = (mirror.signal_min, mirror.signal_max) if mirror else (-1.0, 1.0)
+        worst = int(np.argmax(np.maximum(low - signals, signals - high)))
+        if not low <= signals[worst] <= high:
+            raise Refused(
+                ErrorCode.OUT_OF_RANGE,
+                f"signals: number {worst + 1} is {signals[worst]:g}, must be within {low:g} to {high:g}",
+            )
+        return signals
+
+
+def _selection(p_enter: float, p_remove: float) -> SelectionOptions | None:
+    """Thresholds of a request, 0 = default; None when both are."""
+    if p_enter == 0.0 and p_remove == 0.0:
+        return None
+    # A p_remove that is refused must be named itself, not as the default that follows from it.
+    enter = p_enter or (min(P_ENTER, p_remove) if p_remove > 0.0 else P_ENTER)
+    return SelectionOptions(enter, p_remove or max(P_REMOVE, enter))

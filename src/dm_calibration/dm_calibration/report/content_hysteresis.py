@@ -1,0 +1,99 @@
+"""The report in words, part three: hysteresis, creep and recipes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.report import hysteresis_figures
+from dm_calibration.report.content import length, utc
+from dm_calibration.report.document import Picture, Section, Table
+
+NM = 1e9
+
+
+def hysteresis(calibration: Calibration) -> Section:
+    """Loops and creep of the identified law."""
+    title = "Hysteresis and creep"
+    hysteresis = calibration.hysteresis
+    if hysteresis is None:
+        return Section(
+            title,
+            [
+                "Not identified: the maps of this plan do not show the memory apart from the influence function. "
+                "A calibration with the plan “memory” does (./dm calibrate --plan memory)."
+            ],
+        )
+    law, wavelength = hysteresis.law, calibration.wavelength
+    hour, day = 100 * (hysteresis_figures.step_response(law, np.array([3600.0, 86400.0])) - 1.0)
+    rows = [
+        ("class of law", hysteresis.name),
+        ("maps it was identified from", str(hysteresis.maps)),
+        ("opening of the full loop", f"{hysteresis_figures.loop_opening(law):.1%} of the span"),
+        ("creep", f"{law.creep_rate:.2%} of a step per decade of time"),
+        ("growth of a step from 1 s to 1 h", f"{hour:.2f} %"),
+        ("growth of a step from 1 s to 1 day", f"{day:.2f} %"),
+        (
+            "largest coefficient error of a predicted move, held out, 95 %",
+            length(hysteresis.held_out_max_zernike, wavelength),
+        ),
+        ("standard deviation of an effective signal when the history is unknown", f"{hysteresis.unknown_sigma:.3f}"),
+    ]
+    pictures = [
+        Picture(
+            "loops",
+            "Loops of the identified law: all actuators share it, their gains are in the influence function.",
+            hysteresis_figures.loops_figure(law),
+        )
+    ]
+    if law.creep_rate > 0.0:
+        pictures.append(
+            Picture(
+                "creep",
+                "Creep of the identified law after a step on a rested mirror.",
+                hysteresis_figures.creep_figure(law),
+            )
+        )
+    return Section(
+        title,
+        [
+            "The effective signal is what sag and coefficients are linear in; it depends on the applied signal and on "
+            "the turning points before it. A degauss wipes the loops, not the creep.",
+            *hysteresis.remarks,
+        ],
+        [Table("The law", ("item", "value"), rows, words=True)],
+        pictures,
+    )
+
+
+def recipes(calibration: Calibration) -> Section:
+    """Recipes with their re-measured errors."""
+    book = calibration.recipes
+    title = "Recipes: errors re-measured after the command"
+    if not book.recipes:
+        return Section(
+            title,
+            ["None are stored with this calibration, so no error was re-measured. The action “converge” builds them."],
+        )
+    rows = [
+        (
+            f"{recipe.curvature:+.4f}",
+            f"{recipe.conic_constant:g}",
+            f"{recipe.max_zernike * NM:.2f}",
+            f"{recipe.rms * NM:.2f}",
+            str(recipe.maps),
+            f"{recipe.signals.min():+.3f} … {recipe.signals.max():+.3f}",
+        )
+        for recipe in book.recipes
+    ]
+    header = ("curvature, 1/m", "conic", "largest coefficient, nm", "rms sag, nm", "maps", "signals")
+    return Section(
+        title,
+        [
+            f"Each begins with a degauss of {book.degauss_steps} half-swings. The last was built {utc(book.stamp_ns)}. "
+            "A recipe interpolated from the others erred by "
+            f"{length(book.interpolation_error, calibration.wavelength)} at most."
+        ],
+        [Table("Recipes", header, rows)],
+        [Picture("recipes", "Re-measured errors of the recipes.", hysteresis_figures.recipes_figure(book))],
+    )

@@ -1,0 +1,163 @@
+"""The folder of calibration files: written whole or not at all, read with suspicion."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
+from dm_calibration.store.atomic_write import write_whole
+from dm_calibration.store.hdf5_image import ImageError, content_hash, read_image, write_image
+
+SUFFIX = ".h5"
+#: What was measured, and where: never changed after a calibration was stored.
+_RAW = ("maps/", "points/", "mirror/")
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+class StoreError(Exception):
+    """A calibration could not be written; the message says why, and nothing that was stored has changed."""
+
+
+class UnknownCalibrationError(ValueError):
+    """There is no such calibration in the folder."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One file of the folder: its calibration, or the reason why there is none."""
+
+    id: str
+    file: Path
+    calibration: Calibration | None
+    remark: str
+
+
+class CalibrationStore:
+    """Calibrations of one folder, one file ``<id>.h5`` each."""
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder).expanduser()
+
+    def new_id(self, mirror_name: str, serial: str, created_ns: int) -> str:
+        """An id that no file of the folder has: mirror, serial number, time (UTC), and a number when needed."""
+        parts = [re.sub(r"[^A-Za-z0-9]+", "-", part).strip("-")[:32] for part in (mirror_name, serial)]
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(created_ns * 1e-9))
+        stem = "_".join([part for part in parts if part] + [stamp])
+        number = 1
+        while True:
+            identifier = stem if number == 1 else f"{stem}-{number}"
+            if not self._file(identifier).exists():
+                return identifier
+            number += 1
+
+    def save(self, calibration: Calibration) -> Path:
+        """Write `calibration` to ``<id>.h5``: to a temporary file beside it first, then under its name in one step.
+
+        Raises:
+            StoreError: disk full, read-only, id taken, ...; the folder is as it was.
+        """
+        check_id(calibration.id)
+        target = self._file(calibration.id)
+        if target.exists():
+            raise StoreError(f"calibration {calibration.id} exists already; it is not overwritten")
+        self._write(target, calibration)
+        return target
+
+    def replace(self, calibration: Calibration) -> Path:
+        """Write `calibration` over the file of its id, in one step: until the new file is whole the old one stays.
+
+        Raises:
+            StoreError: disk full, read-only, other raw data than in the file, ...; the old file is as it was.
+            UnknownCalibrationError: there is no such file.
+            CalibrationFileError: the old file is damaged: it is not overwritten.
+        """
+        target = self.find(calibration.id)
+        stored = to_columns(self.load(calibration.id))[0]
+        columns = to_columns(calibration)[0]
+        raw = [name for name in stored.keys() | columns.keys() if name.startswith(_RAW)]
+        if content_hash({n: stored[n] for n in raw if n in stored}, {}) != content_hash(
+            {n: columns[n] for n in raw if n in columns}, {}
+        ):
+            raise StoreError(f"calibration {calibration.id}: its raw data differ from those in the file; not replaced")
+        self._write(target, calibration)
+        return target
+
+    def _write(self, target: Path, calibration: Calibration) -> None:
+        image = write_image(*to_columns(calibration))
+        try:
+            write_whole(target, image)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise StoreError(f"calibration {calibration.id} was not stored in {self.folder}: {reason}") from error
+
+    def load(self, name: str) -> Calibration:
+        """The calibration with the id `name`, or in the file `name` of this folder.
+
+        Raises:
+            UnknownCalibrationError: no such file, or a name that leads out of the folder.
+            CalibrationFileError: the file is damaged, foreign, or of another schema.
+        """
+        return _read(self.find(name))
+
+    def find(self, name: str) -> Path:
+        """The file of the calibration with the id or file name `name`.
+
+        Raises:
+            UnknownCalibrationError: no such file, or a name that leads out of the folder.
+        """
+        path = Path(name).expanduser()
+        if path.name != name:  # a path: only one that is a file of this folder
+            inside = path.suffix == SUFFIX and path.parent.resolve() == self.folder.resolve()
+            if not inside:
+                raise UnknownCalibrationError(f"calibration {name!r}: must be an id or a file of {self.folder}")
+        identifier = path.name.removesuffix(SUFFIX)
+        if not _ID.fullmatch(identifier):
+            raise UnknownCalibrationError(f"calibration {name!r}: not an id")
+        file = self._file(identifier)
+        if not file.is_file():
+            raise UnknownCalibrationError(f"calibration {identifier!r}: no such file in {self.folder}")
+        if file.resolve().parent != self.folder.resolve():
+            raise UnknownCalibrationError(f"calibration {identifier!r}: the file is a link out of {self.folder}")
+        return file
+
+    def entries(self) -> list[Entry]:
+        """All files of the folder, newest first by creation; damaged ones with the reason, by their file time."""
+        listed = []
+        for file in self.folder.glob(f"*{SUFFIX}") if self.folder.is_dir() else []:
+            if file.name.startswith("."):
+                continue
+            identifier = file.name.removesuffix(SUFFIX)
+            age_ns = 0
+            try:
+                age_ns = file.stat().st_mtime_ns
+                calibration = self.load(identifier)
+                listed.append((calibration.created_ns, Entry(identifier, file, calibration, "")))
+            except (CalibrationFileError, UnknownCalibrationError, OSError) as error:
+                listed.append((age_ns, Entry(identifier, file, None, str(error))))
+        listed.sort(key=lambda item: (item[0], item[1].id), reverse=True)
+        return [entry for _, entry in listed]
+
+    def _file(self, identifier: str) -> Path:
+        return self.folder / f"{identifier}{SUFFIX}"
+
+
+def check_id(identifier: str) -> None:
+    """Raise ValueError unless `identifier` is a safe file stem."""
+    if not _ID.fullmatch(identifier):
+        raise ValueError(f"calibration id {identifier!r}: letters, digits, '.', '_', '-', at most 128, no leading dot")
+
+
+def _read(file: Path) -> Calibration:
+    try:
+        columns, attributes = read_image(file)
+        calibration = from_columns(columns, attributes)
+    except (ImageError, CalibrationFileError) as error:
+        raise CalibrationFileError(f"{file.name}: {error}") from error
+    except OSError as error:
+        raise CalibrationFileError(f"{file.name}: cannot be read: {error.strerror or error}") from error
+    if calibration.id != file.name.removesuffix(SUFFIX):
+        raise CalibrationFileError(f"{file.name}: holds the calibration {calibration.id}; was the file renamed?")
+    return calibration

@@ -1,0 +1,87 @@
+"""The helper that opens HDF5 files; see :mod:`dm_calibration.store.hdf5_sandbox`. Reads requests from standard input."""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dm_calibration.map_files.datx import parse_datx
+from dm_calibration.map_files.surface_map import MAX_PIXELS, MapFileError
+from dm_calibration.store.hdf5_image import ImageError, parse_image
+from dm_calibration.store.hdf5_sandbox import CPU_BASE_S, CPU_PER_BYTE_S, fetch, receive, send, store
+
+#: Address space beyond what the process has at its start and the file itself: the largest map, and a copy in work.
+HYSTERESIS = 3 * 8 * MAX_PIXELS
+
+Found = tuple[dict[str, Any], dict[str, np.ndarray]]
+
+
+def datx(content: bytes) -> Found:
+    """A map: its fields, and "sag"."""
+    found = parse_datx(content)
+    facts = {
+        item.name: getattr(found, item.name) for item in fields(found) if item.name not in ("sag", "content", "file")
+    }
+    return facts, {"sag": found.sag}
+
+
+def image(content: bytes) -> Found:
+    """Columns and attributes of a file; columns of texts are facts, as attributes are."""
+    columns, attributes = parse_image(content)
+    texts = {name: value for name, value in columns.items() if isinstance(value, tuple)}
+    arrays = {name: value for name, value in columns.items() if not isinstance(value, tuple)}
+    return {"texts": texts, "attributes": attributes}, arrays
+
+
+TASKS: dict[str, Callable[[bytes], Found]] = {"datx": datx, "image": image}
+
+
+def limit(length: int) -> None:
+    """Bound what the next file of `length` bytes may cost. The limits only ever end this process."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    seconds = math.ceil(used.ru_utime + used.ru_stime + CPU_BASE_S + length * CPU_PER_BYTE_S)
+    _lower(resource.RLIMIT_CPU, seconds)
+    _lower(resource.RLIMIT_AS, _AT_START + HYSTERESIS + 2 * length)
+
+
+def _lower(kind: int, value: int) -> None:
+    _soft, hard = resource.getrlimit(kind)
+    resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+
+
+_AT_START = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def main() -> int:
+    """Serve until standard input ends."""
+    requests, answers, shared = sys.stdin.buffer, sys.stdout.buffer, int(sys.argv[1])
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    while (head := receive(requests)) is not None:
+        limit(head["length"])
+        content = bytearray(head["length"])
+        fetch(shared, memoryview(content), 0)
+        facts: dict[str, Any] = {}
+        arrays: dict[str, np.ndarray] = {}
+        error = kind = ""
+        try:
+            facts, arrays = TASKS[head["task"]](bytes(content))
+        except (MapFileError, ImageError) as refusal:
+            error, kind = str(refusal), type(refusal).__name__
+        arrays = {name: np.asarray(value, order="C") for name, value in arrays.items()}
+        listed = [(name, value.dtype.str, value.shape) for name, value in arrays.items()]
+        answer = {"facts": facts, "arrays": listed, "error": error, "error_kind": kind}
+        store(shared, [value.reshape(-1).view(np.uint8).data for value in arrays.values()])
+        send(answers, answer)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,202 @@
+"""Reading HDF5 in a process of its own: damaged files can crash the HDF5 library, or send it round in circles.
+
+The library is made for files it wrote itself. Bits flipped in a file's structure make it follow wild pointers, loop or
+allocate without bounds (seen with HDF5 2.0 in the fuzzing of :mod:`fault_injection`). So a helper process reads
+the bytes, within limits of memory and computing time, and hands back plain arrays and texts. When it dies, the file is
+damaged; the next file gets a new helper. The helper ends with the process that started it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import math
+import os
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Computing time per file: a fixed part, and one by size [s, s/byte]. A 12-megapixel map takes 0.3 s.
+CPU_BASE_S = 1
+CPU_PER_BYTE_S = 2e-7
+#: Wall time after which the helper is given up, whatever it waits for [s].
+WALL_LIMIT_S = 60.0
+
+_LENGTH = struct.Struct("<Q")
+_HEAD_MAX = 1 << 26
+_ARRAY_MAX = 1 << 31
+#: Memory that the shared file may keep between two files, so that it need not be claimed anew [bytes].
+_KEPT = 1 << 24
+
+
+class SandboxError(Exception):
+    """The helper did not survive the file, or could not be started."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the helper found: numbers and texts, arrays by name, or an error of the reader.
+
+    Attributes:
+        error, error_kind: the message and class name of the reader's exception; empty when it raised none.
+    """
+
+    facts: dict[str, Any] = field(default_factory=dict)
+    arrays: dict[str, NDArray[Any]] = field(default_factory=dict)
+    error: str = ""
+    error_kind: str = ""
+
+
+def send(stream: IO[bytes], head: dict[str, Any]) -> None:
+    """Write a message: length, then JSON."""
+    text = json.dumps(head).encode()
+    stream.write(_LENGTH.pack(len(text)) + text)
+    stream.flush()
+
+
+def receive(stream: IO[bytes]) -> dict[str, Any] | None:
+    """Read the JSON of a message; None at the end of the stream."""
+    prefix = stream.read(_LENGTH.size)
+    if len(prefix) < _LENGTH.size:
+        return None
+    (length,) = _LENGTH.unpack(prefix)
+    if length > _HEAD_MAX:
+        return None
+    text = stream.read(length)
+    return dict(json.loads(text)) if len(text) == length else None
+
+
+def store(descriptor: int, parts: Sequence[bytes | memoryview]) -> None:
+    """Put `parts` into the shared file, one after another from its beginning. A pipe would take longer."""
+    at = 0
+    for part in parts:
+        view = memoryview(part)
+        while view:
+            count = os.pwrite(descriptor, view, at)
+            view, at = view[count:], at + count
+
+
+def fetch(descriptor: int, view: memoryview, at: int) -> None:
+    """Fill `view` with what the shared file holds from byte `at` on.
+
+    Raises:
+        ValueError: it holds less.
+    """
+    while view:
+        count = os.preadv(descriptor, [view], at)
+        if count == 0:
+            raise ValueError("the shared file is shorter than announced")
+        view, at = view[count:], at + count
+
+
+class Hdf5Sandbox:
+    """One helper process, started when it is first needed; several threads take turns."""
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._shared = -1  # a file in memory through which contents go
+        atexit.register(self.close)
+
+    def read(self, task: str, content: bytes) -> Answer:
+        """Have `content` read by the reader `task` of :mod:`dm_calibration.store.hdf5_process`.
+
+        Raises:
+            SandboxError: the helper died of it, took too long, or could not be started.
+        """
+        with self._turn:
+            process = self._running()
+            assert process.stdin is not None and process.stdout is not None
+            # Killing the helper ends every read and write below.
+            watchdog = threading.Timer(WALL_LIMIT_S, process.kill)
+            watchdog.daemon = True
+            watchdog.start()
+            try:
+                store(self._shared, [content])
+                send(process.stdin, {"task": task, "length": len(content)})
+                head = receive(process.stdout)
+                if head is not None:
+                    return self._answer(head)
+            except (OSError, ValueError, MemoryError):
+                pass  # told below, from how the helper ended
+            finally:
+                watchdog.cancel()
+                if self._shared >= 0 and os.fstat(self._shared).st_size > _KEPT:
+                    os.ftruncate(self._shared, 0)
+            raise SandboxError(self._end(process))
+
+    def close(self) -> None:
+        """End the helper; the next read starts another."""
+        with self._turn:
+            if self._process is not None:
+                self._end(self._process)
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        if self._process is None or self._process.poll() is not None:
+            if self._process is not None:
+                self._end(self._process)
+            environment = {**os.environ, "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
+            try:
+                self._shared = os.memfd_create("hdf5")
+                # A session of its own: Ctrl-C on the terminal is for the node, which ends the helper with itself.
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "dm_calibration.store.hdf5_process", str(self._shared)],
+                    pass_fds=[self._shared],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL,
+                    env=environment,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                self._forget_shared()
+                raise SandboxError(f"the process that reads HDF5 files cannot be started: {error}") from error
+        return self._process
+
+    def _answer(self, head: dict[str, Any]) -> Answer:
+        arrays, at = {}, 0
+        for name, kind, shape in head["arrays"]:
+            if math.prod(shape) * np.dtype(kind).itemsize > _ARRAY_MAX:
+                raise ValueError(f"{name}: {shape}")
+            array = np.empty(shape, np.dtype(kind))
+            fetch(self._shared, array.reshape(-1).view(np.uint8).data, at)
+            at += array.nbytes
+            arrays[name] = array
+        return Answer(head["facts"], arrays, head["error"], head["error_kind"])
+
+    def _forget_shared(self) -> None:
+        descriptor, self._shared = self._shared, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+
+    def _end(self, process: subprocess.Popen[bytes]) -> str:
+        """End the helper; returns how it ended, in words."""
+        self._process = None
+        self._forget_shared()
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                try:
+                    stream.close()
+                except OSError:
+                    pass
+        try:
+            status = process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            status = process.wait()
+        return f"reading it ended the helper process with status {status}"
+
+
+_sandbox = Hdf5Sandbox()
+
+
+def read_in_sandbox(task: str, content: bytes) -> Answer:
+    """:meth:`Hdf5Sandbox.read` of the one helper of this process."""
+    return _sandbox.read(task, content)

@@ -1,0 +1,92 @@
+"""Memory and recipes as datasets and attributes of a calibration file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
+from dm_calibration.store.hdf5_image import Column
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook
+
+_RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe))
+
+
+def hysteresis_columns(hysteresis: HysteresisFit | None) -> dict[str, Column]:
+    """Datasets of a memory; none without one."""
+    if hysteresis is None:
+        return {}
+    columns: dict[str, Column] = {
+        "memory/name": (hysteresis.name,),
+        "memory/remarks": hysteresis.remarks,
+        "memory/zernike_sigma": hysteresis.zernike_sigma,
+        "memory/figures": np.array([hysteresis.held_out_max_zernike, hysteresis.unknown_sigma, hysteresis.maps]),
+    }
+    for field in fields(HysteresisModel):
+        columns[f"memory/law/{field.name}"] = np.asarray(getattr(hysteresis.law, field.name), dtype=np.float64)
+    return columns
+
+
+def hysteresis_from(columns: Mapping[str, Column]) -> HysteresisFit | None:
+    """The memory in the datasets of a file; None when it has none.
+
+    Raises:
+        KeyError, ValueError: something is missing or makes no sense.
+    """
+    if "memory/name" not in columns:
+        return None
+    values: dict[str, Any] = {}
+    for field in fields(HysteresisModel):
+        value = np.asarray(columns[f"memory/law/{field.name}"], dtype=np.float64)
+        values[field.name] = value if value.ndim else float(value)
+    held_out, unknown, maps = np.asarray(columns["memory/figures"], dtype=np.float64)
+    sigma = np.asarray(columns["memory/zernike_sigma"], dtype=np.float64)
+    if not (np.isfinite(sigma).all() and np.isfinite([held_out, unknown, maps]).all()):
+        raise ValueError("memory/zernike_sigma and memory/figures: must be finite")
+    name, remarks = _texts(columns, "memory/name"), _texts(columns, "memory/remarks")
+    return HysteresisFit(name[0], HysteresisModel(**values), sigma, float(held_out), float(unknown), int(maps), remarks)
+
+
+def recipe_columns(book: RecipeBook) -> dict[str, Column]:
+    """Datasets of a recipe book; none when it is empty."""
+    if not book.recipes:
+        return {}
+    columns: dict[str, Column] = {
+        f"recipes/{name}": np.array([getattr(recipe, name) for recipe in book.recipes]) for name in _RECIPE_COLUMNS
+    }
+    columns["recipes/degauss_steps"] = np.array(book.degauss_steps)
+    columns["recipes/interpolation_error"] = np.array(book.interpolation_error)
+    columns["recipes/stamp_ns"] = np.array(book.stamp_ns)
+    return columns
+
+
+def recipes_from(columns: Mapping[str, Column]) -> RecipeBook:
+    """The recipe book in the datasets of a file.
+
+    Raises:
+        KeyError, ValueError: something is missing or makes no sense.
+    """
+    if "recipes/curvature" not in columns:
+        return NO_RECIPES
+    rows = [np.asarray(columns[f"recipes/{name}"]) for name in _RECIPE_COLUMNS]
+    recipes = tuple(
+        Recipe(*(value.astype(np.float64) if value.ndim else value.item() for value in row))
+        for row in zip(*rows, strict=True)
+    )
+    return RecipeBook(
+        recipes,
+        int(np.asarray(columns["recipes/degauss_steps"])),
+        float(np.asarray(columns["recipes/interpolation_error"])),
+        int(np.asarray(columns["recipes/stamp_ns"])),
+    )
+
+
+def _texts(columns: Mapping[str, Column], name: str) -> tuple[str, ...]:
+    value = columns[name]
+    if not isinstance(value, tuple):
+        raise ValueError(f"{name}: must be texts")
+    return value

@@ -1,0 +1,105 @@
+"""The file with the updates of a calibration: tied to it by id and content, written whole or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.recalibration.drift_filter import Drift
+from dm_calibration.store.atomic_write import write_whole
+from dm_calibration.store.hdf5_image import Attribute, Column, ImageError, content_hash, read_image, write_image
+from dm_calibration.store.hysteresis_storage import hysteresis_columns
+
+SCHEMA = "dm_calibration/updates"
+SCHEMA_VERSION = 1
+
+_ARRAYS = ("gain", "offset", "covariance")
+_RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
+
+
+class UpdatesFileError(ValueError):
+    """A file of updates is damaged, foreign, or of another calibration; the message says which."""
+
+
+@dataclass(frozen=True)
+class Updates:
+    """What later maps have told of a calibrated mirror.
+
+    Attributes:
+        drift: changes of gains and figure.
+        revision: maps taken in.
+        checked_ns: stamp of the last of them; 0 = none.
+        surprising: maps in a row, the last ones, that disagreed.
+    """
+
+    drift: Drift
+    revision: int = 0
+    checked_ns: int = 0
+    surprising: int = 0
+
+
+def basis_hash(calibration: Calibration) -> str:
+    """SHA-256 over what updates change: influence function, points, memory. Recipes and notes may be added later."""
+    columns: dict[str, Column] = {name: getattr(calibration.fit, name) for name in _RESULT}
+    columns |= {f"points/{name}": getattr(calibration.fit.points, name) for name in ("x", "y", "weight")}
+    return content_hash(columns | hysteresis_columns(calibration.hysteresis), {"id": calibration.id})
+
+
+def write_updates(path: Path, identifier: str, basis: str, updates: Updates) -> None:
+    """Write `updates` of the calibration `identifier` with the hash `basis`.
+
+    Raises:
+        OSError: what stood there before still does.
+    """
+    columns: dict[str, Column] = {name: getattr(updates.drift, name) for name in _ARRAYS}
+    attributes: dict[str, Attribute] = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "calibration": identifier,
+        "basis_sha256": basis,
+        "stamp_ns": updates.drift.stamp_ns,
+    }
+    for field in fields(Updates):
+        if field.name != "drift":
+            attributes[field.name] = getattr(updates, field.name)
+    write_whole(path, write_image(columns, attributes))
+
+
+def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Updates | None:
+    """The updates in a file; None when there is no file.
+
+    Args:
+        like: with arrays of the shapes that must be there.
+
+    Raises:
+        UpdatesFileError: damaged, foreign, or of another calibration.
+    """
+    if not path.exists():
+        return None
+    try:
+        columns, attributes = read_image(path)
+    except ImageError as error:
+        raise UpdatesFileError(f"{path.name}: {error}") from error
+    except OSError as error:
+        raise UpdatesFileError(f"{path.name}: cannot be read: {error.strerror or error}") from error
+    wanted = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "calibration": identifier, "basis_sha256": basis}
+    for name, value in wanted.items():
+        if attributes.get(name) != value:
+            raise UpdatesFileError(f"{path.name}: {name} is {attributes.get(name)!r}: must be {value!r}")
+    numbers = {}
+    for name in ("stamp_ns", *(field.name for field in fields(Updates) if field.name != "drift")):
+        number = attributes.get(name)
+        if not isinstance(number, int) or number < 0:
+            raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a whole number from 0")
+        numbers[name] = number
+    arrays = {}
+    for name in _ARRAYS:
+        value, shape = columns.get(name), getattr(like, name).shape
+        if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
+            raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
+        arrays[name] = value.astype(np.float64)
+    drift = Drift(stamp_ns=numbers.pop("stamp_ns"), **arrays)
+    return Updates(drift, **numbers)

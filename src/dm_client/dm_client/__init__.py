@@ -1,0 +1,1 @@
+"""Python client of the suite for vision stacks: no callbacks, no executors."""

@@ -1,0 +1,1 @@
+"""hysteresis of dm_common."""

@@ -1,0 +1,264 @@
+"""The law by which actuators remember, and the state of a mirror under it.
+
+Every actuator follows an *effective signal*; sag and coefficients are linear in it, and the influence function holds
+the gains. Signals are normalised, so is the effective signal: it spans 2 over a slow full cycle of -1 .. +1.
+
+* Hysteresis: a sum over play operators p_r of half-width r of polynomials in their values. With first powers it is the
+  Prandtl-Ishlinskii model (Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.4); higher powers make
+  it a Preisach operator whose density over centre and half-width of the relays is learned: the relays
+  of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
+* Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for memory that fades.
+* Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
+  grow by `creep_rate` of a step per decade (Krejci & Kuhnen, IEE Proc. Control Theory Appl. 148, 2001).
+
+Nothing here depends on how a straight way is cut into steps, so only turning points have to be known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.hysteresis.duhem import DuhemOperator
+
+Floats = NDArray[np.float64]
+
+#: Time constants of creep, s: from the shortest dwell to more than a day, two per decade.
+CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisState:
+    """Where the actuators stand, with all they remember. Never changed in place.
+
+    Attributes:
+        time: s, of the clock that commands are stamped with.
+        signals: (N,) as applied.
+        play: (N, R) values of the play operators.
+        fading: (N,) of the Duhem operator.
+        position: (N,) static effective signal: hysteresis without creep.
+        crept: (N, J) what the creep elements have followed so far.
+    """
+
+    time: float
+    signals: Floats
+    play: Floats
+    fading: Floats
+    position: Floats
+    crept: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisModel:
+    """The law, shared by all actuators of a mirror; gains are in the influence function.
+
+    Attributes:
+        play_radius: (R,) half-widths, normalised; 0 = the signal itself.
+        play_weight: (R, D) weights of the powers 1 .. D of each play operator's value.
+        duhem_slope: (A,) of the Duhem operator; empty = none.
+        duhem_weight: of the Duhem operator's value.
+        creep_rate: growth of a step per decade of time.
+        creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
+
+    Raises:
+        ValueError: shapes, numbers that are not finite, or a law that cannot be inverted, naming the field.
+    """
+
+    play_radius: Floats
+    play_weight: Floats
+    duhem_slope: Floats
+    duhem_weight: float
+    creep_rate: float
+    creep_time: Floats
+
+    def __post_init__(self) -> None:
+        if self.play_radius.ndim != 1 or not self.play_radius.size:
+            raise ValueError(f"play_radius has the shape {self.play_radius.shape}: must be a list of half-widths")
+        if self.play_weight.ndim != 2 or len(self.play_weight) != len(self.play_radius):
+            raise ValueError(
+                f"play_weight has the shape {self.play_weight.shape}: must be {len(self.play_radius)} rows"
+            )
+        for name in ("play_radius", "play_weight", "duhem_slope", "duhem_weight", "creep_rate", "creep_time"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name} holds values that are not finite")
+        if (self.play_radius < 0.0).any():
+            raise ValueError(f"play_radius = {self.play_radius.min():g}: must not be negative")
+        if not 0.0 <= self.creep_rate <= 0.2:
+            raise ValueError(f"creep_rate = {self.creep_rate:g} per decade: must be 0 to 0.2")
+        if (self.creep_time <= 0.0).any():
+            raise ValueError(f"creep_time = {self.creep_time.min():g} s: must be positive")
+
+    @classmethod
+    def linear(cls) -> HysteresisModel:
+        """No memory: the effective signal is the signal."""
+        none = np.zeros(0)
+        return cls(np.zeros(1), np.ones((1, 1)), none, 0.0, 0.0, none)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the effective signal depends on anything but the signal."""
+        return len(self.play_radius) > 1 or bool(self.duhem_slope.size) or self.creep_rate > 0.0
+
+    @cached_property
+    def _duhem(self) -> DuhemOperator | None:
+        return DuhemOperator(self.duhem_slope) if self.duhem_slope.size else None
+
+    @cached_property
+    def creep_share(self) -> float:
+        """Weight of each creep element."""
+        count = len(self.creep_time)
+        if count < 2 or not self.creep_rate:
+            return 0.0
+        return self.creep_rate * float(np.log10(self.creep_time[-1] / self.creep_time[0])) / (count - 1)
+
+    # --- states ---
+
+    def demagnetised(self, actuators: int, time: float, middle: float = 0.0) -> HysteresisState:
+        """The state after a degauss that ended at `middle`, long rested there."""
+        play = np.full((actuators, len(self.play_radius)), middle)
+        state = HysteresisState(
+            time, np.full(actuators, middle), play, np.zeros(actuators), np.zeros(actuators),
+            np.zeros((actuators, len(self.creep_time))),
+        )  # fmt: skip
+        position = self._position(play, state.fading)
+        return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
+
+    def degaussed(self, state: HysteresisState, time: float, middle: float = 0.0) -> HysteresisState:
+        """The state after a degauss that ended at `middle`; creep remembers what was before."""
+        waited = self.advance(state, time)
+        fresh = self.demagnetised(len(state.signals), waited.time, middle)
+        return replace(fresh, crept=waited.crept)
+
+    def advance(self, state: HysteresisState, time: float) -> HysteresisState:
+        """The same signals at a later time (s). A time before the state's is taken as the state's."""
+        elapsed = time - state.time
+        if not elapsed > 0.0:
+            return state
+        if not self.creep_share:
+            return replace(state, time=time)
+        rest = np.exp(-elapsed / self.creep_time)
+        crept = state.position[:, None] + (state.crept - state.position[:, None]) * rest
+        return replace(state, time=time, crept=crept)
+
+    def move(self, state: HysteresisState, signals: Floats, time: float) -> HysteresisState:
+        """Wait until `time` (s), then go to `signals` (N,) on a straight way."""
+        state = self.advance(state, time)
+        play, fading = self._moved(state, signals)
+        return replace(state, signals=signals, play=play, fading=fading, position=self._position(play, fading))
+
+    def effective(self, state: HysteresisState) -> Floats:
+        """(N,) effective signal, hysteresis and creep."""
+        return np.asarray(state.position + self.creep(state))
+
+    def creep(self, state: HysteresisState) -> Floats:
+        """(N,) the part of the effective signal that changes by itself."""
+        return np.asarray(self.creep_share * state.crept.sum(axis=1))
+
+    def position_for(self, state: HysteresisState, effective: Floats, ahead: float = 0.0) -> Floats:
+        """(N,) static effective signals that, taken at the state's time, become `effective` (N,) `ahead` s later."""
+        rest = np.exp(-ahead / self.creep_time)
+        faded = self.creep_share * (state.crept @ rest)
+        return np.asarray((effective - faded) / (1.0 + self.creep_share * float((1.0 - rest).sum())))
+
+    def position_at(self, state: HysteresisState, signals: Floats) -> Floats:
+        """(N,) static effective signal that a straight move from `state` to `signals` (N,) would lead to."""
+        return self._position(*self._moved(state, signals))
+
+    def _moved(self, state: HysteresisState, signals: Floats) -> tuple[Floats, Floats]:
+        column = signals[:, None]
+        # Faster than np.clip for arrays of this size.
+        play = np.minimum(np.maximum(state.play, column - self.play_radius), column + self.play_radius)
+        if self._duhem is None:
+            return play, state.fading
+        return play, self._duhem.move(state.fading, signals - state.signals)
+
+    def _position(self, play: Floats, fading: Floats) -> Floats:
+        powers = self.play_weight.shape[1]
+        total = play * self.play_weight[:, powers - 1]
+        for power in range(powers - 2, -1, -1):  # Horner: ((w3 p + w2) p + w1) p
+            total = (total + self.play_weight[:, power]) * play
+        result = total.sum(axis=1)
+        if self._duhem is not None:
+            result = result + self.duhem_weight * fading
+        return np.asarray(result)
+
+    # --- what can be inverted ---
+
+    def slope_min(self, span: float = 1.0) -> float:
+        """Smallest slope of the effective signal over signals of +-`span`, on any way.
+
+        After a turn the operators set in one by one, narrow ones first; what has set in follows the signal at a
+        distance of its half-width. Those of half-width r have set in only where the turn can lie 2 r behind.
+        """
+        order = np.argsort(self.play_radius)
+        radius, weight = self.play_radius[order], self.play_weight[order]
+        signal, way = np.linspace(-span, span, 201)[:, None], np.array([1.0, -1.0])[:, None, None]
+        value = signal - way * radius
+        slope = np.zeros_like(value)
+        for power in range(weight.shape[1], 0, -1):
+            slope = slope * value + power * weight[:, power - 1]
+        slope = np.where(2.0 * radius <= span + way * signal, slope, 0.0)
+        smallest = float(np.cumsum(slope, axis=2).min())
+        if self._duhem is not None:
+            low, high = self._duhem.slope_range
+            smallest += min(self.duhem_weight * low, self.duhem_weight * high)
+        return smallest
+
+    def span(self) -> float:
+        """Effective signal at +1 less that at -1 in a full cycle that closes."""
+        state = self.demagnetised(1, 0.0)
+        for turn in (1.0, -1.0, 1.0, -1.0):
+            state = self.move(state, np.array([turn]), 0.0)
+        low = state.position
+        return float((self.move(state, np.ones(1), 0.0).position - low)[0])
+
+    def scaled(self, factor: float) -> HysteresisModel:
+        """The same law with effective signals `factor` times as large."""
+        return replace(self, play_weight=factor * self.play_weight, duhem_weight=factor * self.duhem_weight)
+
+
+def follow(
+    law: HysteresisModel, state: HysteresisState, signals: Floats, time: Floats, moved: Floats | None = None
+) -> tuple[Floats, HysteresisState]:
+    """Effective signals of a sequence, looked at at `time`.
+
+    Args:
+        signals: (M, N) as applied.
+        time: (M,) s, rising.
+        moved: (M,) s, when each was applied, between the looks; None = right after the look before.
+
+    Returns:
+        (M, N) effective signals, and the state after the last.
+
+    Raises:
+        ValueError: time stamps that run backwards.
+    """
+    if (np.diff(time) < 0.0).any():
+        row = int(np.flatnonzero(np.diff(time) < 0.0)[0]) + 1
+        raise ValueError(f"time stamps: row {row} is {time[row - 1] - time[row]:.3f} s before the row before it")
+    result = np.empty_like(signals)
+    starts = np.concatenate(([state.time], time[:-1])) if moved is None else moved
+    for row, (shape, start, when) in enumerate(zip(signals, starts, time, strict=True)):
+        state = law.advance(law.move(state, shape, float(start)), float(when))
+        result[row] = law.effective(state)
+    return result, state
+
+
+#: Random histories that tell what is always within reach, and time between their moves, s.
+HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
+
+
+def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float, float]:
+    """Effective signals that signals of `low` .. `high` reach whatever was before: hysteresis and creep take some away.
+
+    The least of what random histories leave at either end.
+    """
+    rng = np.random.default_rng(0)
+    state = law.demagnetised(HISTORIES, 0.0, 0.5 * (low + high))
+    for _ in range(HISTORY_MOVES):
+        state = law.move(state, rng.uniform(low, high, HISTORIES), state.time + HISTORY_PAUSE_S)
+    reached = [law.effective(law.move(state, np.full(HISTORIES, end), state.time)) for end in (low, high)]
+    return float(reached[0].max()), float(reached[1].min())

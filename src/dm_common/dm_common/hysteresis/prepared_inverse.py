@@ -1,0 +1,139 @@
+"""The inverse of the memory law with everything done beforehand that does not depend on the request.
+
+A mirror waits longer for a request than a request may wait for its command. From the state that the driver reported
+follow, for either way and every actuator, the places where the play operators set in and the law between them. There
+its inverse is smooth: a cubic that meets values and slopes at both ends of a piece. What a request still needs is to
+look its pieces up and to sum three powers.
+
+Where that is not exact enough, or a limit is met, :func:`dm_common.hysteresis.inverse.invert` has to be asked.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.hysteresis.inverse import Pieces, horner, pieces
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+
+Floats = NDArray[np.float64]
+
+#: Error of an effective signal from which a piece is not used: a third of a DAC step. Preisach laws stay a hundred
+#: times below, the tables of Duhem operators reach half of it.
+EXACT = 1e-5
+#: Distance of actuators on the common scale on which all places are looked up at once; effective signals span 2.
+APART = 1e3
+
+
+class PreparedInverse:
+    """From one state, at any time after it.
+
+    Args:
+        law: that remembers.
+        state: of a mirror at rest.
+        low, high: limits of the signals.
+
+    Attributes:
+        state: as given.
+    """
+
+    def __init__(self, law: HysteresisModel, state: HysteresisState, low: float, high: float) -> None:
+        self.state, self._low, self._high = state, low, high
+        self._share, self._rate = law.creep_share, -1.0 / law.creep_time
+        self._gap = self._share * (state.crept - state.position[:, None])
+        self._rests: dict[float, tuple[Floats, float]] = {}
+        parts = pieces(law)
+        # Without the signal itself there is a dead zone about the state, which no piece describes.
+        self._serves = parts.radius[0] == 0.0
+        if self._serves:
+            self._prepare(parts)
+
+    def _prepare(self, parts: Pieces) -> None:
+        """Pieces are counted way by way, falling first, then by actuator, then as operators set in."""
+        state = self.state
+        play = state.play if parts.order is None else state.play[:, parts.order]
+        value = horner(parts.single, play)
+        waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)  # operators that have not set in yet
+        sign = np.array([-1.0, 1.0])[:, None, None]
+        begin = play + sign * parts.radius
+        curve = parts.polynomial[:, :, None, :]
+        first = horner(curve, begin) + waiting
+        fading = None
+        if parts.duhem is not None:
+            start = np.broadcast_to(state.fading[:, None], begin.shape)
+            fading = parts.duhem.move(start, begin - state.signals[:, None])
+            first += parts.duhem_weight * fading
+        if len(curve) == 2 and fading is None:
+            slope = 1.0 / np.broadcast_to(curve[1], begin.shape)
+            self._table = np.stack((begin, first, slope), axis=-1).reshape(-1, 3)
+        else:
+            self._table = self._cubics(parts, begin, first, waiting, fading)
+        rows = APART * np.arange(2.0 * len(play))
+        self._falling, self._rising = rows[: len(play)], rows[len(play) :]
+        places = (sign * first).reshape(len(rows), -1)
+        places[:, 0] = -0.5 * APART  # nothing lies before the state itself
+        self._places = (places + rows[:, None]).ravel()
+
+    def _cubics(self, parts: Pieces, begin: Floats, first: Floats, waiting: Floats, fading: Floats | None) -> Floats:
+        """Rows of: place, value there, and the powers 1 to 3 of the inverse from there; NaN where it is not exact."""
+        duhem, sign = parts.duhem, np.array([-1.0, 1.0])[:, None, None]
+        ends = np.array([[self._low], [self._high]])
+        curve = parts.polynomial[:, :, None, :]
+        slopes = curve[1:] * parts.powers[:, :, None, None]
+        hysteresis = np.broadcast_to(self.state.fading[:, None], begin.shape)
+        change = begin - self.state.signals[:, None]
+        # A piece ends where the next one begins, the last one at the limit.
+        end, last = np.empty_like(begin), np.empty_like(begin)
+        end[..., :-1], end[..., -1] = begin[..., 1:], ends
+        last[..., :-1], last[..., -1] = first[..., 1:], horner(curve[..., -1], ends)
+        steep_first, steep_last = (
+            horner(slopes, at) if len(slopes) > 1 else np.broadcast_to(slopes[0], at.shape).copy()
+            for at in (begin, end)
+        )
+        if duhem is not None and fading is not None:
+            after = np.empty_like(fading)
+            after[..., :-1] = fading[..., 1:]
+            after[..., -1] = duhem.move(hysteresis[..., -1], ends - self.state.signals)
+            last[..., -1] += parts.duhem_weight * after[..., -1]
+            steep_first += horner(parts.duhem_slope, sign * fading)
+            steep_last += horner(parts.duhem_slope, sign * after)
+        with np.errstate(divide="ignore", invalid="ignore"):  # pieces of no width, which hold no solution
+            rise = last - first
+            chord, one, two = (end - begin) / rise, 1.0 / steep_first, 1.0 / steep_last
+            square, cube = (3.0 * chord - 2.0 * one - two) / rise, (one + two - 2.0 * chord) / rise**2
+            # An error is largest in the middle.
+            middle = 0.5 * rise
+            way = ((cube * middle + square) * middle + one) * middle
+            error = horner(curve, begin + way) + waiting - first - middle
+            if duhem is not None:
+                error += parts.duhem_weight * duhem.move(hysteresis, change + way)
+        cube[~(np.abs(error) <= EXACT)] = np.nan
+        return np.stack((begin, first, one, square, cube), axis=-1).reshape(-1, 5)
+
+    def invert(self, time: float, effective: Floats, ahead: float) -> Floats | None:
+        """Signals (N,) applied at `time` (s) for `effective` (N,) `ahead` s later; None = ask `invert`."""
+        if not self._serves:
+            return None
+        wanted = self._static(time, effective, ahead)
+        places = np.where(wanted >= self.state.position, self._rising + wanted, self._falling - wanted)
+        piece = self._table[self._places.searchsorted(places, "right") - 1].T
+        rise = wanted - piece[1]
+        if len(piece) == 3:
+            signals = piece[0] + piece[2] * rise
+        else:
+            signals = piece[0] + ((piece[4] * rise + piece[3]) * rise + piece[2]) * rise
+        if np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high:
+            return np.asarray(signals)
+        return None  # not a number, too
+
+    def _static(self, time: float, effective: Floats, ahead: float) -> Floats:
+        """What `HysteresisModel.position_for` gives for the state at `time`."""
+        if not self._share:
+            return effective
+        elapsed = max(time - self.state.time, 0.0) + ahead
+        known = self._rests.get(ahead)
+        if known is None:
+            rest = float(np.exp(ahead * self._rate).sum())
+            known = self._share * rest * self.state.position, 1.0 + self._share * (len(self._rate) - rest)
+            self._rests[ahead] = known
+        return np.asarray((effective - known[0] - self._gap @ np.exp(elapsed * self._rate)) / known[1])

@@ -1,0 +1,161 @@
+"""Between the messages of dm_msgs and the types that several nodes share."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from dm_msgs.msg import ActuatorHysteresis, MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import Recipe as RecipeMsg
+from dm_msgs.msg import RecipeBook as RecipeBookMsg
+from numpy.typing import NDArray
+
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.measurement import Measurement
+from dm_common.mirror import Mirror
+from dm_common.optics.sampling import SamplePoints
+from dm_common.recipes import Recipe, RecipeBook
+
+Floats = NDArray[np.float64]
+
+
+def doubles(values: Floats) -> array[float]:
+    """`values`, flattened row by row, as a buffer that a float64[] field takes without looking at each element."""
+    buffer = array("d")
+    buffer.frombytes(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+    return buffer
+
+
+def time_message(stamp_ns: int) -> Time:
+    """ns since the epoch of the clock as a message."""
+    return Time(sec=int(stamp_ns // 10**9), nanosec=int(stamp_ns % 10**9))
+
+
+def stamp_ns(message: Time) -> int:
+    """A time message in ns."""
+    return int(message.sec * 10**9 + message.nanosec)
+
+
+def mirror_from(message: MirrorInfo) -> Mirror:
+    """The mirror that the driver describes.
+
+    Raises:
+        ValueError: naming the field that makes no sense.
+    """
+    for name in ("actuator_x", "actuator_y"):
+        if len(getattr(message, name)) != message.actuators:
+            raise ValueError(f"mirror_info: {name} has {len(getattr(message, name))} values, not {message.actuators}")
+    if len(message.neighbour_a) != len(message.neighbour_b):
+        raise ValueError(f"mirror_info: {len(message.neighbour_a)} neighbour_a, {len(message.neighbour_b)} neighbour_b")
+    return Mirror(
+        name=message.name,
+        serial=message.serial,
+        x=np.array(message.actuator_x, dtype=np.float64),
+        y=np.array(message.actuator_y, dtype=np.float64),
+        working_radius=0.5 * message.working_aperture_diameter,
+        signal_min=message.signal_min,
+        signal_max=message.signal_max,
+        neighbours=np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.int64).reshape(-1, 2),
+        neighbour_difference_max=message.neighbour_difference_max,
+    )
+
+
+def measurement_from(response: Any) -> Measurement:
+    """The map in an answer of the service `measure`.
+
+    Raises:
+        ValueError: the answer holds no samples, or coefficients of another convention.
+    """
+    zernike, samples = response.zernike, response.samples
+    if zernike.convention != ZernikeCoefficients.BORN_WOLF:
+        raise ValueError(f"zernike.convention = {zernike.convention}: must be {ZernikeCoefficients.BORN_WOLF}")
+    if not len(samples.sag) == len(samples.x) == len(samples.y) == len(samples.weight) > 0:
+        raise ValueError(f"samples: {len(samples.sag)} sag values at {len(samples.x)} points")
+    coefficients = np.array(zernike.coefficients, dtype=np.float64)
+    sigma = np.array(zernike.sigma, dtype=np.float64)
+    return Measurement(
+        points=SamplePoints(np.array(samples.x), np.array(samples.y), np.array(samples.weight)),
+        sag=np.array(samples.sag, dtype=np.float64),
+        coefficients=coefficients,
+        sigma=sigma if sigma.shape == coefficients.shape else np.full(coefficients.shape, np.nan),
+        stamp_ns=stamp_ns(zernike.header.stamp),
+        residual_rms=zernike.residual_rms,
+        valid_fraction=zernike.valid_fraction,
+        radius=zernike.radius,
+        wavelength=zernike.wavelength,
+        system_error_subtracted=response.info.system_error_subtracted,
+        file=response.info.file,
+        sha256=response.info.sha256,
+        instrument=response.info.instrument,
+        pitch=response.info.pitch,
+        camera=(response.info.width, response.info.height),
+        centre=(response.info.centre_x, response.info.centre_y),
+        radius_px=response.info.aperture_radius_px,
+    )
+
+
+def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None:
+    """The law in a message; None when no memory was identified.
+
+    Raises:
+        ValueError: naming the field that makes no sense.
+    """
+    radius = np.array(message.play_radius, dtype=np.float64)
+    if not radius.size:
+        return None
+    weight = np.array(message.play_weight, dtype=np.float64)
+    if weight.size != radius.size * message.powers or not message.powers:
+        raise ValueError(f"hysteresis: play_weight has {weight.size} values, must be {radius.size} x {message.powers}")
+    return HysteresisModel(
+        radius,
+        weight.reshape(radius.size, message.powers),
+        np.array(message.duhem_slope, dtype=np.float64),
+        message.duhem_weight,
+        message.creep_rate,
+        np.array(message.creep_time, dtype=np.float64),
+    )
+
+
+def recipe_book_message(book: RecipeBook) -> RecipeBookMsg:
+    """Recipes as a message."""
+    recipes = [
+        RecipeMsg(
+            curvature=recipe.curvature,
+            conic_constant=recipe.conic_constant,
+            effective=doubles(recipe.effective),
+            signals=doubles(recipe.signals),
+            max_zernike=recipe.max_zernike,
+            rms=recipe.rms,
+            maps=recipe.maps,
+        )
+        for recipe in book.recipes
+    ]
+    return RecipeBookMsg(
+        stamp=time_message(book.stamp_ns),
+        degauss_steps=book.degauss_steps,
+        interpolation_error=book.interpolation_error,
+        recipes=recipes,
+    )
+
+
+def recipe_book_from(message: RecipeBookMsg) -> RecipeBook:
+    """Recipes of a message.
+
+    Raises:
+        RecipeError: they do not fit together.
+    """
+    recipes = [
+        Recipe(
+            recipe.curvature,
+            recipe.conic_constant,
+            np.array(recipe.effective, dtype=np.float64),
+            np.array(recipe.signals, dtype=np.float64),
+            recipe.max_zernike,
+            recipe.rms,
+            recipe.maps,
+        )
+        for recipe in message.recipes
+    ]
+    return RecipeBook(tuple(recipes), message.degauss_steps, message.interpolation_error, stamp_ns(message.stamp))

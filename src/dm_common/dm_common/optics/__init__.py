@@ -1,0 +1,1 @@
+"""optics of dm_common."""

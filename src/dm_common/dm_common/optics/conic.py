@@ -1,0 +1,89 @@
+"""Conic surfaces, Eq. (2) of the paper, and their Zernike coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dm_common.optics.zernike import TERM_RMS, basis
+
+_RADIAL_NODES = 24
+_ANGLES = 48
+
+
+def conic_sag(
+    x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: float = 0.0, shift: float = 0.0
+) -> NDArray[np.float64]:
+    """Sag of a conic, Eq. (2); positive curvature is concave (the rim stands above the vertex).
+
+    The equation's form with the root in the denominator loses no digits for weak curvatures.
+
+    Args:
+        x, y: m, of any one shape.
+        curvature: axial curvature, 1/m.
+        conic_constant: 0 = sphere, -1 = paraboloid.
+        shift: m, displacement s of the vertex in Eq. (2): the vertex lies at x = -shift.
+
+    Returns:
+        Sag in m, of the shape of x.
+
+    Raises:
+        ValueError: a number that is not finite, or a point beyond the equator, where the conic has no sag.
+    """
+    r2 = (np.asarray(x, dtype=float) + shift) ** 2 + np.asarray(y, dtype=float) ** 2
+    root = 1 - (1 + conic_constant) * curvature**2 * r2
+    if not np.isfinite(root).all():
+        raise ValueError(f"curvature = {curvature} 1/m, conic_constant = {conic_constant}: must be finite")
+    if (root < 0).any():
+        raise ValueError(
+            f"curvature = {curvature:g} 1/m, conic_constant = {conic_constant:g}: the surface does not reach out to "
+            f"{np.sqrt(r2.max()):g} m; (1 + conic_constant) curvature^2 r^2 must be at most 1, is {1 - root.min():g}"
+        )
+    return np.asarray(curvature * r2 / (1 + np.sqrt(root)))
+
+
+def conic_coefficients(
+    curvature: float, conic_constant: float, radius: float, shift: float = 0.0
+) -> NDArray[np.float64]:
+    """Born & Wolf coefficients of a conic over a circular aperture, by least squares over the full disc.
+
+    The terms are orthogonal on the disc, so each coefficient is a projection; the integrals are Gauss-Legendre in r^2
+    and equidistant in angle, exact for the polynomials involved.
+
+    Args:
+        curvature: 1/m; positive = concave.
+        conic_constant: 0 = sphere, -1 = paraboloid.
+        radius: of the aperture, m.
+        shift: as in :func:`conic_sag`, m.
+
+    Returns:
+        (21,) in m.
+
+    Raises:
+        ValueError: radius not positive, or the conic does not reach out to it.
+    """
+    if not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius = {radius} m: must be positive")
+    return disc_coefficients(lambda x, y: conic_sag(radius * x, radius * y, curvature, conic_constant, shift))
+
+
+def disc_coefficients(
+    sag: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """(21,) Born & Wolf coefficients of `sag`, a function of points of the unit disc, by least squares over it."""
+    x, y, projection = _quadrature()
+    return sag(x, y) @ projection
+
+
+@cache
+def _quadrature() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Points of the unit disc, x and y (Q,), and what takes sag there to coefficients, (Q, 21)."""
+    nodes, weights = np.polynomial.legendre.leggauss(_RADIAL_NODES)
+    r = np.sqrt((nodes + 1) / 2)
+    angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
+    x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
+    area = np.repeat(weights / (2 * _ANGLES), _ANGLES)
+    return x, y, area[:, np.newaxis] * basis(x, y) / TERM_RMS**2

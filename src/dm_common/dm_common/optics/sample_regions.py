@@ -1,0 +1,159 @@
+"""Concentric regions on sampling points instead of pixels, for stored maps that hold the sag at some hundred points.
+
+A point stands for a share of the aperture's area (its weight), not for a place without extent. With some ten rings of
+points and ten regions, counting a whole ring in or out would put the boundary of a region off by half a ring's width,
+up to 7 % of the area. So the boundary cuts through the points' shares. Points are taken from the centre outwards; those
+of one radius together stand for the annulus between the area of all points inside them and that area plus their own. A
+disc of a given area holds of each point the part of that annulus that lies inside. For rings of edge-clustered points
+this is exact, as it is for uniform points, whose weights are equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dm_common.optics.sampling import SamplePoints
+
+Floats = NDArray[np.float64]
+
+#: Shares of the aperture's area, 10 % to 100 % (the paper's Fig. 4).
+AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))
+#: Squared radii that agree to so many decimals are one ring of points.
+_RADIUS_DECIMALS = 9
+
+
+class EmptyRegionError(ValueError):
+    """A region holds no data; the message names the map and the region."""
+
+
+def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:
+    """(R,) shares of the area as an array; ValueError unless they rise above 0 and up to 1 at most."""
+    fractions = np.asarray(area_fractions, dtype=float)
+    if not (fractions.size and (np.diff(fractions) > 0).all() and fractions[0] > 0 and fractions[-1] <= 1):
+        raise ValueError(f"area_fractions = {fractions.tolist()}: must rise within 0 to 1")
+    return fractions
+
+
+def check_regions(rms: NDArray[np.float64], area_fractions: NDArray[np.float64], labels: Sequence[str]) -> None:
+    """Raise EmptyRegionError for the first NaN in `rms` (M, R)."""
+    empty = np.argwhere(~np.isfinite(rms))
+    if len(empty):
+        row, region = empty[0]
+        raise EmptyRegionError(
+            f"{labels[row]}: the concentric region of {area_fractions[region]:.0%} of the area holds no valid data; "
+            "measure the map again, or check centre and radius of the aperture"
+        )
+
+
+def disc_shares(points: SamplePoints, area_fractions: ArrayLike = AREA_FRACTIONS) -> Floats:
+    """(P, R): part of each point's own area, 0..1, that lies inside each concentric disc.
+
+    Raises:
+        ValueError: weights that are not positive or do not sum to 1, or fractions out of order.
+    """
+    fractions = checked_fractions(area_fractions)
+    weight = points.weight
+    if not (weight > 0).all() or abs(weight.sum() - 1.0) > 1e-6:
+        raise ValueError(
+            f"weights of the sampling points: from {weight.min():g}, sum {weight.sum():g}; "
+            "must be positive shares of the area that sum to 1"
+        )
+    _, ring = np.unique(np.round(points.x**2 + points.y**2, _RADIUS_DECIMALS), return_inverse=True)
+    area = np.bincount(ring.ravel(), weight)
+    outer = np.cumsum(area)
+    inner = outer - area
+    # The last ring ends at 1 but for rounding, and the whole aperture must hold it whole.
+    outer[-1] = 1.0
+    inside = (fractions - inner[:, np.newaxis]) / (outer - inner)[:, np.newaxis]
+    return np.asarray(np.clip(inside, 0.0, 1.0)[ring.ravel()])
+
+
+def regional_rms(
+    sag: Floats,
+    points: SamplePoints,
+    area_fractions: ArrayLike = AREA_FRACTIONS,
+    labels: Sequence[str] = (),
+    *,
+    level_each: bool = False,
+) -> Floats:
+    """Root mean square of sag samples inside concentric discs, area-weighted.
+
+    The paper does not say whether a partial aperture is levelled on its own. Both readings are here: about zero, with
+    piston and tilt removed once over the whole aperture by the caller; or about each region's own best plane, as an
+    interferometer with that aperture would show it.
+
+    Args:
+        sag: (M, P) at the points, NaN = no data; the points that are left then share the region.
+        area_fractions: (R,) shares of the aperture's area.
+        labels: (M,) names of the maps for messages.
+        level_each: remove piston and tilt from every region on its own.
+
+    Returns:
+        (M, R), in the unit of the sag; all finite.
+
+    Raises:
+        EmptyRegionError: a region of some map has no sample.
+        ValueError: shapes that disagree.
+    """
+    if sag.ndim != 2 or sag.shape[1] != len(points):
+        raise ValueError(f"sag has the shape {sag.shape}: must be (maps, {len(points)} sampling points)")
+    shares = points.weight[:, np.newaxis] * disc_shares(points, area_fractions)
+    seen = np.isfinite(sag)
+    energy = np.where(seen, np.square(sag), 0.0) @ shares
+    area = seen.astype(float) @ shares
+    if level_each:
+        energy = np.maximum(energy - _in_plane(sag, seen, points, shares), 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms = np.where(area > 0.0, np.sqrt(energy / area), np.nan)
+    names = tuple(labels) or tuple(f"map {k + 1}" for k in range(len(sag)))
+    check_regions(rms, checked_fractions(area_fractions), names)
+    return np.asarray(rms)
+
+
+def _in_plane(sag: Floats, seen: NDArray[np.bool_], points: SamplePoints, shares: Floats) -> Floats:
+    """(M, R): the part of the energy in each region that its best plane holds."""
+    plane = np.column_stack((np.ones_like(points.x), points.x, points.y))
+    products = plane[:, :, np.newaxis] * plane[:, np.newaxis, :]
+    gram = np.einsum("mp,pr,pij->mrij", seen.astype(float), shares, products, optimize=True)
+    moments = np.einsum("mp,pr,pi->mri", np.where(seen, sag, 0.0), shares, plane, optimize=True)
+    # The pseudo-inverse serves regions with too few points for a plane.
+    return np.asarray(np.einsum("mri,mrij,mrj->mr", moments, np.linalg.pinv(gram, hermitian=True), moments))
+
+
+def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
+    """(P,) weight of each point: that of the ring it lies in.
+
+    Where the boundary of a region cuts through a point's area the squares are averaged, since weights act squared.
+
+    Args:
+        weights: (R,) of the discs, from the smallest; R of equal steps in area up to the whole aperture.
+
+    Raises:
+        ValueError: weights not above 0, or not one per region.
+    """
+    w = np.asarray(weights, dtype=float)
+    if w.shape != (len(AREA_FRACTIONS),) or not (np.isfinite(w) & (w > 0.0)).all():
+        raise ValueError(
+            f"weights = {w.tolist()}: must be {len(AREA_FRACTIONS)} finite numbers above 0, one per region"
+        )
+    ring_shares = np.diff(disc_shares(points), axis=1, prepend=0.0)
+    return np.asarray(np.sqrt(ring_shares @ np.square(w)))
+
+
+def command_row_weights(points: SamplePoints, weights: ArrayLike) -> Floats:
+    """Place (b): factor of each row of the command solve min |W(dC - G dS)| on the vector of sag points.
+
+    Multiply the rows of the influence function (P, N) and of the wanted sag (P,) by it. It holds the points' areas too,
+    and its squares sum to 1 as those do: a ridge then weighs as much as without region weights.
+
+    Args:
+        weights: (R,) of the regions.
+
+    Returns:
+        (P,) above 0.
+    """
+    row = np.sqrt(points.weight) * point_weights(points, weights)
+    return np.asarray(row / np.linalg.norm(row))

@@ -1,0 +1,252 @@
+"""Work that waits, beside an executor that never does.
+
+A service or action callback that would block (settling, files, fits, other services) runs as ordinary code in a worker
+thread; its outcome is handed back to the executor, which sends the response. While it runs, streams are served
+undisturbed and nothing polls.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.client import Client
+from rclpy.clock import Clock
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.service import Service
+
+from dm_common.ros import qos
+
+#: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
+RESULT_TIMEOUT_S = 10
+
+#: Time that discovery may take on a busy machine from one side to the other.
+DISCOVERY_S = 0.5
+_first_seen: WeakKeyDictionary[Any, float] = WeakKeyDictionary()
+
+
+class ServiceCallError(Exception):
+    """A service did not answer: not there, too slow, or the wait was cancelled."""
+
+
+def _tell(node: Node, what: str, error: Exception, answer: Any) -> None:
+    """Log an exception of the body of `what`, and tell it in the answer as ErrorCode.INTERNAL if that has a place."""
+    node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
+    if hasattr(answer, "error_code"):
+        answer.error_code = 599  # ErrorCode.INTERNAL
+        answer.message = f"{type(error).__name__}: {error}"
+
+
+def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """`callback(request, response) -> response` of service `name` that answers ErrorCode.INTERNAL instead of raising.
+
+    A service whose callback raises sends no answer: whoever called it waits until its patience ends.
+    """
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:
+            _tell(node, f"service {name}", error, response)
+            return response
+
+    return answer
+
+
+class WorkerService:
+    """A service whose callback runs in a worker thread.
+
+    `callback(request, response) -> response` may block. Requests of one service are served one after another, in order.
+    """
+
+    def __init__(self, node: Node, srv_type: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
+        self._node = node
+        self._callback = never_silent(node, name, callback)
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name.replace("/", "_"))
+        self._service: Service = node.create_service(
+            srv_type, name, lambda request, response: (request, response), qos_profile=qos.SERVICE
+        )
+        # The executor calls `callback` and passes what it returns to `send_response(response, header)`: the only place
+        # where the header that a later answer needs can be had.
+        self._send: Callable[[Any, Any], None] = self._service.send_response
+        self._service.send_response = self._start
+
+    def _start(self, request_and_response: tuple[Any, Any], header: Any) -> None:
+        self._pool.submit(self._work, *request_and_response, header)
+
+    def _work(self, request: Any, response: Any, header: Any) -> None:
+        response = self._callback(request, response)
+        if self._node.executor is not None:
+            self._node.executor.create_task(self._send, response, header)
+
+    def destroy(self) -> None:
+        """Stop taking requests and drop those not yet begun."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._node.destroy_service(self._service)
+
+
+class WorkerActionServer(ActionServer):
+    """An action server whose body runs in a worker thread.
+
+    `body(goal_handle) -> (outcome, result)` may block; `outcome` is "succeed", "abort" or "canceled". It should return
+    soon after `goal_handle.is_cancel_requested` or after `preempted(goal_handle)` becomes true.
+
+    Args:
+        exclusive: "refuse" refuses a goal while another runs; "preempt" asks the running goal to stop and starts the
+            newest one after it.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        action_type: Any,
+        name: str,
+        body: Callable[[ServerGoalHandle], tuple[str, Any]],
+        *,
+        exclusive: str = "refuse",
+    ) -> None:
+        if exclusive not in ("refuse", "preempt"):
+            raise ValueError(f"exclusive = {exclusive!r}: must be 'refuse' or 'preempt'")
+        self._worker_node = node
+        self._body = body
+        self._exclusive = exclusive
+        self._turn = threading.Lock()  # held by the goal that runs
+        self._bookkeeping = threading.Lock()
+        self._newest: ServerGoalHandle | None = None
+        self._running = 0
+        super().__init__(
+            node,
+            action_type,
+            name,
+            execute_callback=lambda goal_handle: action_type.Result(),  # replaced in notify_execute
+            goal_callback=self._on_goal,
+            cancel_callback=lambda goal_handle: CancelResponse.ACCEPT,
+            result_timeout=RESULT_TIMEOUT_S,
+            goal_service_qos_profile=qos.SERVICE,
+            result_service_qos_profile=qos.SERVICE,
+            cancel_service_qos_profile=qos.SERVICE,
+        )
+
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is running or waiting."""
+        with self._bookkeeping:
+            return self._running > 0
+
+    def preempted(self, goal_handle: ServerGoalHandle) -> bool:
+        """Whether a newer goal waits for this one to stop."""
+        with self._bookkeeping:
+            return self._newest is not goal_handle
+
+    def _on_goal(self, goal: Any) -> GoalResponse:
+        if self._exclusive == "refuse" and self.busy:
+            self._worker_node.get_logger().warning("goal refused: another one is running")
+            return GoalResponse.REJECT
+        with self._bookkeeping:
+            self._running += 1
+        return GoalResponse.ACCEPT
+
+    def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
+        """Run the body in a thread; rclpy's own execution only publishes the outcome, when it is there."""
+        with self._bookkeeping:
+            self._newest = goal_handle
+        threading.Thread(target=self._work, args=(goal_handle,), daemon=True).start()
+
+    def _work(self, goal_handle: ServerGoalHandle) -> None:
+        try:
+            with self._turn:
+                outcome, result = self._body(goal_handle)
+        except Exception as error:
+            outcome, result = "abort", self._action_type.Result()
+            _tell(self._worker_node, "action", error, result)
+        finally:
+            with self._bookkeeping:
+                self._running -= 1
+
+        def finish(_goal_handle: ServerGoalHandle) -> Any:
+            # Only a goal whose cancellation was requested may end as cancelled.
+            if outcome == "canceled" and not goal_handle.is_cancel_requested:
+                goal_handle.abort()
+            else:
+                getattr(goal_handle, outcome)()
+            return result
+
+        if self._worker_node.executor is not None:
+            self._worker_node.executor.create_task(ActionServer.notify_execute, self, goal_handle, finish)
+
+
+def answers_arrive(client: Any, is_ready: Callable[[], bool]) -> bool:
+    """Whether a service or action server is there, and has had time to discover the client in its turn.
+
+    A server that answers before it knows the client's reader drops the answer; no API tells whether it does. So a
+    server counts as there only some time after it was first seen.
+    """
+    if not is_ready():
+        _first_seen.pop(client, None)
+        return False
+    return time.monotonic() >= _first_seen.setdefault(client, time.monotonic()) + DISCOVERY_S
+
+
+def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], bool] = lambda: False) -> Any:
+    """Call a service from a worker thread and wait for the answer.
+
+    Never call this from an executor callback: it would wait for itself.
+
+    Raises:
+        ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, or `cancelled()` became true.
+    """
+    deadline = time.monotonic() + timeout_s
+    while not answers_arrive(client, client.service_is_ready):
+        if cancelled():
+            raise ServiceCallError(f"{client.srv_name}: cancelled")
+        if time.monotonic() > deadline:
+            raise ServiceCallError(f"{client.srv_name}: no such service within {timeout_s:g} s; is its node running?")
+        time.sleep(0.02)
+    done = threading.Event()
+    future = client.call_async(request)
+    future.add_done_callback(lambda _future: done.set())
+    while not done.wait(0.02 if deadline - time.monotonic() > 0.02 else 0.001):
+        if cancelled() or time.monotonic() > deadline:
+            client.remove_pending_request(future)
+            reason = "cancelled" if cancelled() else f"no answer within {timeout_s:g} s"
+            raise ServiceCallError(f"{client.srv_name}: {reason}")
+    return future.result()
+
+
+def wait_for_clock(clock: Clock, timeout_s: float = 10.0) -> None:
+    """Wait in a worker thread until ROS time runs: simulated time stands at 0 until the first message on /clock.
+
+    Raises:
+        TimeoutError: no time within `timeout_s`.
+    """
+    deadline = time.monotonic() + timeout_s
+    while clock.now().nanoseconds == 0:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"use_sim_time is set, but nothing came on /clock within {timeout_s:g} s")
+        time.sleep(0.01)
+
+
+def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: False) -> bool:
+    """Sleep in ROS time (which may run faster than the wall clock) in a worker thread.
+
+    Returns True, or False as soon as `cancelled()` is true. When ROS time stands still (a simulator that ended), it
+    gives up after 10 s plus ten times `seconds` of wall time and raises TimeoutError.
+    """
+    wait_for_clock(clock)
+    end = clock.now() + Duration(nanoseconds=round(seconds * 1e9))
+    give_up = time.monotonic() + 10.0 + 10.0 * seconds
+    while (remaining := (end - clock.now()).nanoseconds * 1e-9) > 0:
+        if cancelled():
+            return False
+        if time.monotonic() > give_up:
+            raise TimeoutError(f"ROS time did not advance by {seconds:g} s; is the publisher of /clock alive?")
+        time.sleep(min(remaining, 0.002 if remaining < 0.02 or clock.ros_time_is_active else 0.02))
+    return not cancelled()

@@ -1,0 +1,102 @@
+"""Zernike terms and converters against tables and integrals written out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dm_common.optics import zernike
+from dm_common.optics.zernike import TERMS, basis
+
+# (n, m, kind), R_n^m(r) as written in Born & Wolf table 9.1, Noll's j, OSA/ANSI j.
+TABLE = [
+    (0, 0, "", lambda r: 1 + 0 * r, 1, 0),
+    (1, 1, "cos", lambda r: r, 2, 2),
+    (1, 1, "sin", lambda r: r, 3, 1),
+    (2, 0, "", lambda r: 2 * r**2 - 1, 4, 4),
+    (2, 2, "cos", lambda r: r**2, 6, 5),
+    (2, 2, "sin", lambda r: r**2, 5, 3),
+    (3, 1, "cos", lambda r: 3 * r**3 - 2 * r, 8, 8),
+    (3, 1, "sin", lambda r: 3 * r**3 - 2 * r, 7, 7),
+    (3, 3, "cos", lambda r: r**3, 10, 9),
+    (3, 3, "sin", lambda r: r**3, 9, 6),
+    (4, 0, "", lambda r: 6 * r**4 - 6 * r**2 + 1, 11, 12),
+    (4, 2, "cos", lambda r: 4 * r**4 - 3 * r**2, 12, 13),
+    (4, 2, "sin", lambda r: 4 * r**4 - 3 * r**2, 13, 11),
+    (4, 4, "cos", lambda r: r**4, 14, 14),
+    (4, 4, "sin", lambda r: r**4, 15, 10),
+    (5, 1, "cos", lambda r: 10 * r**5 - 12 * r**3 + 3 * r, 16, 18),
+    (5, 1, "sin", lambda r: 10 * r**5 - 12 * r**3 + 3 * r, 17, 17),
+    (5, 3, "cos", lambda r: 5 * r**5 - 4 * r**3, 18, 19),
+    (5, 3, "sin", lambda r: 5 * r**5 - 4 * r**3, 19, 16),
+    (5, 5, "cos", lambda r: r**5, 20, 20),
+    (5, 5, "sin", lambda r: r**5, 21, 15),
+]
+
+R, THETA = np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 2 * np.pi, 11, endpoint=False))
+VALUES = [
+    radial(R) * {"": 1.0, "cos": np.cos(m * THETA), "sin": np.sin(m * THETA)}[kind]
+    for _n, m, kind, radial, _noll, _ansi in TABLE
+]
+
+
+def test_terms_are_in_the_papers_order() -> None:
+    assert [tuple(term) for term in TERMS] == [row[:3] for row in TABLE]
+    assert zernike.NAMES[3:6] == ("Z_2^0", "Z_2^2 cos", "Z_2^2 sin")
+    assert zernike.index_of(4, 0) == 10
+
+
+def test_basis_equals_the_table() -> None:
+    found = basis(R * np.cos(THETA), R * np.sin(THETA))
+    assert found.shape == (*R.shape, 21)
+    np.testing.assert_allclose(found, np.stack(VALUES, axis=-1), atol=1e-13)
+
+
+def test_rms_over_the_disc_is_the_integral() -> None:
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    radius = np.sqrt((nodes + 1) / 2)
+    angle = 2 * np.pi * np.arange(32) / 32
+    terms = basis(np.outer(radius, np.cos(angle)), np.outer(radius, np.sin(angle)))
+    gram = np.einsum("r,rak,ral->kl", weights / 64, terms, terms)
+    np.testing.assert_allclose(gram, np.diag(zernike.TERM_RMS**2), atol=1e-14)
+
+
+def test_rms_of_a_sum_leaves_out_what_is_told() -> None:
+    coefficients = np.zeros((2, 21))
+    coefficients[:, :5] = [[7, 8, 9, 3, 4], [7, 8, 9, 0, 0]]
+    expected = math.sqrt(3**2 / 3 + 4**2 / 6)
+    np.testing.assert_allclose(zernike.rms_of(coefficients), [expected, 0])
+    np.testing.assert_allclose(zernike.rms_of(coefficients[1], exclude=()), math.sqrt(49 + 64 / 4 + 81 / 4))
+
+
+@pytest.mark.parametrize("convention", ["noll", "ansi"])
+def test_converters_describe_the_same_surface(convention: str) -> None:
+    coefficients = np.random.default_rng(3).normal(size=21)
+    converted = getattr(zernike, f"born_wolf_to_{convention}")(coefficients)
+    surface = sum(c * value for c, value in zip(coefficients, VALUES, strict=True))
+    again = np.zeros_like(R)
+    for (n, m, _kind, _radial, noll, ansi), value in zip(TABLE, VALUES, strict=True):
+        norm = math.sqrt(n + 1) if m == 0 else math.sqrt(2 * (n + 1))
+        again += converted[noll - 1 if convention == "noll" else ansi] * norm * value
+    np.testing.assert_allclose(again, surface, atol=1e-12)
+    # rms-normalised coefficients add up to the surface's rms directly
+    assert np.sqrt((converted[1:] ** 2).sum()) == pytest.approx(zernike.rms_of(coefficients, exclude=(0,)))
+
+
+@settings(max_examples=20, deadline=None)
+@given(arrays(float, (3, 21), elements=st.floats(-1e3, 1e3)))
+def test_converters_there_and_back(coefficients: np.ndarray) -> None:
+    for name in ("noll", "ansi"):
+        there = getattr(zernike, f"born_wolf_to_{name}")(coefficients)
+        back = getattr(zernike, f"{name}_to_born_wolf")(there)
+        np.testing.assert_allclose(back, coefficients, rtol=1e-12, atol=1e-12)
+
+
+def test_wrong_number_of_coefficients_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"shape \(20,\).*21 terms"):
+        zernike.born_wolf_to_noll(np.zeros(20))

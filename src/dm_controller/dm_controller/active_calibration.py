@@ -1,0 +1,134 @@
+"""The calibration in use: whether it belongs to the mirror at hand, and what moves are planned with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from dm_msgs.msg import Calibration, ErrorCode, MirrorInfo
+
+from dm_common.errors import Refusal
+from dm_common.hysteresis.model import certain_reach
+from dm_common.messages import recipe_book_from, stamp_ns
+from dm_common.recipes import RecipeBook
+from dm_controller.conversions import hysteresis_figures_of, limits_of, model_of
+from dm_controller.mirror_model import CalibratedMirror
+from dm_controller.planner import Planner
+from dm_controller.target import FocusTarget
+
+NO_CALIBRATION = "no calibration: run `./dm calibrate` or load_calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class ActiveCalibration:
+    """A mirror that can be focused.
+
+    Attributes:
+        calibration: as received.
+        mirror: its influence function inside the limits.
+        certain: the same inside what is within reach whatever the actuators remember.
+        loop: plans moves.
+        recipes: may be empty.
+        middle: signal of mid range, where a degauss ends.
+        slew_rate: 1/s, of the signals; infinite = not limited.
+        span: of the signals.
+    """
+
+    calibration: Calibration
+    mirror: CalibratedMirror
+    certain: CalibratedMirror
+    loop: Planner
+    recipes: RecipeBook
+    middle: float
+    slew_rate: float
+    span: float
+
+    def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
+        """See :meth:`CalibratedMirror.reachable_range`; within reach from any history."""
+        return self.certain.reachable_range(target, tolerance)
+
+    @property
+    def conditioned_error(self) -> float:
+        """m, bound of the largest coefficient error of a conditioned move; 0 = no recipes."""
+        if not self.recipes.recipes:
+            return 0.0
+        worst = max(recipe.max_zernike for recipe in self.recipes.recipes)
+        return worst + self.recipes.interpolation_error
+
+    def error_bound(self, history_known: bool) -> float:
+        """m, 95 % bound of the largest coefficient error of a direct move."""
+        hysteresis = self.loop.hysteresis
+        if hysteresis is None:
+            return float(self.calibration.held_out_max_zernike)
+        unknown = 0.0 if history_known else self.loop.unknown_max_zernike
+        return math.hypot(hysteresis.held_out_max_zernike, unknown)
+
+    def stale(self, now_ns: int, age_max_s: float) -> str:
+        """Why the calibration should be renewed, in words; "" = it is fresh, or of unknown age."""
+        seen = stamp_ns(self.calibration.checked) or stamp_ns(self.calibration.header.stamp)
+        age = 1e-9 * (now_ns - seen)
+        if not age_max_s or not seen or age <= age_max_s:
+            return ""
+        return (
+            f"calibration {self.calibration.id} is stale: no map has agreed with it for {age / 86400.0:.1f} days "
+            f"(calibration_age_max {age_max_s / 86400.0:g}); check it with a map or calibrate anew"
+        )
+
+
+def active_calibration(
+    calibration: Calibration | None, mirror: MirrorInfo | None, aperture_tolerance: float
+) -> ActiveCalibration:
+    """What to plan moves of `mirror` with.
+
+    Raises:
+        Refusal: there is no calibration, it is of another mirror, or its numbers make no sense, naming the field.
+    """
+    if calibration is None or not calibration.id:
+        raise Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
+    if mirror is None:
+        raise Refusal(
+            ErrorCode.DRIVER_UNAVAILABLE, "the mirror's limits are unknown: no mirror_info from pdm_driver yet"
+        )
+    reason = _mismatch(calibration, mirror, aperture_tolerance)
+    if reason is not None:
+        raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {reason}")
+    try:
+        slew_rate = mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf
+        limits = limits_of(mirror)
+        calibrated = CalibratedMirror(model_of(calibration), limits)
+        recipes = recipe_book_from(calibration.recipes)
+        if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):
+            raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
+        loop = Planner(calibrated, hysteresis_figures_of(calibration), slew_rate)
+        certain = calibrated
+        if loop.law.remembers:
+            reach = certain_reach(loop.law, limits.low, limits.high)
+            share = (reach[1] - reach[0]) / (limits.high - limits.low)
+            certain = CalibratedMirror(
+                calibrated.model,
+                replace(
+                    limits,
+                    low=reach[0],
+                    high=reach[1],
+                    neighbour_difference=min(share, 1.0) * limits.neighbour_difference,
+                ),
+            )
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
+    low, high = mirror.signal_min, mirror.signal_max
+    return ActiveCalibration(calibration, calibrated, certain, loop, recipes, 0.5 * (low + high), slew_rate, high - low)
+
+
+def _mismatch(calibration: Calibration, mirror: MirrorInfo, aperture_tolerance: float) -> str | None:
+    if calibration.mirror_serial != mirror.serial:
+        return f"is of mirror serial {calibration.mirror_serial!r}, this one is {mirror.serial!r}"
+    if calibration.actuators != mirror.actuators:
+        return f"has {calibration.actuators} actuators, this mirror {mirror.actuators}"
+    working = mirror.working_aperture_diameter / 2
+    if abs(calibration.aperture_radius - working) > aperture_tolerance * working:
+        return (
+            f"was made over an aperture of radius {calibration.aperture_radius * 1e3:.3f} mm, "
+            f"the working aperture's is {working * 1e3:.3f} mm"
+        )
+    return None

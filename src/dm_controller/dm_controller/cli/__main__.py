@@ -1,5 +1,0 @@
-"""python -m dm_controller.cli."""
-
-from dm_controller.cli import main
-
-main()

@@ -1,0 +1,1 @@
+"""converge of dm_controller."""

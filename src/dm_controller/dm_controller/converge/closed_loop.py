@@ -1,0 +1,257 @@
+"""Closed loop on an interferometer: measure, compare with the target, correct, until the surface is the wanted one.
+
+Knows no ROS. The first map judges the open-loop command; each further map judges a correction. Hysteresis makes every
+correction miss by some share of itself, so the loop contracts instead of ending in one step; the share is not known
+beforehand. Two things keep it from diverging:
+
+- the response is watched: after each step the change that was seen is compared with the change that was asked for, and
+  the next correction is scaled by the inverse of their ratio (a secant step in one number, within bounds);
+- when the error grew nevertheless, the next correction is halved, once more each time.
+
+Creep goes on while the loop measures: after a large move the surface drifts by a share of that move per decade of time,
+more between two early maps than a correction misses. A loop that is told the share aims at the time of the next map.
+
+The best command seen is kept. Damped corrections lie between two legal commands, so they are legal as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from dm_common.measurement import Cancelled, Measurement
+from dm_common.optics.zernike import TERM_RMS
+from dm_controller.mirror_model import InfluenceModel
+from dm_controller.solvers.base import FREE, Floats, Shape, Solver, measured_shape, rms_sag, target_shape
+from dm_controller.target import FocusTarget
+
+#: Bounds of the factor on a correction that the watched response may ask for.
+SCALE_MIN, SCALE_MAX = 0.6, 1.5
+#: Changes smaller than this (m) say more of the noise than of the response, and growth by less is no divergence.
+CHANGE_MIN = 3e-9
+#: Corrections below this factor would never converge: an error that still grows is not the loop's.
+DAMPING_MIN = 0.1
+#: The best command is written again at the end when the last was so much worse. Nearer ones are the same but for noise,
+#: and going back costs hysteresis.
+RESTORE_RATIO = 1.5
+
+
+class Plant(Protocol):
+    """What the loop drives; `dm_calibration.procedure.procedure.Bench` is one."""
+
+    def apply(self, signals: Floats) -> Floats:
+        """Command `signals` (N,), wait until they stand, return what was written (N,)."""
+
+    def settle(self) -> bool:
+        """Wait the settle time; False when cancelled meanwhile."""
+
+    def measure(self, label: str) -> Measurement:
+        """Take one map."""
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """When to stop.
+
+    Attributes:
+        tolerance: largest coefficient error beyond tilt, m, at which the loop has converged.
+        max_maps: maps it may take, the one of the open-loop command included.
+        correct_last: when the maps are used up, make the correction that the last one asks for as well, and leave it
+            unmeasured; else the mirror is left with a command that was measured.
+    """
+
+    tolerance: float = 2e-9
+    max_maps: int = 5
+    correct_last: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
+            raise ValueError(f"tolerance = {self.tolerance:g} m: must be above 0 and finite")
+        if self.max_maps < 1:
+            raise ValueError(f"max_maps = {self.max_maps}: must be at least 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Creep:
+    """What a loop needs to foresee creep.
+
+    Attributes:
+        share: growth of a move per decade of time (piezos: about 0.01); 0 = do not foresee.
+        previous: (N,) signals that stood before the loop's first command.
+        now: the plant's time, s, in steady advance.
+    """
+
+    share: float
+    previous: Floats
+    now: Callable[[], float]
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.share <= 0.2:
+            raise ValueError(f"creep = {self.share:g} per decade: must be 0 to 0.2")
+
+
+@dataclass(frozen=True, eq=False)
+class LoopStep:
+    """One map of the loop.
+
+    Attributes:
+        map: 1, 2, ...
+        signals: (N,) commanded.
+        error: measured minus wanted.
+        max_zernike: largest coefficient error beyond tilt, m.
+        rms: sag error at the sampling points, piston and tilt removed, m.
+        overflow: of the command, see `Command`.
+    """
+
+    map: int
+    signals: Floats
+    error: Shape
+    max_zernike: float
+    rms: float
+    overflow: float
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResult:
+    """How a loop ended.
+
+    Attributes:
+        best: the step with the smallest coefficient error.
+        steps: all, in order.
+        converged: whether the best is within the tolerance.
+        signals: (N,) what the mirror is left with.
+        restored: the last command was clearly worse than the best, which was written again at the end, unmeasured;
+            because of hysteresis the surface need not be the same as before.
+    """
+
+    best: LoopStep
+    steps: tuple[LoopStep, ...]
+    converged: bool
+    signals: Floats
+    restored: bool
+
+    @property
+    def maps(self) -> int:
+        """Maps taken."""
+        return len(self.steps)
+
+
+class StoppedLoop(Cancelled):
+    """The loop was asked to stop; `steps` holds what was measured until then."""
+
+    def __init__(self, steps: tuple[LoopStep, ...]) -> None:
+        super().__init__(f"cancelled after {len(steps)} maps; the mirror holds the last command")
+        self.steps = steps
+
+
+def _response(model: InfluenceModel, change: Floats) -> Shape:
+    """What the model says of a change of signals."""
+    return Shape(model.influence_zernike @ change, model.influence_sag @ change)
+
+
+class _Foresight:
+    """Drift until the next map: the loop's first move grows by a share per decade of the time since it was made."""
+
+    def __init__(self, creep: Creep, model: InfluenceModel, first: Floats) -> None:
+        self._creep = creep
+        self._move = _response(model, first - creep.previous)
+        self._began = self._last = creep.now()
+
+    def drift(self) -> Shape:
+        """Change of the surface from the map just taken to the next, which will take as long as this one did."""
+        now = self._creep.now()
+        age = max(now - self._began, 1e-3)
+        decades = math.log10(1.0 + max(now - self._last, 0.0) / age)
+        self._last = now
+        factor = self._creep.share * decades
+        return Shape(factor * self._move.coefficients, factor * self._move.sag)
+
+
+def response_ratio(asked: Shape, seen: Shape) -> float:
+    """Share of a change that was seen, by least squares over the coefficients beyond tilt; NaN when too little moved.
+
+    Coefficients count by their rms sag.
+    """
+    factors = TERM_RMS[FREE : len(asked.coefficients)]
+    wanted, got = factors * asked.coefficients[FREE:], factors * seen.coefficients[FREE:]
+    power = float(wanted @ wanted)
+    return float(wanted @ got) / power if math.sqrt(power) >= CHANGE_MIN else math.nan
+
+
+def converge(
+    solver: Solver,
+    target: FocusTarget,
+    plant: Plant,
+    options: LoopOptions | None = None,
+    *,
+    start: Floats | None = None,
+    creep: Creep | None = None,
+    on_step: Callable[[LoopStep], None] = lambda step: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> LoopResult:
+    """Bring the surface to `target`.
+
+    Args:
+        start: (N,) signals to begin with; None = the solver's open-loop command.
+        creep: to foresee creep by; None = do not.
+        on_step: called after each map.
+
+    Raises:
+        TargetError: no such surface exists over the aperture.
+        StoppedLoop: `cancelled()` became true, or the plant was cancelled while settling.
+        BenchError: the mirror or the interferometer failed.
+        ValueError: maps of another kind than the calibration's.
+    """
+    options = options or LoopOptions()
+    model = solver.model
+    wanted = target_shape(target, model)
+    command = solver.solve(wanted)
+    signals, overflow = (command.signals, command.overflow) if start is None else (start, 0.0)
+    foresight = _Foresight(creep, model, signals) if creep is not None and creep.share > 0.0 else None
+    steps: list[LoopStep] = []
+    damping, scale = 1.0, 1.0
+    drift = _response(model, np.zeros_like(signals))
+    while True:
+        if cancelled():
+            raise StoppedLoop(tuple(steps))
+        plant.apply(signals)
+        if not plant.settle():
+            raise StoppedLoop(tuple(steps))
+        number = len(steps) + 1
+        measured = plant.measure(f"converge {number}")
+        error = measured_shape(measured.coefficients, measured.sag, model) - wanted
+        step = LoopStep(number, signals, error, error.max_zernike, rms_sag(error, model), overflow)
+        if steps:
+            asked = _response(model, signals - steps[-1].signals)
+            ratio = response_ratio(asked, error - steps[-1].error - drift)
+            if math.isfinite(ratio):
+                scale = float(np.clip(1.0 / ratio, SCALE_MIN, SCALE_MAX)) if ratio > 0.0 else SCALE_MIN
+            if step.max_zernike > steps[-1].max_zernike + CHANGE_MIN:
+                damping = max(0.5 * damping, DAMPING_MIN)
+        steps.append(step)
+        on_step(step)
+        best = min(steps, key=lambda taken: taken.max_zernike)
+        converged = best.max_zernike <= options.tolerance
+        used_up = number >= options.max_maps
+        restored = step.max_zernike > RESTORE_RATIO * best.max_zernike and (converged or used_up)
+        if restored:
+            signals = best.signals
+            break
+        if converged or (used_up and not options.correct_last):
+            break
+        if foresight is not None:
+            drift = foresight.drift()
+        better = solver.correct(signals, error + drift)
+        # Beyond the full step only as far as the limits go.
+        moved = solver.limited(signals + scale * damping * (better.signals - signals))
+        signals, overflow = moved.signals, max(better.overflow, moved.overflow)
+        if used_up:
+            break
+    if signals is not steps[-1].signals:
+        plant.apply(signals)
+        plant.settle()
+    return LoopResult(best, tuple(steps), converged, signals, restored)

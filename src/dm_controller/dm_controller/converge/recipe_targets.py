@@ -1,0 +1,48 @@
+"""Which shapes recipes can be built for: checked before anything moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+from dm_common.recipes import RecipeError
+from dm_controller.planner import Planner
+from dm_controller.recipes import SAME_CURVATURE
+from dm_controller.target import FocusTarget
+
+
+class UnreachableError(RecipeError):
+    """The limits of the actuators deny the shape."""
+
+
+def recipe_targets(
+    curvatures: Sequence[float], conic_constant: float, loop: Planner, error_max: float
+) -> list[FocusTarget]:
+    """The shapes to build recipes for, by rising curvature, checked before anything moves.
+
+    Args:
+        error_max: largest coefficient error, m, that the model may leave.
+
+    Raises:
+        RecipeError: a curvature that is not finite or asked for twice, naming it.
+        UnreachableError: one out of reach.
+        TargetError: no such surface exists over the aperture.
+    """
+    for place, curvature in enumerate(curvatures):
+        if not math.isfinite(curvature):
+            raise RecipeError(f"curvatures[{place}] = {curvature}: must be a finite number")
+    ordered = sorted(float(curvature) for curvature in curvatures)
+    for one, next_one in pairwise(ordered):
+        if next_one - one <= SAME_CURVATURE:
+            raise RecipeError(f"curvatures: {one:+.4f} 1/m is there twice; each recipe once")
+    targets = [FocusTarget(curvature, conic_constant) for curvature in ordered]
+    for target in targets:
+        left = loop.mirror.plan(target).max_zernike
+        if left > error_max:
+            low, high = loop.mirror.reachable_range(target, error_max)
+            raise UnreachableError(
+                f"curvature = {target.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error of "
+                f"{left * 1e9:.1f} nm (allowed {error_max * 1e9:.1f} nm); reachable: {low:+.4f} to {high:+.4f} 1/m"
+            )
+    return targets

@@ -1,0 +1,277 @@
+"""A calibrated mirror: predicts the surface of a command and finds the command of a surface, before anything moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.optics.zernike import TERM_RMS, basis
+from dm_controller.closed_form import ClosedForm
+from dm_controller.solvers.bounded import BoundedProgramme, Limits
+from dm_controller.target import FocusTarget
+
+#: Piston and the two tilts are free: focus does not care, and an interferometer cannot see piston.
+FREE_TERMS = 3
+#: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
+#: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
+COEFFICIENT_WEIGHT = 100.0
+#: Combinations of coefficients that the actuators move less than this, relative to the one they move most, cannot be
+#: made equal to anything: with 19 actuators 3 of 18 stand below 2e-4, the others above 0.09; with 37 all above 0.1.
+LEAST_AUTHORITY = 0.01
+#: Ridge on the signals, as a share of a typical actuator's rms response. On a PDM30-37 twin it costs less than 1 % of
+#: the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
+RIDGE_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class InfluenceModel:
+    """What a calibration says of a mirror; see dm_msgs/Calibration for the fields.
+
+    Shapes: N actuators, K Zernike terms, P sampling points.
+
+    Raises:
+        ValueError: shapes disagree or a number is not finite.
+    """
+
+    aperture_radius: float
+    influence_zernike: NDArray[np.float64]  # (K, N) m per unit signal
+    zernike_offset: NDArray[np.float64]  # (K,) m
+    sample_x: NDArray[np.float64]  # (P,)
+    sample_y: NDArray[np.float64]
+    sample_weight: NDArray[np.float64]  # (P,) sums to 1
+    influence_sag: NDArray[np.float64]  # (P, N) m per unit signal
+    sag_offset: NDArray[np.float64]  # (P,) m
+    held_out_rms: float  # m
+    held_out_max_zernike: float  # m
+
+    def __post_init__(self) -> None:
+        terms, actuators = self.influence_zernike.shape
+        points = len(self.sample_x)
+        expected = {
+            "zernike_offset": (terms,),
+            "sample_y": (points,),
+            "sample_weight": (points,),
+            "influence_sag": (points, actuators),
+            "sag_offset": (points,),
+        }
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"calibration: {name} has shape {getattr(self, name).shape}, must be {shape}")
+        for name in ("influence_zernike", "sample_x", *expected):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"calibration: {name} holds values that are not finite")
+        if not self.aperture_radius > 0:
+            raise ValueError(f"calibration: aperture_radius = {self.aperture_radius:g}: must be positive")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A command and what it is expected to do.
+
+    Lengths in m; `lower` and `upper` are 95 % bounds that include the calibration's held-out error.
+    """
+
+    signals: NDArray[np.float64]
+    rms: float
+    rms_lower: float
+    rms_upper: float
+    max_zernike: float
+    max_zernike_upper: float
+    saturated: NDArray[np.bool_]
+
+
+class Commanded(NamedTuple):
+    """A command and the largest coefficient error that it leaves, m; `judged()` works out the rest.
+
+    Attributes:
+        signals: (N,).
+    """
+
+    signals: NDArray[np.float64]
+    max_zernike: float
+    judged: Callable[[], Plan]
+
+
+def rms_bounds(rms: float, spread: float) -> tuple[float, float]:
+    """95 % interval of an rms, m, when an independent error with the rms `spread` (m) comes on top, in squares."""
+    reach = (1.96 * spread) ** 2
+    return math.sqrt(max(rms**2 - reach, 0.0)), math.sqrt(rms**2 + reach)
+
+
+def coefficient_rows(influence: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K - 3, K - 3) rows that weigh coefficients beyond tilt: COEFFICIENT_WEIGHT where the actuators have authority.
+
+    Args:
+        influence: (K - 3, N) m per unit signal.
+    """
+    rms = TERM_RMS[FREE_TERMS : FREE_TERMS + len(influence)]
+    modes, authority, _ = np.linalg.svd(rms[:, None] * influence)
+    weak = np.ones(len(influence), dtype=np.bool_)
+    weak[: len(authority)] = authority < LEAST_AUTHORITY * authority[0]
+    if not weak.any():
+        return COEFFICIENT_WEIGHT * np.eye(len(influence))
+    # Without authority a unit is the rms sag it stands for, as in the rows of the sag below.
+    rows: NDArray[np.float64] = np.where(weak, 1.0, COEFFICIENT_WEIGHT)[:, None] * modes.T * rms
+    return rows
+
+
+class CalibratedMirror:
+    """Solves focus targets on an influence model inside limits.
+
+    The command makes the coefficients beyond tilt equal to the wanted ones and the sag beyond the terms as small as
+    possible, with piston and tilt free, inside the limits; where the limits forbid equality it is the closest in the
+    weighted least-squares sense. A mirror of few actuators moves fewer combinations of coefficients than there are; the
+    others count as the sag they are (measured with 19 actuators: 8 nm rms are left instead of 97, and no signal
+    saturates). A small ridge keeps actuators that the aperture hardly sees from running to their
+    limits for nothing.
+
+    Attributes:
+        matrix: (K - 3 + P, N), `rows` of the influence function.
+        sag_root: (N, N), m: its product with signals is as long as their rms sag, piston and tilt removed.
+    """
+
+    def __init__(self, model: InfluenceModel, limits: Limits) -> None:
+        self.model = model
+        self.limits = limits
+        self._weights = np.sqrt(model.sample_weight)
+        self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
+        self._tilt_free = self._terms[:, :FREE_TERMS]
+        self._coefficient_rows = coefficient_rows(model.influence_zernike[FREE_TERMS:])
+        self.matrix = self.rows(model.influence_zernike, model.influence_sag)
+        reduced = self._reduce(model.influence_sag, self._tilt_free)
+        self.sag_root: NDArray[np.float64] = np.linalg.qr(reduced)[1]
+        response = np.linalg.norm(reduced, axis=0)
+        self._programme = BoundedProgramme(self.matrix, limits, ridge=(RIDGE_SHARE * float(np.median(response))) ** 2)
+        self._closed_form = ClosedForm(
+            model.aperture_radius,
+            (model.sample_x, model.sample_y),
+            model.zernike_offset,
+            model.sag_offset,
+            lambda coefficients, sag: self._programme.unlimited(self.rows(coefficients, sag)),
+            self._errors,
+        )
+        self._range_cached = lru_cache(maxsize=64)(self._find_range)
+
+    def _reduce(self, sag: NDArray[np.float64], removed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weighted sag (P,) or (P, N) with the span of `removed` (P, k, orthonormal) projected out."""
+        weighted = (sag.T * self._weights).T
+        result: NDArray[np.float64] = weighted - removed @ (removed.T @ weighted)
+        return result
+
+    def rows(self, coefficients: NDArray[np.float64], sag: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
+
+        Args:
+            coefficients: (K,) m, or (K, N), a surface in each column.
+            sag: (P,) or (P, N) m.
+
+        Returns:
+            (K - 3 + P,) or (K - 3 + P, N).
+        """
+        weighted = self._coefficient_rows @ coefficients[FREE_TERMS:]
+        return np.concatenate([weighted, self._reduce(sag, self._terms)])
+
+    def solve(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The signals (N,) inside the limits whose `matrix @ signals` comes nearest to `rows`.
+
+        Raises:
+            ValueError: another number of rows than `matrix` has, or not finite.
+        """
+        return self._programme.solve(rows)
+
+    def plan(self, target: FocusTarget) -> Plan:
+        """Find the command for `target` and predict its error.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        return self.command(target).judged()
+
+    def command(self, target: FocusTarget) -> Commanded:
+        """Find the command for `target`, and leave the rest of its prediction for later.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        found = self._closed_form.find(target)
+        if found is not None and self.limits.allow(found.signals):
+            signals, largest, remaining = found
+            return Commanded(
+                signals, largest, lambda: self._plan(signals, math.sqrt(float(remaining @ remaining)), largest)
+            )
+        coefficients, sag = self._wanted(target)
+        plan = self._judged(self.solve(self.rows(coefficients, sag)), coefficients, sag)
+        return Commanded(plan.signals, plan.max_zernike, lambda: plan)
+
+    def predict(self, target: FocusTarget, signals: NDArray[np.float64]) -> Plan:
+        """What `signals` (N,) are expected to do when `target` is wanted.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        return self._judged(signals, *self._wanted(target))
+
+    def _wanted(self, target: FocusTarget) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficients (K,) and sag (P,) of `target` less those at zero signals, m."""
+        model = self.model
+        coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
+        return coefficients, target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
+
+    def _judged(
+        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64], sag: NDArray[np.float64]
+    ) -> Plan:
+        zernike_error, sag_error = self._errors(signals, coefficients, sag)
+        return self._plan(signals, float(np.linalg.norm(sag_error)), float(np.abs(zernike_error).max()))
+
+    def _errors(
+        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64], sag: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Coefficient errors beyond tilt (K - 3,) and weighted sag errors (P,), piston and tilt removed, or columns."""
+        model = self.model
+        zernike_error = model.influence_zernike[FREE_TERMS:] @ signals - coefficients[FREE_TERMS:]
+        return zernike_error, self._reduce(model.influence_sag @ signals - sag, self._tilt_free)
+
+    def _plan(self, signals: NDArray[np.float64], rms: float, largest: float) -> Plan:
+        lower, upper = rms_bounds(rms, self.model.held_out_rms)
+        return Plan(
+            signals=signals,
+            rms=rms,
+            rms_lower=lower,
+            rms_upper=upper,
+            max_zernike=largest,
+            max_zernike_upper=largest + self.model.held_out_max_zernike,
+            saturated=self.limits.at_limit(signals),
+        )
+
+    def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
+        """Smallest and largest curvature [1/m] with the target's conic constant and added terms that the limits permit.
+
+        Reachable means: the model's largest coefficient error stays below `tolerance` [m]. Returns (nan, nan) when not
+        even curvature 0 is (for example with large added terms).
+        """
+        return self._range_cached(target.with_curvature(0.0), tolerance)
+
+    def _find_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
+        if self.plan(target).max_zernike > tolerance:
+            return (float("nan"), float("nan"))
+        # Beyond this the stroke of all actuators together could not follow (defocus of a sphere is c r^2 / 4).
+        defocus_stroke = float(np.abs(self.model.influence_zernike[3]).sum())
+        far = 4.0 * (self.limits.high - self.limits.low) * defocus_stroke / self.model.aperture_radius**2
+        return (self._bisect(target, -far, tolerance), self._bisect(target, far, tolerance))
+
+    def _bisect(self, target: FocusTarget, far: float, tolerance: float) -> float:
+        """The largest reachable curvature between 0 and `far`: one edge, since the programme is convex."""
+        near = 0.0
+        while abs(far - near) > 1e-5:
+            middle = 0.5 * (near + far)
+            if self.plan(target.with_curvature(middle)).max_zernike <= tolerance:
+                near = middle
+            else:
+                far = middle
+        return near

@@ -1,0 +1,242 @@
+"""Open loop that remembers: from a target and the state of the actuators to a command, with what it is expected to do.
+
+The influence function acts on effective signals; the bounded programme finds those of the target, the inverse of the
+memory law the command that brings them about from where the mirror stands. Holding the shape is the same inversion
+again, a little later: creep has changed what the same signals do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.hysteresis.inverse import invert
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.hysteresis.prepared_inverse import PreparedInverse
+from dm_controller.mirror_model import FREE_TERMS, CalibratedMirror, Plan, rms_bounds
+from dm_controller.solvers.bounded import Limits
+from dm_controller.target import FocusTarget
+
+Floats = NDArray[np.float64]
+
+#: When a shape is to be right unless configured otherwise, s after the way.
+SETTLE_S = 0.05
+#: Draws for the 95 % quantile of the largest of many errors.
+DRAWS = 4000
+#: Shortest time after a move at which a calibration sees the surface, s: one map takes about that long. Creep of less
+#: age is extrapolated.
+YOUNGEST_MAP_S = 1.0
+#: Uncertainty of that extrapolation.
+YOUNG_SHARE = 0.1
+#: Part of the expected error beyond which effective signals that a limit denies count, normalised.
+MISSED_MAX = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisFigures:
+    """What a calibration says of its memory law; fields as in dm_msgs/ActuatorHysteresis."""
+
+    law: HysteresisModel
+    zernike_sigma: Floats
+    held_out_max_zernike: float
+    unknown_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """A planned move.
+
+    Attributes:
+        signals: (N,) what the electronics get.
+        effective: (N,) effective signals aimed at: what holding the shape means.
+        duration: s that the way takes at the slew rate.
+        max_zernike: m, expected largest coefficient error.
+    """
+
+    signals: Floats
+    effective: Floats
+    duration: float
+    max_zernike: float
+    _predict: Callable[[], Plan]
+
+    @cached_property
+    def plan(self) -> Plan:
+        """Command and prediction, worked out when first asked for: a command need not wait for it."""
+        return self._predict()
+
+
+class Planner:
+    """Plans moves of one calibrated mirror.
+
+    Args:
+        mirror: its influence function acts on effective signals.
+        memory: None = the mirror's memory is not identified: effective signals are signals.
+        slew_rate: of the signals, 1/s; infinite = moves take no time.
+    """
+
+    def __init__(
+        self, mirror: CalibratedMirror, hysteresis: HysteresisFigures | None = None, slew_rate: float = math.inf
+    ) -> None:
+        self.mirror, self.hysteresis, self.slew_rate = mirror, hysteresis, slew_rate
+        self.law = hysteresis.law if hysteresis is not None else HysteresisModel.linear()
+        self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[FREE_TERMS:])
+        self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
+        self._prepared: PreparedInverse | None = None
+
+    def prepare(self, state: HysteresisState) -> None:
+        """Work out now what plans from exactly this `state`, of a mirror at rest, will need."""
+        limits = self.mirror.limits
+        if self.hysteresis is not None and self.law.remembers:
+            self._prepared = PreparedInverse(self.law, state, limits.low, limits.high)
+
+    def plan(
+        self,
+        target: FocusTarget,
+        state: HysteresisState | None,
+        time: float,
+        known: bool = True,
+        effective: Floats | None = None,
+        ahead: float = 0.0,
+        error: float | None = None,
+    ) -> Move:
+        """The move to `target` that begins at `time` (s) from `state`.
+
+        Args:
+            state: None = unknown altogether; then the mirror is taken to be degaussed.
+            known: whether the state can be trusted; if not, the bounds are widened.
+            effective: (N,) effective signals to aim at instead of the model's own (a recipe).
+            ahead: s after the way at which the shape is to be right; creep is quickest just after a move.
+            error: m, 95 % bound of the largest coefficient error under `effective`, where it was measured.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        limits = self.mirror.limits
+        if effective is None:
+            aim, largest, judged = self.mirror.command(target)
+        else:
+            given = self.mirror.predict(target, effective)
+            aim, largest, judged = effective, given.max_zernike, lambda: given
+        if error is not None:
+            largest = min(largest, error)
+        travel = 0.0
+        if state is not None:
+            travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
+        if self.hysteresis is None:
+
+            def predict_at_once() -> Plan:
+                plan = judged()
+                return plan if error is None else replace(plan, max_zernike=largest, max_zernike_upper=error)
+
+            return Move(aim, aim, travel, largest, predict_at_once)
+        if state is None:
+            state, known = self.law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
+        # A move counts from its last write; older creep goes on during the way.
+        begun, arrival = state, time + travel
+        signals, missed = self._inverted(begun, arrival, aim, ahead)
+        if missed is not None and np.abs(missed).max() > MISSED_MAX and effective is None:
+            short = self.mirror.predict(target, aim - missed)
+            largest, judged = short.max_zernike, lambda: short
+
+        def predict() -> Plan:
+            plan = judged()
+            if error is not None:
+                plan = replace(plan, max_zernike=min(plan.max_zernike, error), max_zernike_upper=error)
+            # But for creep, how far the actuators go.
+            step = (aim if missed is None else aim - missed) - self.law.effective(self.law.advance(begun, arrival))
+            return self._bounded(plan, signals, known, self._young_creep(step, ahead), error)
+
+        return Move(signals, aim, travel, largest, predict)
+
+    def _inverted(
+        self, state: HysteresisState, arrival: float, aim: Floats, ahead: float
+    ) -> tuple[Floats, Floats | None]:
+        """Signals (N,) for the effective signals `aim`, and what limits make them miss; None = nothing."""
+        limits, ready = self.mirror.limits, self._prepared
+        if ready is not None and ready.state is state:
+            found = ready.invert(arrival, aim, ahead)
+            if found is not None and limits.allow_neighbours(found):
+                return found, None
+        at = self.law.advance(state, arrival)
+        inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
+        if limits.allow_neighbours(inverted.signals):
+            return inverted.signals, inverted.missed
+        return self._within_neighbours(inverted.signals, at, aim)
+
+    def hold(self, state: HysteresisState, time: float, effective: Floats, ahead: float = 0.0) -> Floats:
+        """(N,) signals, applied at `time` (s), that keep `effective` (N,) and are right `ahead` s later."""
+        limits = self.mirror.limits
+        at = self.law.advance(state, time)
+        signals = invert(self.law, at, effective, limits.low, limits.high, ahead).signals
+        return signals if limits.allow_neighbours(signals) else state.signals
+
+    def drift(self, state: HysteresisState, time: float, effective: Floats) -> float:
+        """Largest coefficient error (m) at `time` (s) of a mirror that should stand at `effective` (N,)."""
+        gap = self.law.effective(self.law.advance(state, time)) - effective
+        return self._largest(gap)
+
+    def _largest(self, effective: Floats) -> float:
+        """Largest coefficient beyond tilt, m, of effective signals (N,)."""
+        return float(np.abs(self._zernike @ effective).max())
+
+    def _young_creep(self, step: Floats, ahead: float) -> tuple[float, float]:
+        """What extrapolation adds to the largest coefficient error and to the rms sag error of a move, m.
+
+        Creep within `ahead` s of a step (N,) follows from the law, which no map younger than YOUNGEST_MAP_S confirms:
+        what it says of the time between is taken to be right to YOUNG_SHARE.
+        """
+        if not 0.0 < ahead < YOUNGEST_MAP_S:
+            return 0.0, 0.0
+        share = YOUNG_SHARE * self.law.creep_rate * math.log10(YOUNGEST_MAP_S / ahead)
+        return share * self._largest(step), share * float(np.linalg.norm(self.mirror.sag_root @ step))
+
+    def _bounded(
+        self, plan: Plan, signals: Floats, known: bool, young: tuple[float, float], error: float | None
+    ) -> Plan:
+        hysteresis = self.hysteresis
+        assert hysteresis is not None
+        rms_spread = self.mirror.model.held_out_rms
+        largest_spread = hysteresis.held_out_max_zernike if error is None else error - plan.max_zernike
+        if not known:
+            rms_spread = float(np.hypot(rms_spread, self._unknown_rms))
+            largest_spread = float(np.hypot(largest_spread, self.unknown_max_zernike))
+        rms_lower, rms_upper = rms_bounds(plan.rms, float(np.hypot(rms_spread, young[1] / 1.96)))
+        return replace(
+            plan,
+            signals=signals,
+            rms_lower=rms_lower,
+            rms_upper=rms_upper,
+            max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, young[0])),
+            saturated=self.mirror.limits.at_limit(signals),
+        )
+
+    def _within_neighbours(self, signals: Floats, at: HysteresisState, aim: Floats) -> tuple[Floats, Floats]:
+        """The part of the way from the present signals that keeps neighbours within their limit, and what it misses."""
+        limits = self.mirror.limits
+        a, b = limits.pairs.T
+        now, then = at.signals[a] - at.signals[b], signals[a] - signals[b]
+        room = limits.neighbour_difference - np.sign(then) * now
+        share = np.where(
+            np.abs(then) > limits.neighbour_difference, room / np.maximum(np.sign(then) * (then - now), 1e-12), 1.0
+        )
+        moved = at.signals + float(np.clip(share.min(), 0.0, 1.0)) * (signals - at.signals)
+        reached = self.law.position_at(at, moved) + self.law.creep(at)
+        return moved, aim - reached
+
+    def _unknown_history(self) -> tuple[float, float]:
+        """95 % quantile of the largest coefficient error, and rms sag error, when the history is not known; m."""
+        if self.hysteresis is None:
+            return 0.0, 0.0
+        model, sigma = self.mirror.model, self.hysteresis.unknown_sigma
+        miss = sigma * np.random.default_rng(0).standard_normal((DRAWS, model.influence_zernike.shape[1]))
+        largest = np.abs(miss @ model.influence_zernike[FREE_TERMS:].T).max(axis=1)
+        area = model.sample_weight[:, None] * np.square(model.influence_sag)
+        return float(np.quantile(largest, 0.95)), float(sigma * np.sqrt(area.sum()))
+
+
+__all__ = ["HysteresisFigures", "Limits", "Move", "Planner"]

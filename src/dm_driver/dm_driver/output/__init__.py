@@ -1,0 +1,1 @@
+"""output of dm_driver."""

@@ -1,0 +1,183 @@
+"""The whole virtual bench: drive unit, mirror, interferometer, camera and their ports, without ROS."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_simulation.camera import CameraConfig, SceneCamera
+from dm_simulation.electronics.drive_unit import DriveConfig, DriveUnit
+from dm_simulation.electronics.monitor import Monitor, MonitorConfig
+from dm_simulation.electronics.server import OFF, ElectronicsServer, PortsConfig
+from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
+from dm_simulation.interferometer.trigger_server import TriggerServer
+from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx
+from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
+from dm_simulation.mirror.zernike import Array
+
+
+@dataclass(frozen=True)
+class FilesConfig:
+    """Map files: where they go, "dat" or "datx", unit of .datx heights, intensity frame in .dat, seconds over which a
+    file grows (0: it appears whole), and the name of the part."""
+
+    folder: Path = Path("maps")
+    format: str = "datx"
+    datx_unit: str = "NanoMeters"
+    intensity: bool = False
+    slow_write: float = 0.0
+    part_name: str = "PDM30-37"
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """Everything the bench is made of. The seed fixes the gains, the initial figure and the noise of the n-th map."""
+
+    seed: int = 1
+    plate: PlateConfig = field(default_factory=PlateConfig)
+    piezo: PiezoConfig = field(default_factory=PiezoConfig)
+    interferometer: InterferometerConfig = field(default_factory=InterferometerConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    drive: DriveConfig = field(default_factory=DriveConfig)
+    ports: PortsConfig = field(default_factory=PortsConfig)
+    monitor: MonitorConfig = field(default_factory=MonitorConfig)
+    files: FilesConfig = field(default_factory=FilesConfig)
+    trigger_port: int = 1235
+
+
+class VirtualBench:
+    """A running bench.
+
+    Args:
+        now: the bench's time in seconds, monotonic but for clock jumps; creep goes by it.
+        on_event: called with (severe, text) from the bench's own threads.
+
+    Raises:
+        ValueError: a configuration that makes no sense, naming the parameter.
+        OSError: a port is taken.
+    """
+
+    def __init__(
+        self,
+        config: BenchConfig,
+        now: Callable[[], float] = time.monotonic,
+        on_event: Callable[[bool, str], None] = lambda severe, text: None,
+    ) -> None:
+        if config.files.format not in FORMATS or config.files.datx_unit not in UNITS:
+            raise ValueError(f"output_format: must be one of {', '.join(FORMATS)}, datx_unit one of {', '.join(UNITS)}")
+        self.config = config
+        self._now = now
+        self._on_event = on_event
+        seeds = np.random.SeedSequence(config.seed).spawn(5)
+        gains, figure, noise, scene, shot_noise = (np.random.default_rng(seed) for seed in seeds)
+        self.plate = Plate(config.plate)
+        self.unit = DriveUnit(config.drive)
+        if len(config.drive.wiring) != len(self.plate.x):
+            raise ValueError(f"wiring: {len(config.drive.wiring)} channels given, {len(self.plate.x)} are needed")
+        signals = self.unit.signals()
+        self.piezo = PiezoActuators(config.piezo, gains, signals, now())
+        self.interferometer = Interferometer(config.interferometer, self.plate, figure, noise)
+        self.camera: SceneCamera | None = None
+        if config.camera.rate > 0:
+            self.camera = SceneCamera(config.camera, config.interferometer.field_diameter, scene, shot_noise)
+        self.monitor = Monitor(config.monitor, neighbour_pairs(self.plate.x, self.plate.y), signals)
+        self.maps_written = 0
+        self._measuring = threading.Lock()
+        # At once, as on the instrument's PC: whoever watches the folder finds it before the first map.
+        config.files.folder.mkdir(parents=True, exist_ok=True)
+        self.electronics = ElectronicsServer(
+            self.unit, config.ports, self._on_frame, lambda text: on_event(text.startswith("malformed"), text)
+        )
+        try:
+            self.trigger = None if config.trigger_port == OFF else TriggerServer(config.trigger_port, self.measure)
+        except OSError:
+            self.electronics.close()
+            raise
+
+    @property
+    def endpoints(self) -> dict[str, int | str]:
+        """Actual ports and paths by name."""
+        trigger = {} if self.trigger is None else {"trigger_port": self.trigger.port}
+        return {**self.electronics.endpoints, **trigger}
+
+    def _on_frame(self) -> None:
+        signals = self.unit.signals()
+        self.piezo.apply(signals, self._now())
+        wrong = self.monitor.watch(signals)
+        if wrong:
+            self._on_event(True, wrong)
+
+    def displacement(self) -> Array:
+        """Base displacements (N,), m, at this moment, with all frames that have arrived."""
+
+        def sample() -> Array:
+            self.piezo.advance(self._now())
+            return self.piezo.displacement
+
+        return self.electronics.run(sample)
+
+    def photograph(self) -> NDArray[np.uint8]:
+        """An image (height, width) of the scene through the mirror as its surface truly is at this moment.
+
+        Raises:
+            ValueError: the bench has no camera.
+        """
+        if self.camera is None:
+            raise ValueError("camera.rate = 0: this bench has no camera")
+        return self.camera.expose(self.interferometer.surface(self.displacement()))
+
+    def measure(self, path: Path | None = None) -> Path:
+        """Measure the surface at this moment and write the map file; the suffix of `path` gives the format.
+
+        Returns:
+            The path of the file: `path`, else map_<nnnnnn> in the output folder.
+
+        Raises:
+            ValueError: `path` is not absolute, or has another suffix than .dat or .datx.
+            OSError: the file cannot be written.
+        """
+        files, instrument = self.config.files, self.interferometer
+        if path is not None:
+            _check_path(path)
+        with self._measuring:
+            displacement = self.displacement()
+            stamp = int(self._now())
+            sag = instrument.measure(displacement)
+            if path is None:
+                path = self._next_path()
+            facts = (sag, instrument.pitch, instrument.config.wavelength, stamp)
+            if path.suffix == ".dat":
+                content = encode_dat(*facts, intensity=files.intensity, part_name=files.part_name)
+            else:
+                content = encode_datx(*facts, unit=files.datx_unit, part_name=files.part_name)
+            deliver(content, path, files.slow_write)
+            self.maps_written += 1
+        return path
+
+    def _next_path(self) -> Path:
+        files, number = self.config.files, self.maps_written
+        while (path := files.folder.absolute() / f"map_{number:06d}.{files.format}").exists():
+            number += 1
+        return path
+
+    def close(self) -> None:
+        """Free all ports and end all threads."""
+        if self.trigger is not None:
+            self.trigger.close()
+        self.electronics.close()
+
+
+def _check_path(path: Path) -> None:
+    if not path.is_absolute():
+        raise ValueError(f"path {str(path)!r}: must be absolute")
+    if path.suffix.lstrip(".") not in FORMATS:
+        raise ValueError(f"path {str(path)!r}: must end in .dat or .datx")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"path {str(path)!r}: exists and is not a file")

@@ -1,0 +1,153 @@
+"""A camera that looks at a scene through the mirror: what focus does to its images, from the true surface.
+
+The mirror stands in the entrance pupil (or in its image by an afocal relay), a lens of fixed focus behind it. The
+wavefront error of an object is twice the sag of the surface, figure and print-through included, plus what defocus is
+left of the lens and the object's distance; the squared modulus of the pupil's Fourier transform is the point spread
+function (Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4), with which the object's texture is folded.
+Objects stand side by side; that a near one hides parts of a blurred far one is left out. Exposure is instantaneous.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+from scipy import fft
+
+from dm_simulation.mirror.zernike import Array
+
+#: Surfaces closer than this [m] over the whole pupil give the same image: creep at rest needs no new one.
+SAME_SURFACE = 1e-9
+#: Grey level of the scene's mean brightness.
+MEAN_GREY = 100.0
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """The camera and its scene, SI units.
+
+    Attributes:
+        rate: images per second of wall time; 0 = no camera.
+        width, height: image size, px.
+        pixel_pitch: m.
+        focal_length: of the lens, m.
+        rest_distance: object distance in focus while the mirror is flat, m; 0 = infinity.
+        relay_magnification: diameter of the beam on the mirror / diameter of the entrance pupil.
+        wavelength: m.
+        distances: of the objects, from left to right, m; 0 = infinity.
+        photons: electrons per pixel at the mean grey level: fixes the shot noise.
+    """
+
+    rate: float = 0.0
+    width: int = 320
+    height: int = 240
+    pixel_pitch: float = 3.45e-6
+    focal_length: float = 0.2
+    rest_distance: float = 10.0
+    relay_magnification: float = 1.0
+    wavelength: float = 550e-9
+    distances: Sequence[float] = (6.0, 15.0, 100.0)
+    photons: float = 5000.0
+
+
+class SceneCamera:
+    """Renders the scene for a surface.
+
+    Args:
+        config: camera and scene.
+        pupil_diameter: of the mirror that is used, m.
+        scene_rng: draws the textures, once.
+        noise_rng: draws the noise of each image.
+
+    Raises:
+        ValueError: a configuration that makes no sense, naming the parameter.
+    """
+
+    def __init__(
+        self,
+        config: CameraConfig,
+        pupil_diameter: float,
+        scene_rng: np.random.Generator,
+        noise_rng: np.random.Generator,
+    ) -> None:
+        if not config.distances or min(config.distances) < 0:
+            raise ValueError(f"camera.distances = {list(config.distances)}: must be one or more distances >= 0")
+        # An FFT over `extent` of the pupil plane gives a point spread function in pixels of the camera.
+        extent = config.wavelength * config.focal_length / config.pixel_pitch
+        if extent < pupil_diameter:
+            raise ValueError(
+                f"camera.pixel_pitch = {config.pixel_pitch:g} m: too coarse for the diffraction of a pupil of "
+                f"{pupil_diameter:g} m; at most {config.wavelength * config.focal_length / pupil_diameter:.3g} m"
+            )
+        self.config = config
+        self._noise = noise_rng
+        self._size = fft.next_fast_len(max(config.width, config.height) + 64)
+        pitch = extent / self._size
+        count = math.floor(pupil_diameter / pitch)
+        metres = (np.arange(count) - (count - 1) / 2) * pitch
+        self._field = metres / (pupil_diameter / 2)
+        squares = np.add.outer(metres**2, metres**2)
+        self._inside = squares <= (pupil_diameter / 2) ** 2
+        self._aperture = self._inside.astype(np.float32)
+        self._half_square = (squares / 2).astype(np.float32)
+        # What is left to focus for each object, as dioptre at the mirror: lens at rest minus object.
+        at_mirror = [(1 / distance if distance else 0.0) for distance in (config.rest_distance, *config.distances)]
+        self._defocus = (at_mirror[0] - np.array(at_mirror[1:])) / config.relay_magnification**2
+        self._textures = [fft.rfft2(part) for part in self._scene(scene_rng)]
+        self._last: tuple[Array, NDArray[np.float32]] | None = None
+
+    def _scene(self, rng: np.random.Generator) -> list[NDArray[np.float32]]:
+        """One textured strip per object, side by side on the periodic plane: mean about 1, detail at all scales."""
+        size, count = self._size, len(self.config.distances)
+        frequency = np.hypot(*np.meshgrid(fft.fftfreq(size), fft.rfftfreq(size), indexing="ij"))
+        frequency[0, 0] = np.inf
+        y, x = np.meshgrid(np.arange(size), np.arange(size), indexing="ij")
+        owner = np.minimum(x * count // self.config.width, count - 1)
+        strips = []
+        for number in range(count):
+            texture = fft.irfft2(fft.rfft2(rng.standard_normal((size, size))) / frequency, (size, size))
+            texture /= texture.std()
+            # Large shapes, so that the objects can be told apart by eye: bars, squares, rings.
+            across = x - (number + 0.5) * self.config.width / count
+            along = y - self.config.height / 2
+            shape = (np.sin(along / 3), np.sin(across / 5) * np.sin(along / 5), np.sin(np.hypot(across, along) / 3))
+            grey = np.clip(1 + 0.2 * texture + 0.3 * np.sign(shape[number % 3]), 0, None)
+            strips.append((grey * (owner == number)).astype(np.float32))
+        return strips
+
+    def wavefronts(self, surface: Array) -> list[NDArray[np.float32]]:
+        """Wavefront error (n, n) in m over the pupil for each object.
+
+        Args:
+            surface: sag in m as coefficients of T_p(y) T_q(x) over the pupil's square.
+        """
+        basis = chebyshev.chebvander(self._field, len(surface) - 1)
+        doubled = (2 * basis @ surface @ basis.T).astype(np.float32)
+        return [doubled + np.float32(defocus) * self._half_square for defocus in self._defocus]
+
+    def expose(self, surface: Array) -> NDArray[np.uint8]:
+        """An image (height, width) of the scene by a mirror of this surface (see `wavefronts`), 8 bit."""
+        if self._last is None or 4 * np.abs(surface - self._last[0]).sum() > SAME_SURFACE:
+            self._last = (surface, self._render(surface))
+        ideal = self._last[1]
+        noise = self._noise.standard_normal(ideal.shape, dtype=np.float32)
+        noisy = ideal + np.sqrt(ideal / np.float32(self.config.photons)) * noise
+        return np.clip(np.float32(MEAN_GREY) * noisy + 0.5, 0, 255).astype(np.uint8)
+
+    def _render(self, surface: Array) -> NDArray[np.float32]:
+        shape = (self._size, self._size)
+        total = np.zeros((self._size, self._size // 2 + 1), np.complex64)
+        wave = np.complex64(2j * np.pi / self.config.wavelength)
+        for wavefront, texture in zip(self.wavefronts(surface), self._textures, strict=True):
+            pupil = np.zeros(shape, np.complex64)
+            count = len(wavefront)
+            pupil[:count, :count] = self._aperture * np.exp(wave * wavefront)
+            amplitude = fft.fft2(pupil, overwrite_x=True)
+            transfer = fft.rfft2(amplitude.real**2 + amplitude.imag**2)
+            total += texture * (transfer / transfer[0, 0])
+        image = fft.irfft2(total, shape)[: self.config.height, : self.config.width]
+        return np.maximum(image, 0).astype(np.float32)

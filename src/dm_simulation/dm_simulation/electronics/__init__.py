@@ -1,0 +1,1 @@
+"""electronics of dm_simulation."""

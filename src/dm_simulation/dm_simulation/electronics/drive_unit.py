@@ -1,0 +1,121 @@
+"""The drive electronics behind the wire: DAC registers, output stage, amplifier, cables to the actuators."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_simulation.electronics import frames
+from dm_simulation.mirror.zernike import Array
+
+#: Actuator 1..37 of a PDM30-37 (trihex) -> connector channel, 0-based.
+TRIHEX = (
+    14, 16, 38, 23, 26, 1, 8, 10, 13, 37, 18, 36, 25, 28, 22, 7, 5, 2, 6,
+    19, 17, 32, 15, 11, 35, 34, 39, 33, 31, 21, 27, 29, 24, 9, 3, 4, 12,
+)  # fmt: skip
+EDAC40_FULL_SCALE = 65535
+DAC40_FULL_SCALE = 4095
+FACTORY_GLOBAL_OFFSET = 0x2000
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """What is soldered, stored and plugged.
+
+    Attributes:
+        dac_volts_at_zero, dac_volts_at_full: DAC output at code 0 and at full scale, as the unit's NVRAM has them, V.
+        amplifier_gain: actuator volts per DAC volt.
+        amplifier_min, amplifier_max: where the amplifier saturates, V at the actuator.
+        volts_min, volts_max: V at the actuator for signals -1 and +1.
+        wiring: connector channel (0-based) that actuator 1, 2, ... is really connected to.
+        channels: at the connector; EDAC40 and USB DAC-40 have 40.
+    """
+
+    dac_volts_at_zero: float = 0.0
+    dac_volts_at_full: float = 5.0
+    amplifier_gain: float = 80.0
+    amplifier_min: float = 0.0
+    amplifier_max: float = 400.0
+    volts_min: float = 0.0
+    volts_max: float = 300.0
+    wiring: Sequence[int] = TRIHEX
+    channels: int = frames.CHANNELS
+
+
+class DriveUnit:
+    """Outputs that hold their values until the next frame, whoever sent it.
+
+    After power-up every actuator is at 0 V, or as near as the DAC reaches.
+
+    Raises:
+        ValueError: inconsistent configuration, naming the parameter.
+    """
+
+    def __init__(self, config: DriveConfig) -> None:
+        self.config = config
+        wiring = np.asarray(config.wiring, int)
+        last = config.channels - 1
+        if len(np.unique(wiring)) != len(wiring) or wiring.min() < 0 or wiring.max() > last:
+            raise ValueError(f"wiring = {list(config.wiring)}: must be different channels from 0 to {last}")
+        for name, value in (
+            ("electronics.dac_volts_at_full - electronics.dac_volts_at_zero", self._span),
+            ("electronics.amplifier_gain", config.amplifier_gain),
+            ("volts.max - volts.min", config.volts_max - config.volts_min),
+            ("electronics.amplifier_max - electronics.amplifier_min", config.amplifier_max - config.amplifier_min),
+        ):
+            if value == 0:
+                raise ValueError(f"{name} = 0: must not be zero")
+        self._wiring = wiring
+        at_rest = np.clip(-config.dac_volts_at_zero / self._span, 0, 1)
+        #: Outputs as fractions of the DAC's range; a unit of few channels still has the registers of an EDAC40.
+        self.outputs: Array = np.full(max(frames.CHANNELS, config.channels), at_rest)
+        self._codes = np.zeros(frames.CHANNELS, np.int64)
+        self._offset = np.full(frames.CHANNELS, 0x8000, np.int64)
+        self._gain = np.full(frames.CHANNELS, 0xFFFF, np.int64)
+        self._global_offset = FACTORY_GLOBAL_OFFSET
+        self.settings_frames = 0
+
+    @property
+    def _span(self) -> float:
+        return self.config.dac_volts_at_full - self.config.dac_volts_at_zero
+
+    def take_edac40(self, frame: frames.EdacFrame) -> None:
+        """Carry out an EDAC40 frame. Only value frames belong to normal running; the others are counted."""
+        if frame.command == frames.EDAC40_VALUE:
+            self._codes[frame.channels] = frame.values
+        else:
+            self.settings_frames += 1
+            if frame.command == frames.EDAC40_OFFSET:
+                self._offset[frame.channels] = frame.values
+            elif frame.command == frames.EDAC40_GAIN:
+                self._gain[frame.channels] = frame.values
+            elif frame.command == frames.EDAC40_GLOBAL_OFFSET:
+                self._global_offset = int(frame.values[-1]) & 0x3FFF
+        if frame.command != frames.EDAC40_SAVE:
+            outputs = self.outputs[: frames.CHANNELS]
+            dac = self._codes * (self._gain + 1) // 65536 + self._offset - 0x8000
+            shift = 4 * (self._global_offset - FACTORY_GLOBAL_OFFSET)
+            touched = slice(None) if frame.command == frames.EDAC40_GLOBAL_OFFSET else frame.channels
+            outputs[touched] = ((np.clip(dac, 0, EDAC40_FULL_SCALE) - shift) / EDAC40_FULL_SCALE)[touched]
+
+    def take_dac40(self, codes: NDArray[np.int64]) -> None:
+        """Carry out a USB DAC-40 frame: codes (40,) by connector channel."""
+        self.outputs[: frames.CHANNELS] = codes / DAC40_FULL_SCALE
+
+    def take_shares(self, outputs: Array) -> None:
+        """Set all channels (C,) to shares of the DAC's range."""
+        self.outputs[: len(outputs)] = outputs
+
+    def actuator_volts(self) -> Array:
+        """Volts at the actuators (N,)."""
+        config = self.config
+        dac_volts = config.dac_volts_at_zero + self._span * self.outputs[self._wiring]
+        return np.clip(config.amplifier_gain * dac_volts, config.amplifier_min, config.amplifier_max)
+
+    def signals(self) -> Array:
+        """Normalised signals (N,) that the actuators really get; beyond -1..+1 when driven too far."""
+        config = self.config
+        return 2 * (self.actuator_volts() - config.volts_min) / (config.volts_max - config.volts_min) - 1

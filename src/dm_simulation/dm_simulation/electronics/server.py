@@ -1,0 +1,329 @@
+"""The units on the wire: an EDAC40 on loopback TCP and UDP with discovery, a serial unit on a pseudo-terminal.
+
+One thread owns all sockets and, through `run()`, everything that frames change: frames are carried out in the order in
+which they arrived, and whoever asks for the state sees every frame that was sent before the question.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import time
+import tty
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from dm_simulation.electronics import frames
+from dm_simulation.electronics.drive_unit import DriveUnit
+from dm_simulation.electronics.event_loop import EventLoop
+from dm_simulation.electronics.framed_unit import FramedConfig, FramedDecoder
+from dm_simulation.electronics.frames import FrameError
+
+T = TypeVar("T")
+
+LOOPBACK = "127.0.0.1"
+#: Port value that leaves a service out; 0 lets the system choose one.
+OFF = -1
+DISCOVERY_QUESTION = b"Discovery: Who is out there?"
+DISCOVERY_ANSWER = b"EDAC40".ljust(17) + b"02-00-00-DA-C4-00\r\n"
+
+
+@dataclass(frozen=True)
+class PortsConfig:
+    """Where the units are to be found: loopback ports (0 = any free one, -1 = off), the path of a symbolic link to the
+    pseudo-terminal ("" = off), and what is spoken there (by default a USB DAC-40)."""
+
+    tcp_port: int = 1234
+    udp_port: int = 1234
+    discovery_port: int = 30303
+    pty_link: str = ""
+    framed: FramedConfig = field(default_factory=FramedConfig)
+
+
+class ElectronicsServer:
+    """Serves one drive unit.
+
+    Args:
+        on_update: called in the server's thread after every frame that was carried out.
+        on_event: called with a line of text when something worth a log line happens.
+
+    Attributes:
+        endpoints: actual "tcp_port", "udp_port", "discovery_port" and "pty", as far as they are offered.
+        malformed: the last hundred reasons why something received was no frame; `malformed_count` counts all.
+
+    Raises:
+        OSError: a port is taken, naming it.
+    """
+
+    def __init__(
+        self,
+        unit: DriveUnit,
+        ports: PortsConfig,
+        on_update: Callable[[], None],
+        on_event: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._unit = unit
+        self._ports = ports
+        self._on_update = on_update
+        self._on_event = on_event
+        self.endpoints: dict[str, int | str] = {}
+        self.malformed: deque[str] = deque(maxlen=100)
+        self.malformed_count = 0
+        self.plugged = False
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
+        self._datagrams: list[socket.socket] = []
+        self._terminal: tuple[int, int] | None = None
+        self._terminal_name = ""
+        self._stream = bytearray()
+        self._serial = bytearray()
+        self._framed = FramedDecoder(ports.framed) if ports.framed.channels else None
+        self._loop = EventLoop("electronics", lambda error: on_event(f"{type(error).__name__}: {error}"))
+        try:
+            self._loop.run(self._plug)
+        except BaseException:
+            self.close()
+            raise
+
+    def run(self, task: Callable[[], T]) -> T:
+        """Run `task` in the server's thread, after every frame that had arrived, and return its value.
+
+        Raises:
+            OSError: the server is closed.
+        """
+        return self._loop.run(task)
+
+    def set_plugged(self, plugged: bool) -> None:
+        """Pull the data cable out or put it back on the same ports. The outputs hold their values meanwhile."""
+        if plugged != self.plugged:
+            self.run(self._plug if plugged else self._unplug)
+            self._on_event("plugged in" if plugged else "unplugged: outputs hold")
+
+    def close(self) -> None:
+        """Stop serving; free ports and link."""
+        self._loop.run(self._unplug)
+        self._loop.close()
+
+    def _plug(self) -> None:
+        try:
+            self._open_all()
+        except BaseException:
+            self._unplug()
+            raise
+        self.plugged = True
+
+    def _open_all(self) -> None:
+        def wanted(name: str, configured: int) -> int:
+            return int(self.endpoints.get(name, configured))
+
+        if self._ports.tcp_port != OFF:
+            self._listen(wanted("tcp_port", self._ports.tcp_port))
+        if self._ports.udp_port != OFF:
+            self._bind_udp("udp_port", wanted("udp_port", self._ports.udp_port), self._on_datagram)
+        if self._ports.discovery_port != OFF:
+            self._bind_udp("discovery_port", wanted("discovery_port", self._ports.discovery_port), self._on_discovery)
+        if self._ports.pty_link:
+            self._open_terminal(Path(self._ports.pty_link))
+
+    def _unplug(self) -> None:
+        self.plugged = False
+        self._drop_client("unplugged")
+        for endpoint in (*self._datagrams, self._listener):
+            if endpoint is not None:
+                self._loop.forget(endpoint)
+                endpoint.close()
+        self._datagrams.clear()
+        self._listener = None
+        if self._terminal is not None:
+            self._loop.forget(self._terminal[0])
+            for descriptor in self._terminal:
+                os.close(descriptor)
+            self._terminal = None
+            self._serial.clear()
+            link = Path(self._ports.pty_link)
+            if link.is_symlink() and str(link.readlink()) == self._terminal_name:
+                link.unlink()
+
+    def _reject(self, source: str, reason: str, data: bytes) -> None:
+        self.malformed_count += 1
+        text = f"{source}: {reason} ({data[:16].hex(' ')}{' ...' if len(data) > 16 else ''})"
+        self.malformed.append(text)
+        self._on_event(f"malformed frame, {text}")
+
+    def _take_edac40(self, frame: bytes) -> None:
+        self._unit.take_edac40(frames.decode_edac40(frame))
+        self._on_update()
+
+    # EDAC40 over TCP: one client. While it is connected the port is bound but nobody listens, so that a second one is
+    # refused as the unit does.
+
+    def _listen(self, port: int) -> None:
+        placeholder = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        placeholder.setblocking(False)
+        self._listener = placeholder
+        # A connection that was waiting when the port was closed holds its number for a moment longer.
+        _bind(placeholder, port, "electronics.tcp_port", patience_s=0.0 if self._client is None else 1.0)
+        self.endpoints["tcp_port"] = placeholder.getsockname()[1]
+        if self._client is None:
+            placeholder.listen(1)
+            self._loop.watch(placeholder, self._on_connect)
+
+    def _on_connect(self) -> None:
+        assert self._listener is not None
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return
+        self._loop.forget(self._listener)
+        self._listener.close()
+        client.setblocking(False)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._client = client
+        self._stream.clear()
+        self._loop.watch(client, self._on_stream)
+        self._listen(int(self.endpoints["tcp_port"]))
+        self._on_event("TCP client connected")
+
+    def _drop_client(self, reason: str) -> None:
+        if self._client is None:
+            return
+        self._loop.forget(self._client)
+        self._client.close()
+        self._client = None
+        if self._stream:
+            self._reject("TCP", "connection ended inside a frame", bytes(self._stream))
+            self._stream.clear()
+        self._on_event(f"TCP client gone: {reason}")
+
+    def _on_stream(self) -> None:
+        assert self._client is not None and self._listener is not None
+        try:
+            received = self._client.recv(65536)
+            # Acknowledge at once, as small network stacks do; Linux would wait 40 ms for more.
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            received, reason = b"", str(error)
+        else:
+            reason = "connection closed"
+        if not received:
+            self._drop_client(reason)
+            self._listener.listen(1)
+            self._loop.watch(self._listener, self._on_connect)
+            return
+        self._stream += received
+        try:
+            while len(self._stream) >= frames.EDAC40_HEADER:
+                length = frames.edac40_length(bytes(self._stream[: frames.EDAC40_HEADER]))
+                if len(self._stream) < length:
+                    return
+                frame = bytes(self._stream[:length])
+                del self._stream[:length]
+                self._take_edac40(frame)
+        except FrameError as error:
+            # A stream has no frame marks: after a bad header the rest of what has arrived means nothing.
+            self._reject("TCP", str(error), bytes(self._stream))
+            self._stream.clear()
+
+    def _bind_udp(self, name: str, port: int, handler: Callable[[socket.socket], None]) -> None:
+        endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        endpoint.setblocking(False)
+        self._datagrams.append(endpoint)
+        _bind(endpoint, port, f"electronics.{name}")
+        self.endpoints[name] = endpoint.getsockname()[1]
+        self._loop.watch(endpoint, lambda: handler(endpoint))
+
+    def _on_datagram(self, endpoint: socket.socket) -> None:
+        while True:
+            try:
+                datagram = endpoint.recv(2048)
+            except OSError:
+                return
+            try:
+                self._take_edac40(datagram)
+            except FrameError as error:
+                self._reject("UDP", str(error), datagram)
+
+    def _on_discovery(self, endpoint: socket.socket) -> None:
+        while True:
+            try:
+                question, sender = endpoint.recvfrom(2048)
+            except OSError:
+                return
+            if question == DISCOVERY_QUESTION:
+                endpoint.sendto(DISCOVERY_ANSWER, sender)
+            else:
+                self._reject("discovery", "unknown question", question)
+
+    def _open_terminal(self, link: Path) -> None:
+        leader, follower = os.openpty()
+        self._terminal = (leader, follower)  # the follower stays open, so that the outputs outlive the client
+        tty.setraw(follower)
+        os.set_blocking(leader, False)
+        self._terminal_name = os.ttyname(follower)
+        if link.is_symlink() and str(link.readlink()).startswith("/dev/pts/"):
+            link.unlink()  # left behind by a bench that was killed
+        try:
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(self._terminal_name)
+        except OSError as error:
+            raise OSError(f"electronics.pty_link = {str(link)!r}: {error}") from None
+        self.endpoints["pty"] = str(link)
+        self._loop.watch(leader, self._on_serial)
+
+    def _on_serial(self) -> None:
+        assert self._terminal is not None
+        try:
+            self._serial += os.read(self._terminal[0], 65536)
+        except OSError:
+            return
+        if self._framed is not None:
+            self._take_framed(self._framed)
+            return
+        while len(self._serial) >= frames.DAC40_FRAME:
+            frame = bytes(self._serial[: frames.DAC40_FRAME])
+            try:
+                codes = frames.decode_dac40(frame)
+            except FrameError as error:
+                # Look for the next start byte, as the unit does.
+                start = self._serial.find(frames.DAC40_START, 1)
+                skipped = bytes(self._serial[:start] if start > 0 else self._serial)
+                del self._serial[: len(skipped)]
+                self._reject("serial", str(error), skipped)
+                continue
+            del self._serial[: frames.DAC40_FRAME]
+            if codes is not None:
+                self._unit.take_dac40(codes)
+                self._on_update()
+
+    def _take_framed(self, decoder: FramedDecoder) -> None:
+        assert self._terminal is not None
+        while True:
+            try:
+                outputs = decoder.take(self._serial)
+            except FrameError as error:
+                self._reject("serial", str(error), b"")
+                continue
+            if outputs is None:
+                return
+            self._unit.take_shares(outputs)
+            self._on_update()
+            if decoder.reply:
+                os.write(self._terminal[0], decoder.reply)
+
+
+def _bind(endpoint: socket.socket, port: int, name: str, patience_s: float = 0.0) -> None:
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            return endpoint.bind((LOOPBACK, port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or time.monotonic() >= deadline:
+                raise OSError(f"{name} = {port}: {error}") from None
+        time.sleep(0.005)

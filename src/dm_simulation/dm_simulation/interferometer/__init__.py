@@ -1,0 +1,1 @@
+"""interferometer of dm_simulation."""

@@ -1,0 +1,175 @@
+"""The camera: what a Fizeau interferometer would report of the plate, with its noise, piston, tilt and dropouts.
+
+Everything smooth (influence functions to order 36, initial figure, low-order noise, piston, tilt) is a polynomial in
+x and y over the field, so a map is two thin matrix products, T(y) C T(x)^T with T the Chebyshev polynomials at the
+pixel centres: about 3 ms for 944 x 944 pixels, and no influence maps to keep in memory.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from dm_simulation.mirror import zernike
+from dm_simulation.mirror.plate import Plate
+from dm_simulation.mirror.zernike import Array
+
+WAVELENGTH = 632.8e-9
+
+
+@dataclass(frozen=True)
+class InterferometerConfig:
+    """The instrument, SI units.
+
+    Attributes:
+        pixels: the camera has pixels x pixels, the circular field touching its edges.
+        field_diameter: diameter of the field, m (the working aperture of the mirror).
+        figure_rms: initial figure of the unpowered mirror inside the field, orders 2-12 over the plate, seeded.
+        pixel_noise: rms of white noise per pixel, m.
+        low_order_noise: rms over the field of all Zernike terms of orders 2-5 together, drawn anew for every map, m.
+        piston_spread, tilt_spread: standard deviations of piston and of the edge sag of each tilt, per map, m.
+        specks: mean number of dropped single pixels per map.
+        blobs: number of dropped discs per map, of 3 to 16 pixels radius (scaled with the camera).
+        flip_x, flip_y, rotate_deg: the camera turns the picture anticlockwise by rotate_deg (0, 90, 180, 270), then
+            mirrors it left-right (flip_x) and upside down (flip_y).
+    """
+
+    pixels: int = 944
+    field_diameter: float = 0.022
+    wavelength: float = WAVELENGTH
+    figure_rms: float = 40e-9
+    pixel_noise: float = 1e-9
+    low_order_noise: float = 0.3e-9
+    piston_spread: float = 200e-9
+    tilt_spread: float = 300e-9
+    specks: int = 400
+    blobs: int = 6
+    flip_x: bool = False
+    flip_y: bool = False
+    rotate_deg: int = 0
+
+
+class Interferometer:
+    """The instrument in front of one plate.
+
+    Args:
+        figure_rng: draws the initial figure, once.
+        noise_rng: draws what differs from map to map.
+
+    Attributes:
+        pitch: m per pixel.
+        aperture: (pixels, pixels) bool, pixels whose centre is inside the field.
+    """
+
+    def __init__(
+        self,
+        config: InterferometerConfig,
+        plate: Plate,
+        figure_rng: np.random.Generator,
+        noise_rng: np.random.Generator,
+    ) -> None:
+        if config.field_diameter > plate.config.diameter:
+            raise ValueError(
+                f"interferometer.field_diameter = {config.field_diameter:g} m: "
+                f"must not exceed the plate, {plate.config.diameter:g} m"
+            )
+        if config.rotate_deg not in (0, 90, 180, 270):
+            raise ValueError(f"interferometer.rotate_deg = {config.rotate_deg}: must be 0, 90, 180 or 270")
+        self.config = config
+        self.pitch = config.field_diameter / config.pixels
+        self._noise = noise_rng
+        self._field_radius = config.field_diameter / 2
+        degree = plate.config.order
+
+        # Pixel centres in units of the field radius; row 0 is the top, y points up.
+        centres = (2 * np.arange(config.pixels) + 1) / config.pixels - 1
+        self.aperture: NDArray[np.bool_] = np.add.outer(centres**2, centres**2) <= 1
+        self._outside = ~self.aperture
+        self._columns = chebyshev.chebvander(centres, degree)
+        self._rows = self._columns[::-1].copy()
+
+        # Coefficients of products T_p(y) T_q(x) by interpolation at Chebyshev points, exact for polynomials.
+        nodes = chebyshev.chebpts1(degree + 1)
+        inverse = np.linalg.inv(chebyshev.chebvander(nodes, degree))
+        y, x = np.meshgrid(nodes, nodes, indexing="ij")
+
+        def interpolate(values: Array) -> Array:
+            return np.einsum("py,qx,yxk->kpq", inverse, inverse, values, optimize=True)
+
+        metres_x, metres_y = x * self._field_radius, y * self._field_radius
+        self._influence = interpolate(plate.influence_at(metres_x, metres_y))
+        # Over the field disc: piston, two tilts, then orders 2 to 5.
+        self._low_orders = interpolate(zernike.evaluate(x, y, zernike.terms_to_order(5)))
+        figure = zernike.terms_to_order(12)[3:]
+        shapes = zernike.evaluate(metres_x / plate.radius, metres_y / plate.radius, figure)
+        amplitudes = figure_rng.standard_normal(len(figure)) / np.array([term.n for term in figure]) ** 1.5
+        self._figure = interpolate((shapes @ amplitudes)[..., None])[0]
+        inside = self._evaluate(self._figure)[self.aperture]
+        self._figure *= config.figure_rms / np.sqrt(np.mean((inside - inside.mean()) ** 2))
+
+    def with_noise(self, noise_rng: np.random.Generator) -> Interferometer:
+        """This very instrument and plate, drawing what differs from map to map from `noise_rng`.
+
+        What never changes (polynomials, figure) is shared, not copied.
+        """
+        other = copy.copy(self)
+        other._noise = noise_rng
+        return other
+
+    def surface(self, displacement: Array) -> Array:
+        """The true surface over the field, without the instrument's noise, for bases at `displacement` (N,), m.
+
+        Returns:
+            Sag in m as coefficients (p, q) of T_p(y) T_q(x), x and y in units of the field's radius.
+        """
+        return np.tensordot(displacement, self._influence, 1) + self._figure
+
+    def _evaluate(self, coefficients: Array) -> Array:
+        return (self._rows @ coefficients) @ self._columns.T
+
+    def _camera(self, picture: Array) -> Array:
+        """The picture as the camera turns it."""
+        picture = np.rot90(picture, self.config.rotate_deg // 90)
+        if self.config.flip_x:
+            picture = picture[:, ::-1]
+        return picture[::-1] if self.config.flip_y else picture
+
+    def true_sag(self, displacement: Array) -> Array:
+        """The noise-free surface (pixels, pixels), m, as the camera shows it, NaN outside: for judging only."""
+        sag = self._evaluate(np.tensordot(displacement, self._influence, 1) + self._figure)
+        sag[self._outside] = np.nan
+        return self._camera(sag)
+
+    def measure(self, displacement: Array) -> Array:
+        """A map of the surface with spring bases at `displacement` (N,), m: (pixels, pixels), m, NaN = no data."""
+        config, rng = self.config, self._noise
+        low = np.empty(len(self._low_orders))
+        low[0] = config.piston_spread * rng.standard_normal()
+        low[1:3] = config.tilt_spread / 2 * rng.standard_normal(2)  # an orthonormal tilt is 2 at the edge
+        low[3:] = config.low_order_noise / np.sqrt(len(low) - 3) * rng.standard_normal(len(low) - 3)
+        sag = self._evaluate(
+            np.tensordot(displacement, self._influence, 1) + self._figure + np.tensordot(low, self._low_orders, 1)
+        )
+        noise = rng.standard_normal(sag.shape, dtype=np.float32)
+        noise *= np.float32(config.pixel_noise)
+        sag += noise
+        sag[self._outside] = np.nan
+        self._drop_out(sag)
+        return self._camera(sag)
+
+    def _drop_out(self, sag: Array) -> None:
+        """Lose single pixels (weak fringes) and a few discs (dust)."""
+        size, rng = self.config.pixels, self._noise
+        sag.flat[rng.integers(0, sag.size, rng.poisson(self.config.specks))] = np.nan
+        for _ in range(self.config.blobs):
+            row, column = rng.integers(0, size, 2)
+            radius = rng.uniform(3, 16) * size / 944
+            reach = int(radius) + 1
+            rows = slice(max(row - reach, 0), row + reach + 1)
+            columns = slice(max(column - reach, 0), column + reach + 1)
+            y, x = np.ogrid[rows.start : min(rows.stop, size), columns.start : min(columns.stop, size)]
+            sag[rows, columns][(y - row) ** 2 + (x - column) ** 2 <= radius**2] = np.nan

@@ -1,0 +1,1 @@
+"""mirror of dm_simulation."""

@@ -1,0 +1,158 @@
+"""Node `virtual_bench`: the digital twin of mirror, drive electronics and interferometer.
+
+Other nodes meet it as they meet hardware: on the wire and in map files. ROS carries only what a person at the bench
+would do: pull the plug (`~/power`), press the instrument's button (`~/trigger`), read the labels (`~/endpoints`); and
+the images of the camera behind the mirror (`image_raw`), which a driver of a real camera would publish.
+"""
+
+from __future__ import annotations
+
+import array
+import json
+import sys
+import threading
+import time
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from dm_common.ros import qos
+from dm_common.ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
+from dm_common.ros.executor import run_node
+from dm_common.ros.parameters import declare
+from dm_common.ros.worker import WorkerService
+from dm_simulation.bench import VirtualBench
+from dm_simulation.clock import FastClock
+from dm_simulation.parameters import TABLE, bench_config
+
+
+class VirtualBenchNode(Node):
+    """Runs one :class:`dm_simulation.bench.VirtualBench`."""
+
+    def __init__(self) -> None:
+        super().__init__("virtual_bench")
+        values = declare(self, TABLE)
+        speed = values["clock.speed"]
+        self._fast_clock = FastClock(speed) if speed > 0 else None
+        self._stop = threading.Event()
+        self.bench = VirtualBench(bench_config(values), self._now, self._on_event)
+
+        # Latched JSON object: the ports and paths really in use.
+        endpoints = self.create_publisher(String, "~/endpoints", qos.LATCHED)
+        endpoints.publish(String(data=json.dumps(self.bench.endpoints)))
+        WorkerService(self, Trigger, "~/trigger", self._trigger)
+        WorkerService(self, SetBool, "~/power", self._power)
+        Diagnostics(self, f"virtual {values['mirror.name']}", self._check)
+        self._ticker: threading.Thread | None = None
+        if self._fast_clock is not None:
+            # Reliable, depth 1: matches the best-effort subscriptions of all time sources and any stricter one.
+            self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=1))
+            self._ticker = threading.Thread(target=self._tick, args=(values["clock.period"],), daemon=True)
+            self._ticker.start()
+        self._photographer: threading.Thread | None = None
+        if self.bench.camera is not None:
+            # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
+            self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
+            self._photographer = threading.Thread(target=self._film, args=(1 / values["camera.rate"],), daemon=True)
+            self._photographer.start()
+        places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
+        law = f"{values['piezo.law']} {100 * values['piezo.hysteresis']:g} %, creep {100 * values['piezo.creep']:g} %"
+        self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; clock speed {speed:g}")
+
+    def _now(self) -> float:
+        if self._fast_clock is not None:
+            return self._fast_clock.now_ns() * 1e-9
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def _tick(self, period: float) -> None:
+        assert self._fast_clock is not None
+        while not self._stop.wait(period):
+            seconds, nanoseconds = divmod(self._fast_clock.now_ns(), 1_000_000_000)
+            self._clock_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+
+    def _film(self, period: float) -> None:
+        while not self._stop.wait(period - time.monotonic() % period):
+            seconds, nanoseconds = divmod(round(self._now() * 1e9), 1_000_000_000)
+            try:
+                picture = self.bench.photograph()
+            except OSError:  # the bench is closing
+                return
+            height, width = picture.shape
+            message = Image(height=height, width=width, encoding="mono8", step=width)
+            message.header.stamp, message.header.frame_id = Time(sec=seconds, nanosec=nanoseconds), "camera"
+            message.data = array.array("B", picture.tobytes())
+            self._image_publisher.publish(message)
+
+    def _on_event(self, severe: bool, text: str) -> None:
+        logger = self.get_logger()
+        if severe:
+            logger.warning(text, throttle_duration_sec=0.2)
+        else:
+            logger.info(text)
+
+    def _trigger(self, _request: Any, response: Any) -> Any:
+        try:
+            response.message = str(self.bench.measure())
+            response.success = True
+        except (OSError, ValueError) as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    def _power(self, request: Any, response: Any) -> Any:
+        try:
+            self.bench.electronics.set_plugged(request.data)
+            response.success = True
+            response.message = "plugged in" if request.data else "unplugged; the outputs hold"
+        except OSError as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    def _check(self) -> Health:
+        bench, record, electronics = self.bench, self.bench.monitor.record, self.bench.electronics
+        values = {
+            "plugged": electronics.plugged,
+            "frames": record.frames,
+            "malformed_frames": electronics.malformed_count,
+            "settings_frames": bench.unit.settings_frames,
+            "violations": record.violations,
+            "jumps": record.jumps,
+            "neighbour_violations": record.neighbour_violations,
+            "range_violations": record.range_violations,
+            "largest_jump": f"{record.largest_jump:.5f}",
+            "largest_neighbour_difference": f"{record.largest_neighbour_difference:.5f}",
+            "lowest_signal": f"{record.lowest_signal:.5f}",
+            "highest_signal": f"{record.highest_signal:.5f}",
+            "maps_written": bench.maps_written,
+            **bench.endpoints,
+        }
+        if record.violations:
+            return Health(ERROR, f"{record.violations} frames broke a limit", values)
+        if electronics.malformed_count or bench.unit.settings_frames:
+            return Health(WARN, "frames arrived that no driver should send", values)
+        if not electronics.plugged:
+            return Health(WARN, "unplugged", values)
+        return Health(OK, f"{record.frames} frames, {bench.maps_written} maps", values)
+
+    def make_safe(self) -> None:
+        """Free ports and threads before the node goes."""
+        self._stop.set()
+        if self._ticker is not None:
+            self._ticker.join(2)
+        if self._photographer is not None:
+            self._photographer.join(2)
+        self.bench.close()
+
+
+def main() -> int:
+    """Entry point of the executable `virtual_bench`."""
+    return run_node(VirtualBenchNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,25 @@
+from setuptools import find_packages, setup
+
+package_name = "dm_simulation"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+    ],
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest"]},  # tells `colcon test` to use pytest
+    zip_safe=True,
+    maintainer="Deformable mirror maintainers",
+    maintainer_email="maintainers@deformable-mirror.example",
+    description="Simulation of the optical bench: deformable mirror, drive electronics, interferometer and camera",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "virtual_bench = dm_simulation.virtual_bench_node:main",
+        ],
+    },
+)

@@ -1,0 +1,204 @@
+"""Hysteresis laws and creep of the virtual bench."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, PreisachMemory
+from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+
+Array = NDArray[np.float64]
+REMEMBERING = ("prandtl_ishlinskii", "preisach", "bouc_wen")
+RETURN_POINT = ("prandtl_ishlinskii", "preisach")
+signal = st.floats(-1, 1, allow_nan=False)
+
+
+def drive(law: Hysteresis, *signals: float) -> Array:
+    return np.array([law.move(np.array([u]))[0] for u in signals])
+
+
+@pytest.mark.parametrize("law", REMEMBERING)
+@pytest.mark.parametrize("fraction", [0.05, 0.10, 0.15])
+def test_loop_opens_by_the_stated_fraction_of_a_total_stroke_of_two(law: str, fraction: float) -> None:
+    hysteresis = Hysteresis(law, fraction, 1)
+    grid = np.linspace(-1, 1, 1501)
+    for _ in range(4):
+        rising, falling = drive(hysteresis, *grid), drive(hysteresis, *grid[::-1])[::-1]
+    stroke = rising[-1] - rising[0]
+    assert stroke == pytest.approx(2, rel=1e-3)
+    assert np.max(falling - rising) / stroke == pytest.approx(fraction, rel=2e-3)
+    assert np.all(falling - rising > -1e-9)  # the lag always has the same sense
+
+
+def test_without_hysteresis_the_law_is_a_straight_line() -> None:
+    grid = np.array([0.3, -0.7, 1.0, 0.2])
+    np.testing.assert_allclose(drive(Hysteresis("none", 0.1, 1), *grid), grid)
+    np.testing.assert_allclose(drive(Hysteresis("preisach", 0.0, 1), *grid), grid)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@settings(max_examples=25, deadline=None)
+@given(history=st.lists(signal, max_size=8), start=signal, stop=signal)
+def test_branches_are_monotone(law: str, history: list[float], start: float, stop: float) -> None:
+    hysteresis = Hysteresis(law, 0.1, 1)
+    branch = drive(hysteresis, *history, *np.linspace(start, stop, 40))[len(history) :]
+    assert np.all(np.diff(branch) * np.sign(stop - start) >= -1e-12)
+
+
+@pytest.mark.parametrize("law", REMEMBERING)
+@settings(max_examples=25, deadline=None)
+@given(turns=st.lists(signal, min_size=1, max_size=8), cuts=st.integers(2, 9))
+def test_rate_independence(law: str, turns: list[float], cuts: int) -> None:
+    """Only the turning points count, not in how many steps a move is made."""
+    at_once, in_steps = Hysteresis(law, 0.1, 1), Hysteresis(law, 0.1, 1)
+    last = 0.0
+    for turn in turns:
+        whole = drive(at_once, turn)[-1]
+        cut = drive(in_steps, *np.linspace(last, turn, cuts + 1)[1:])[-1]
+        assert cut == pytest.approx(whole, abs=1e-12)
+        last = turn
+
+
+@pytest.mark.parametrize("law", RETURN_POINT)
+@settings(max_examples=25, deadline=None)
+@given(history=st.lists(signal, max_size=6), low=signal, high=signal, inner=st.floats(0.01, 0.99))
+def test_return_point_memory(law: str, history: list[float], low: float, high: float, inner: float) -> None:
+    """A minor loop closes exactly, and wipes itself out: what follows is as if it had not been."""
+    high, low = max(high, low), min(high, low)
+    disturbed, plain = Hysteresis(law, 0.1, 1), Hysteresis(law, 0.1, 1)
+    before = drive(disturbed, *history, low, high)[-1]
+    turn = high - inner * (high - low)
+    after = drive(disturbed, turn, high)[-1]
+    assert after == pytest.approx(before, abs=1e-12)
+    drive(plain, *history, low, high)
+    onward = (low, 0.5 * (low + high), 1.0, -1.0)
+    np.testing.assert_allclose(drive(disturbed, *onward), drive(plain, *onward), atol=1e-12)
+
+
+def test_bouc_wen_has_no_return_point_memory() -> None:
+    hysteresis = Hysteresis("bouc_wen", 0.1, 1)
+    before = drive(hysteresis, -1, 1, -1, 1, -1, 0.5)[-1]
+    after = drive(hysteresis, 0.0, 0.5)[-1]
+    assert abs(after - before) > 1e-3
+
+
+@pytest.mark.parametrize("law", RETURN_POINT)
+def test_minor_loops_between_the_same_signals_are_congruent(law: str) -> None:
+    """Congruency holds for Preisach and Prandtl-Ishlinskii: the loops differ by a constant only."""
+    loops = []
+    for history in ([1.0], [-1.0], [1.0, -0.4], [-1.0, 0.9, -0.3]):
+        hysteresis = Hysteresis(law, 0.1, 1)
+        drive(hysteresis, *history, 0.1)
+        drive(hysteresis, 0.5, 0.1)
+        loop = drive(hysteresis, *np.linspace(0.1, 0.5, 21), *np.linspace(0.5, 0.1, 21))
+        loops.append(loop - loop[0])
+    for loop in loops[1:]:
+        np.testing.assert_allclose(loop, loops[0], atol=1e-12)
+    assert np.ptp(loops[0][:21] - loops[0][21:][::-1]) > 1e-4  # and they are loops
+
+
+def major_loop_asymmetry(law: str) -> float:
+    """How far the loop is from its own point reflection."""
+    hysteresis = Hysteresis(law, 0.1, 1)
+    grid = np.linspace(-1, 1, 201)
+    for _ in range(4):
+        rising, falling = drive(hysteresis, *grid), drive(hysteresis, *grid[::-1])
+    return float(np.max(np.abs(rising + falling - (rising + falling).mean())))
+
+
+def test_only_the_preisach_loop_is_asymmetric() -> None:
+    assert major_loop_asymmetry("prandtl_ishlinskii") < 1e-9
+    assert major_loop_asymmetry("bouc_wen") < 1e-3
+    assert major_loop_asymmetry("preisach") > 0.02
+
+
+def test_preisach_equals_a_crowd_of_relays() -> None:
+    """The definition itself: relays up above alpha = v + r, down below beta = v - r, weighted with the density."""
+    radii, centres = 128, 1200
+    r = (np.arange(radii) + 0.5) / radii
+    v = (np.arange(centres) + 0.5) / centres * 4 - 2
+    memory = PreisachMemory(1)
+    weight = memory.density(v[None, :], r[:, None]) * (4 / centres) / radii
+    up = np.repeat((v < 0)[None, :], radii, axis=0)
+    start = (weight * up).sum()
+    rng = np.random.default_rng(5)
+    for u in rng.uniform(-1, 1, 60):
+        up = np.where(u >= v + r[:, None], True, np.where(u <= v - r[:, None], False, up))
+        assert memory.move(np.array([u]))[0] == pytest.approx((weight * up).sum() - start, abs=2e-3)
+
+
+def test_unknown_laws_and_impossible_loops_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"piezo.law = 'magic'.*prandtl_ishlinskii"):
+        Hysteresis("magic", 0.1, 1)
+    with pytest.raises(ValueError, match=r"piezo.hysteresis = 0.9"):
+        Hysteresis("prandtl_ishlinskii", 0.9, 1)
+
+
+def rested(config: PiezoConfig, count: int = 1, signal: float = 0.0) -> PiezoActuators:
+    return PiezoActuators(config, np.random.default_rng(7), np.full(count, signal))
+
+
+LINEAR = PiezoConfig(gain_spread=0.0, law="none", hysteresis=0.0, creep=0.01)
+
+
+def test_stroke_and_gain_spread() -> None:
+    config = PiezoConfig(law="none", creep=0.0)
+    actuators = rested(config, 2000)
+    actuators.apply(np.full(2000, 1.0), 0.0)
+    high = actuators.displacement
+    actuators.apply(np.full(2000, -1.0), 0.0)
+    stroke = high - actuators.displacement
+    assert stroke.mean() == pytest.approx(8e-6, rel=0.005)
+    assert stroke.std() / stroke.mean() == pytest.approx(0.03, rel=0.1)
+    again = rested(config, 2000)
+    np.testing.assert_array_equal(again.gain, actuators.gain)
+
+
+def test_a_step_creeps_by_one_percent_per_decade() -> None:
+    actuators = rested(LINEAR)
+    actuators.apply(np.ones(1), 0.0)
+    step = actuators.displacement[0]
+    at = []
+    for time in (1.0, 10.0, 100.0, 1e3):
+        actuators.advance(time)
+        at.append(actuators.displacement[0] / step)
+    np.testing.assert_allclose(np.diff(at), 0.01, rtol=0.01)
+
+
+@settings(max_examples=25, deadline=None)
+@given(times=st.lists(st.floats(0, 1e4), min_size=1, max_size=10))
+def test_creep_does_not_depend_on_how_time_is_cut(times: list[float]) -> None:
+    steps, leap = rested(LINEAR), rested(LINEAR)
+    for actuators in (steps, leap):
+        actuators.apply(np.full(1, 0.7), 0.0)
+    for time in sorted(times):
+        steps.advance(time)
+    leap.advance(max(times))
+    assert steps.displacement[0] == pytest.approx(leap.displacement[0], rel=1e-12)
+
+
+def test_creep_superposes_and_dies_away_after_rest() -> None:
+    actuators = rested(LINEAR, signal=-1.0)
+    start = actuators.displacement[0]
+    actuators.advance(1e5)
+    assert actuators.displacement[0] == pytest.approx(start, rel=1e-12)  # rested: nothing moves
+    actuators.apply(np.ones(1), 1e5)
+    actuators.advance(1.1e5)
+    actuators.apply(np.full(1, -1.0), 1.1e5)
+    actuators.advance(1e8)
+    assert actuators.displacement[0] == pytest.approx(start, rel=1e-9)
+
+
+def test_a_clock_that_jumps_back_does_not_age_the_mirror() -> None:
+    actuators = rested(LINEAR)
+    actuators.apply(np.ones(1), 100.0)
+    actuators.advance(110.0)
+    before = actuators.displacement[0]
+    actuators.advance(5.0)
+    assert actuators.displacement[0] == before
+    actuators.advance(6.0)
+    assert actuators.displacement[0] > before

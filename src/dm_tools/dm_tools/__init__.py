@@ -1,0 +1,1 @@
+"""The dm command, bench console, recordings, security profile and generated documentation."""

@@ -1,0 +1,5 @@
+"""python -m dm_tools.cli."""
+
+from dm_tools.cli import main
+
+main()

@@ -1,0 +1,276 @@
+"""The ROS side of the console: one node on a thread of its own, the latest messages, and calls as coroutines."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import os
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import rclpy
+from action_msgs.srv import CancelGoal
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from dm_msgs.action import Calibrate, Converge, MoveFocus
+from dm_msgs.msg import (
+    ActuatorState,
+    Calibration,
+    Capabilities,
+    FocusState,
+    MirrorInfo,
+    SurfaceMapInfo,
+    ZernikeCoefficients,
+)
+from dm_msgs.srv import Degauss, Flatten, ListCalibrations, LoadCalibration, Measure, SetFocus, SetSignals
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from sensor_msgs.msg import Image
+
+from dm_common.messages import stamp_ns
+from dm_common.ros import qos
+from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.rosout import LogTail
+from dm_common.ros.worker import ServiceCallError, answers_arrive, call
+from dm_tools.console.external_goals import ExternalGoals
+from dm_tools.console.state_observer import Following
+
+TOPICS = {
+    "mirror_info": (MirrorInfo, qos.LATCHED),
+    "calibration": (Calibration, qos.LATCHED),
+    "capabilities": (Capabilities, qos.LATCHED),
+    "actuator_state": (ActuatorState, qos.STATE),
+    "focus_state": (FocusState, qos.STATE),
+    "surface_map": (Image, qos.MAP),
+    "surface_map_info": (SurfaceMapInfo, qos.MAP),
+    "zernike": (ZernikeCoefficients, qos.STATE),
+}
+SERVICES = {
+    "set_signals": SetSignals,
+    "degauss": Degauss,
+    "set_focus": SetFocus,
+    "flatten": Flatten,
+    "measure": Measure,
+    "list_calibrations": ListCalibrations,
+    "load_calibration": LoadCalibration,
+}
+ACTIONS = {"calibrate": Calibrate, "converge": Converge, "move_focus": MoveFocus}
+
+#: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
+WATCHED = ("calibrate", "converge")
+
+#: A node whose diagnostics were not heard for so long counts as missing, s. Nodes publish once a second.
+SILENCE_S = 5.0
+#: Time for an answer that comes at once, s.
+ANSWER_S = 10.0
+#: Time that runs back by more than this is another time: a simulator that was started again, s.
+TIME_JUMP_S = 60.0
+_NUMBERS = itertools.count(1)
+
+
+class RefusedError(Exception):
+    """A node refused, or did not answer; the message is the sentence to show."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The latest message of each topic; None = none was heard.
+
+    Attributes:
+        diagnostics: {node: latest status}, of this namespace's nodes and others.
+        present: names of the nodes heard lately, without the namespace.
+        bench_time: s, ROS time as far as heard.
+    """
+
+    mirror_info: Any = None
+    calibration: Any = None
+    capabilities: Any = None
+    actuator_state: Any = None
+    focus_state: Any = None
+    surface_map: Any = None
+    surface_map_info: Any = None
+    zernike: Any = None
+    diagnostics: dict[str, DiagnosticStatus] = field(default_factory=dict)
+    present: frozenset[str] = frozenset()
+    bench_time: float = 0.0
+
+
+class ConsoleNode:
+    """Listens to one mirror's nodes and calls them.
+
+    Args:
+        namespace: of the mirror, "" for none.
+        domain: ROS domain; None = the environment's.
+    """
+
+    def __init__(self, namespace: str = "", domain: int | None = None) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node(f"dm_console_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
+        self._prefix = f"{namespace.strip('/')}/" if namespace.strip("/") else ""
+        self._latest: dict[str, Any] = {}
+        self._heard: dict[str, float] = {}
+        self._diagnostics: dict[str, DiagnosticStatus] = {}
+        self._bench_time = 0.0
+        self._goals: dict[str, Any] = {}
+        self._beginning: dict[str, bool] = {}  # goals that are not accepted yet; True = to be cancelled
+        self.following = Following()
+        self.log = LogTail(self.node)
+        for topic, (message_type, profile) in TOPICS.items():
+            self._subscribe(message_type, topic, profile)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
+        # Early, so that the nodes have discovered them all by the time the first is used.
+        self._services = {name: self.node.create_client(kind, name) for name, kind in SERVICES.items()}
+        self._actions = {name: ThreadedActionClient(self.node, kind, name) for name, kind in ACTIONS.items()}
+        self.watched = {name: ExternalGoals(self.node, ACTIONS[name], name) for name in WATCHED}
+        self._background = BackgroundExecutor(self.node)
+
+    def _subscribe(self, message_type: Any, topic: str, profile: Any) -> None:
+        self.node.create_subscription(message_type, topic, lambda message: self._take(topic, message), profile)
+
+    def _take(self, topic: str, message: Any) -> None:
+        self._latest[topic] = message
+        if topic == "actuator_state":
+            self.following.observe(message)
+        elif topic in ("calibration", "mirror_info"):
+            calibration, mirror = self._latest.get("calibration"), self._latest.get("mirror_info")
+            if calibration is not None and mirror is not None:
+                self.following.use(calibration, 0.5 * (mirror.signal_min + mirror.signal_max))
+
+    def _take_diagnostics(self, message: DiagnosticArray) -> None:
+        time_s = 1e-9 * stamp_ns(message.header.stamp)
+        restarted = time_s < self._bench_time - TIME_JUMP_S
+        self._bench_time = time_s if restarted else max(self._bench_time, time_s)
+        for status in message.status:
+            self._diagnostics[status.name] = status
+            self._heard[status.name] = time.monotonic()
+
+    def close(self) -> None:
+        """Leave the ROS graph; the mirror keeps its shape."""
+        self._background.destroy_node()
+        self._context.try_shutdown()
+
+    def snapshot(self) -> Snapshot:
+        """What is known now."""
+        recent = time.monotonic() - SILENCE_S
+        present = frozenset(
+            name.removeprefix(self._prefix)
+            for name, when in dict(self._heard).items()
+            if when >= recent and name.startswith(self._prefix)
+        )
+        return Snapshot(
+            **dict(self._latest),
+            diagnostics=dict(self._diagnostics),
+            present=present,
+            bench_time=self._bench_time,
+        )
+
+    async def call(self, name: str, request: Any, timeout_s: float = ANSWER_S) -> Any:
+        """Call a service of the suite.
+
+        Raises:
+            RefusedError: it refused, with its sentence, or did not answer.
+        """
+        try:
+            response = await asyncio.to_thread(call, self._services[name], request, timeout_s)
+        except ServiceCallError as error:
+            raise RefusedError(str(error)) from error
+        if response.error_code != 0:
+            raise RefusedError(f"{response.message} (error {response.error_code})")
+        return response
+
+    async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = 7200.0) -> Any:
+        """Run an action to its end and return its result.
+
+        Raises:
+            RefusedError: the goal was refused, ended with an error or was cancelled, with the node's sentence.
+        """
+        client = self._actions[name]
+        identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
+        identity.uuid = list(uuid.uuid4().bytes)
+        if name in self.watched:
+            self.watched[name].own(identity)
+        self._beginning[name] = False
+        try:
+            handle = self._goals[name] = await self._begin(name, goal, on_feedback, identity)
+            finished = handle.get_result_async()
+            if self._beginning.pop(name):
+                await self.cancel(name)
+            if not await _until(finished.done, timeout_s, lambda: self._server_is_gone(client)):
+                with contextlib.suppress(RefusedError):
+                    await self.cancel(name)
+                raise RefusedError(f"{name}: no result: its node has gone, or it took longer than {timeout_s:g} s")
+        except RefusedError:
+            if name in self.watched:  # it may run all the same: then it must be seen, and be cancelled from here
+                self.watched[name].disown(identity)
+            raise
+        finally:
+            self._beginning.pop(name, None)
+            self._goals.pop(name, None)
+        result = finished.result().result
+        if result.error_code != 0:
+            raise RefusedError(f"{result.message} (error {result.error_code})")
+        return result
+
+    async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None], identity: Any) -> Any:
+        """The handle of a goal that was accepted."""
+        client = self._actions[name]
+        if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
+            raise RefusedError(f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
+        if self._beginning[name]:
+            raise RefusedError(f"{name}: cancelled before it began; nothing has changed")
+        accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
+        if not await _until(accepted.done, ANSWER_S):
+            raise RefusedError(f"{name}: no answer to the goal within {ANSWER_S:g} s")
+        handle = accepted.result()
+        if not handle.accepted:
+            raise RefusedError(f"{name}: refused, another goal is running")
+        return handle
+
+    @staticmethod
+    def _server_is_gone(client: ThreadedActionClient) -> bool:
+        return not client.server_is_ready()
+
+    @property
+    def busy_elsewhere(self) -> str:
+        """Name of an action that runs and was not started here; "" = none."""
+        return next((name for name, watch in self.watched.items() if watch.elsewhere), "")
+
+    async def cancel(self, name: str) -> None:
+        """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs.
+
+        Raises:
+            RefusedError: no answer, or the node does not know the goal.
+        """
+        handle = self._goals.get(name)
+        if handle is None and name in self._beginning:
+            self._beginning[name] = True  # whoever begins it cancels it as soon as it is accepted
+            return
+        if handle is not None:
+            asked: Future | None = handle.cancel_goal_async()
+        else:
+            asked = self.watched[name].cancel() if name in self.watched else None
+        if asked is None:
+            return
+        if not await _until(asked.done, ANSWER_S):
+            raise RefusedError(f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
+        code, codes = asked.result().return_code, CancelGoal.Response
+        if code not in (codes.ERROR_NONE, codes.ERROR_GOAL_TERMINATED):
+            raise RefusedError(f"{name}: its node does not cancel the goal (code {code})")
+
+
+async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[[], bool] = lambda: False) -> bool:
+    """Wait until `condition()` is true; False when it was not in time, or `lost()` was true too long."""
+    deadline, lost_since = time.monotonic() + timeout_s, float("inf")
+    while not condition():
+        now = time.monotonic()
+        lost_since = min(lost_since, now) if lost() else float("inf")
+        if now > deadline or now - lost_since > SILENCE_S:
+            return False
+        await asyncio.sleep(0.02)
+    return True

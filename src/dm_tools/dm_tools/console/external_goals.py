@@ -1,0 +1,115 @@
+"""Goals of an action that somebody else sent: the console shows them, can cancel them and does not get in their way."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import qos_profile_action_status_default
+from rclpy.task import Future
+
+from dm_common.ros import qos
+
+#: action_msgs/GoalStatus: accepted, executing, canceling.
+RUNNING = (1, 2, 3)
+#: A goal that says nothing for so long has lost its node, s. Nodes wait 60 s for a map.
+SILENCE_S = 150.0
+
+
+class ExternalGoals:
+    """Follows all goals of one action by its status and feedback topics. May be asked from any thread.
+
+    Args:
+        node: subscribes.
+        action_type: of dm_msgs.
+        name: of the action.
+
+    Attributes:
+        goals: goals that were seen to begin.
+        residuals: feedback field `residual_rms` (m) of every step of the last goal.
+    """
+
+    def __init__(self, node: Node, action_type: Any, name: str) -> None:
+        self._node, self._status_topic = node, f"{name}/_action/status"
+        self._lock = threading.Lock()
+        self._running: bytes = b""
+        self._own: set[bytes] = set()
+        self._ended: set[bytes] = set()
+        self._feedback: Any = None
+        self._heard = 0.0
+        self.goals = 0
+        self.residuals: list[float] = []
+        interface, latched = action_type.Impl, qos_profile_action_status_default
+        node.create_subscription(interface.GoalStatusMessage, self._status_topic, self._on_status, latched)
+        feedback = f"{name}/_action/feedback"
+        node.create_subscription(interface.FeedbackMessage, feedback, self._on_feedback, qos.STATE)
+        self._interface = interface.CancelGoalService
+        self._cancel = node.create_client(self._interface, f"{name}/_action/cancel_goal")
+
+    def own(self, identity: Any) -> None:
+        """Tell that this console is about to send the goal `identity`, a unique_identifier_msgs/UUID."""
+        with self._lock:
+            self._own.add(bytes(identity.uuid))
+
+    def disown(self, identity: Any) -> None:
+        """Tell that this console has lost sight of the goal `identity`: if it runs, it does as one of somebody else."""
+        with self._lock:
+            self._own.discard(bytes(identity.uuid))
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether a goal runs that this console did not send."""
+        with self._lock:
+            running, heard = self._running, self._heard
+            if not running or running in self._own or time.monotonic() - heard > SILENCE_S:
+                return False
+        return bool(self._node.count_publishers(self._status_topic))
+
+    @property
+    def feedback(self) -> Any:
+        """The latest feedback of the goal that runs; None before the first."""
+        with self._lock:
+            return self._feedback
+
+    def cancel(self) -> Future | None:
+        """Ask the goal that runs to stop: the answer, None = no goal runs. Its status tells when it has stopped."""
+        request = self._interface.Request()
+        with self._lock:
+            if not self._running:
+                return None
+            request.goal_info.goal_id.uuid = list(self._running)
+        return self._cancel.call_async(request)
+
+    def _on_status(self, message: Any) -> None:
+        running = []
+        with self._lock:
+            for entry in message.status_list:
+                identity = bytes(entry.goal_info.goal_id.uuid)
+                if entry.status in RUNNING:
+                    running.append(identity)
+                else:
+                    self._ended.add(identity)
+            newest = running[-1] if running else b""
+            if newest and newest != self._running:
+                self._begin(newest)
+            self._running, self._heard = newest, time.monotonic()
+
+    def _on_feedback(self, message: Any) -> None:
+        identity, feedback = bytes(message.goal_id.uuid), message.feedback
+        with self._lock:
+            # Status and feedback are two topics: either may be late.
+            if identity in self._ended:
+                return
+            if identity != self._running:
+                self._begin(identity)
+            if self._feedback is None:
+                self.residuals = []
+            if feedback.residual_rms > 0.0 and (self._feedback is None or feedback.step != self._feedback.step):
+                self.residuals.append(float(feedback.residual_rms))
+            self._feedback, self._heard = feedback, time.monotonic()
+
+    def _begin(self, identity: bytes) -> None:
+        self._running, self._feedback = identity, None
+        self.goals += 1

@@ -1,0 +1,105 @@
+"""Hysteresis loops of one actuator: what the law of the calibration says, and what maps say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+
+Floats = NDArray[np.float64]
+
+#: A measured way in shares of the amplitude: up, back through the start, down, and back.
+WAY = (0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0)
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A hysteresis loop of one actuator, effective over applied signal.
+
+    Attributes:
+        signals, rising, falling: the closed cycle of the law over the whole range.
+        stands: (signal, effective signal) now; None = not known.
+        path, modelled_path, measured: a measured way, what the law says of it and what came; may be empty.
+    """
+
+    actuator: int
+    signals: tuple[float, ...]
+    rising: tuple[float, ...]
+    falling: tuple[float, ...]
+    stands: tuple[float, float] | None = None
+    path: tuple[float, ...] = ()
+    modelled_path: tuple[float, ...] = ()
+    measured: tuple[float, ...] = ()
+
+    @property
+    def opening(self) -> float:
+        """Largest distance of the branches as a share of the span."""
+        gap = max(abs(b - a) for a, b in zip(self.rising, self.falling, strict=True))
+        return gap / (self.rising[-1] - self.rising[0])
+
+    @property
+    def words(self) -> str:
+        """The loop in a sentence."""
+        return f"the branches are up to {self.opening:.1%} of the span apart"
+
+
+def modelled_loop(law: HysteresisModel, actuator: int, low: float, high: float, steps: int = 41) -> Loop:
+    """The closed cycle of `law` between `low` and `high`, without creep."""
+    signals = np.linspace(low, high, steps)
+    state = law.demagnetised(1, 0.0, 0.5 * (low + high))
+    for turn in (high, low):
+        state = law.move(state, np.array([turn]), 0.0)
+    branches = []
+    for way in (signals, signals[::-1]):
+        values = []
+        for signal in way:
+            state = law.move(state, np.array([signal]), 0.0)
+            values.append(float(state.position[0]))
+        branches.append(values)
+    return Loop(actuator, tuple(signals.tolist()), tuple(branches[0]), tuple(branches[1][::-1]))
+
+
+def way(start: float, amplitude: float, low: float, high: float) -> list[float]:
+    """Signals of a measured loop around `start`, which it ends at, inside `low` .. `high`."""
+    return [min(max(start + amplitude * share, low), high) for share in WAY]
+
+
+def modelled_way(law: HysteresisModel, state: HysteresisState, actuator: int, signals: Sequence[float]) -> list[float]:
+    """Effective signals of one actuator (1-based) when it goes from `state` through `signals`; creep stands still."""
+    values = []
+    shape = state.signals.copy()
+    for signal in signals:
+        shape = shape.copy()
+        shape[actuator - 1] = signal
+        state = law.move(state, shape, state.time)
+        values.append(float(law.effective(state)[actuator - 1]))
+    return values
+
+
+def effective_change(before: Any, after: Any, calibration: Any, actuator: int) -> float:
+    """By how much the effective signal of one actuator (1-based) changed between two maps.
+
+    Args:
+        before, after: dm_msgs/SurfaceSamples at the points of the calibration.
+        calibration: dm_msgs/Calibration.
+
+    Raises:
+        ValueError: the maps were sampled at other points, or the actuator does nothing to the surface.
+    """
+    points, count = calibration.points, calibration.actuators
+    x, y = np.array(after.x), np.array(after.y)
+    if x.shape != (points,) or not np.allclose(x, calibration.sample_x) or not np.allclose(y, calibration.sample_y):
+        raise ValueError(f"the map was sampled at {x.size} points, not at the {points} of the calibration")
+    change = np.array(after.sag) - np.array(before.sag)
+    response = np.array(calibration.influence_sag).reshape(points, count)[:, actuator - 1]
+    good = np.isfinite(change)
+    root = np.sqrt(np.array(calibration.sample_weight)[good])
+    columns = np.column_stack([response, np.ones(points), x, y])[good] * root[:, None]
+    if not np.linalg.norm(columns[:, 0]) > 0.0:
+        raise ValueError(f"actuator {actuator} does nothing to the surface of this calibration")
+    return float(np.linalg.lstsq(columns, change[good] * root, rcond=None)[0][0])

@@ -1,0 +1,201 @@
+"""What the buttons do: each function calls the nodes and returns its outcome in words."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from dm_msgs.action import Calibrate, Converge, MoveFocus
+from dm_msgs.msg import FocusRequest
+from dm_msgs.srv import Degauss, Flatten, LoadCalibration, Measure, SetFocus, SetSignals
+
+from dm_tools.console.console_node import RefusedError
+from dm_tools.console.feedback import calibration_step, converge_step
+from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
+from dm_tools.console.session import Session
+from dm_tools.console.view_models import NM, poke_signals, prediction_words
+
+#: What the plans of a calibration are called.
+PLANS = {
+    Calibrate.Goal.PLAN_HYSTERESIS: "Memory: influence function, hysteresis and creep",
+    Calibrate.Goal.PLAN_FULL: "Full: pokes and the surfaces of Table 1",
+    Calibrate.Goal.PLAN_POKES: "Pokes only",
+    Calibrate.Goal.PLAN_SURFACES: "Surfaces of Table 1 only",
+    Calibrate.Goal.PLAN_POKE_CHECK: "Poke check: wiring and orientation, nothing is stored",
+}
+#: Longest waits, s of wall time.
+DEGAUSS_S, MEASURE_S, MOVE_S = 300.0, 120.0, 60.0
+
+
+async def predict(session: Session, request: FocusRequest) -> str:
+    """The prediction for a request, in words; nothing moves. Raises RefusedError."""
+    answer = await session.ros.call("set_focus", SetFocus.Request(request=request, dry_run=True))
+    return prediction_words(answer.state)
+
+
+async def move(session: Session, request: FocusRequest) -> str:
+    """Take the curvature of `request`."""
+
+    def show(feedback: Any) -> None:
+        session.progress.step, session.progress.steps = round(100 * feedback.progress), 100
+        session.progress.words = ("planning", "moving", "settling")[min(feedback.phase, 2)]
+
+    timeout = MOVE_S + (DEGAUSS_S if request.mode != FocusRequest.MODE_DIRECT else 0.0)
+    result = await session.ros.run("move_focus", MoveFocus.Goal(request=request), show, timeout)
+    session.base = None
+    return f"{request.curvature:+.4f} 1/m stands after {result.duration:.2f} s. {prediction_words(result.state)}"
+
+
+async def converge(session: Session, request: FocusRequest) -> str:
+    """Correct the command on the interferometer until the surface is right."""
+
+    def show(feedback: Any) -> None:
+        session.progress.step = feedback.step
+        session.progress.words = converge_step(feedback)
+
+    result = await session.ros.run("converge", Converge.Goal(request=request), show)
+    session.base = None
+    figures = f"{result.residual_rms * NM:.1f} nm rms, largest coefficient {result.max_zernike * NM:.2f} nm"
+    return f"{figures}, {result.maps} maps"
+
+
+async def flatten(session: Session) -> str:
+    """Make the surface flat."""
+    answer = await session.ros.call("flatten", Flatten.Request(), MOVE_S)
+    session.base = None
+    return prediction_words(answer.state)
+
+
+async def degauss(session: Session) -> str:
+    """Wipe the hysteresis memory."""
+    session.progress.words = "alternating with falling amplitude about mid range"
+    answer = await session.ros.call("degauss", Degauss.Request(), DEGAUSS_S)
+    session.base = None
+    return f"done in {answer.duration:.1f} s; the mirror is at mid range"
+
+
+async def measure(session: Session, label: str = "console") -> str:
+    """Take one map."""
+    answer = await session.ros.call("measure", Measure.Request(label=label), MEASURE_S)
+    return f"rms {answer.info.rms * NM:.1f} nm, valid {100 * answer.info.valid_fraction:.1f} % of the aperture"
+
+
+async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
+    """Measure and store a calibration."""
+
+    def show(feedback: Any) -> None:
+        session.progress.step, session.progress.steps = feedback.step, feedback.steps
+        session.progress.words = calibration_step(feedback)
+
+    result = await session.ros.run("calibrate", goal, show)
+    findings = "".join(f" Poke check: {sentence}." for sentence in result.poke_findings)
+    if result.poke_check_passed:
+        findings = " Poke check passed: wiring and orientation are as configured."
+    made = f"{result.id}: held-out residual {result.held_out_rms * NM:.1f} nm rms. " if result.id else ""
+    return f"{made}{result.maps} maps, {result.maps_dropped} dropped.{findings}"
+
+
+async def estimate(session: Session, goal: Calibrate.Goal) -> str:
+    """How long a calibration would take, and how good it would be; nothing moves."""
+    goal.dry_run = True
+    return str((await session.ros.run("calibrate", goal, lambda _feedback: None, MOVE_S)).message)
+
+
+async def build_recipes(session: Session, curvatures: list[float]) -> str:
+    """Condition the mirror, then converge, for every curvature (1/m); stored with the calibration in use."""
+    order = sorted(curvatures)
+
+    def show(feedback: Any) -> None:
+        done = sum(curvature < feedback.curvature - 1e-9 for curvature in order)
+        session.progress.step, session.progress.steps = done, len(order)
+        session.progress.words = f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"
+
+    goal = Converge.Goal(curvatures=curvatures)
+    result = await session.ros.run("converge", goal, show)
+    session.base = None
+    return str(result.message)
+
+
+async def load(session: Session, name: str) -> str:
+    """Use a stored calibration."""
+    answer = await session.ros.call("load_calibration", LoadCalibration.Request(calibration=name), 30.0)
+    return f"{answer.id} is in use"
+
+
+def _standing(session: Session) -> tuple[Any, list[float]]:
+    """mirror_info and the requested signals. Raises RefusedError when the driver has not told them."""
+    snapshot = session.snapshot()
+    state, mirror = snapshot.actuator_state, snapshot.mirror_info
+    if mirror is None or state is None:
+        raise RefusedError("the driver has not told its mirror and signals yet")
+    requested = list(state.requested)
+    if not requested:
+        requested = [0.5 * (mirror.signal_min + mirror.signal_max)] * mirror.actuators
+    return mirror, requested
+
+
+def _still_poked(session: Session, requested: list[float]) -> bool:
+    """Whether the mirror stands where the last poke of this console left it."""
+    return session.base is not None and np.array_equal(requested, session.poked)
+
+
+async def poke(session: Session, actuator: int, amplitude: float, then_measure: bool) -> str:
+    """Move one actuator away from the shape that stood before the first poke."""
+    mirror, requested = _standing(session)
+    base = session.base if session.base is not None and _still_poked(session, requested) else requested
+    signals = poke_signals(base, actuator, amplitude, mirror.signal_min, mirror.signal_max)
+    await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), MOVE_S)
+    session.base, session.poked = base, signals
+    words = f"actuator {actuator} at {signals[actuator - 1]:+.3f}; release it with Escape"
+    return f"{words}. Map: {await measure(session, f'poke {actuator}')}" if then_measure else words
+
+
+async def release(session: Session) -> str:
+    """Go back to the shape that stood before the poke."""
+    base, (_mirror, requested) = session.base, _standing(session)
+    if base is None:
+        return "nothing is poked"
+    session.base = None
+    if not np.array_equal(requested, session.poked):
+        return "the mirror was moved by somebody else since; it stays where it is"
+    session.base = base
+    await session.ros.call("set_signals", SetSignals.Request(signals=base, wait=True), MOVE_S)
+    session.base = None
+    return "back at the shape before"
+
+
+async def measure_loop(session: Session, actuator: int, amplitude: float) -> str:
+    """Take one actuator up and down with a map at every step; it ends where it began."""
+    snapshot, (mirror, start) = session.snapshot(), _standing(session)
+    calibration, following = snapshot.calibration, session.ros.following
+    if calibration is None or not calibration.id:
+        raise RefusedError("a measured loop needs a calibration: it holds what the actuator does to the surface")
+    standing = following.now(snapshot.bench_time)
+    state = following.state()
+    if standing.effective is None or state is None:
+        raise RefusedError(f"where the actuators stand is not known: {standing.doubt}")
+    signals = way(start[actuator - 1], amplitude, mirror.signal_min, mirror.signal_max)
+    first = float(standing.effective[actuator - 1])
+    model = modelled_way(following.law, state, actuator, signals)
+    before = (await session.ros.call("measure", Measure.Request(label="loop start"), MEASURE_S)).samples
+    values: list[float] = []
+    session.progress.steps = len(signals)
+    try:
+        for step, signal in enumerate(signals, start=1):
+            if session.cancelled:
+                raise RefusedError("cancelled; the actuator is back where it began")
+            session.progress.step, session.progress.words = step, f"actuator {actuator} at {signal:+.2f}"
+            shape = [*start[: actuator - 1], signal, *start[actuator:]]
+            await session.ros.call("set_signals", SetSignals.Request(signals=shape, wait=True), MOVE_S)
+            after = (await session.ros.call("measure", Measure.Request(label=f"loop {step}"), MEASURE_S)).samples
+            values.append(first + effective_change(before, after, calibration, actuator))
+    except (RefusedError, ValueError):
+        await session.ros.call("set_signals", SetSignals.Request(signals=start, wait=True), MOVE_S)
+        raise
+    loop = modelled_loop(following.law, actuator, mirror.signal_min, mirror.signal_max)
+    session.loops[actuator] = dataclasses.replace(
+        loop, path=tuple(signals), modelled_path=tuple(model), measured=tuple(values)
+    )
+    gap = float(np.abs(np.array(values) - np.array(model)).max())
+    return f"actuator {actuator}: model and maps differ by at most {gap:.4f} of a signal"

@@ -1,0 +1,77 @@
+"""The page: all cards in order, refreshed from one snapshot a few times a second."""
+
+from __future__ import annotations
+
+from nicegui import app, ui
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+from dm_tools.console import style
+from dm_tools.console.console_node import ConsoleNode
+from dm_tools.console.session import Session
+from dm_tools.console.surface_view import SurfaceView
+from dm_tools.console.widgets.actuators import ActuatorCards
+from dm_tools.console.widgets.calibration import CalibrationCard
+from dm_tools.console.widgets.focus import FocusCard
+from dm_tools.console.widgets.header import Header
+from dm_tools.console.widgets.messages import DiagnosticsCard, LogCard
+from dm_tools.console.widgets.recipes import RecipesCard
+from dm_tools.console.widgets.surfaces import SurfaceCard, ZernikeCard
+
+#: Only this machine; a web site elsewhere must not reach the mirror through the browser either, hence the host names.
+HOST = "127.0.0.1"
+HOST_NAMES = [HOST, "localhost"]
+REFRESH_S = 0.3
+#: A page that was not served for so long is loaded anew and forgets what was typed, s: long for a phone that dozed off.
+RECONNECT_S = 60.0
+
+
+def serve(ros: ConsoleNode, port: int) -> None:
+    """Serve the console on loopback until Ctrl-C.
+
+    Args:
+        ros: closed by the caller.
+        port: 1 to 65535.
+    """
+    session = Session(ros)
+    view = SurfaceView(ros.following)
+
+    @ui.page("/")
+    def console() -> None:
+        build(session, view)
+
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOST_NAMES)
+    app.on_shutdown(session.end)
+    ui.run(
+        host=HOST,
+        port=port,
+        title="Deformable mirror console",
+        language="en-GB",
+        reload=False,
+        show=False,
+        show_welcome_message=False,
+        reconnect_timeout=RECONNECT_S,
+    )
+
+
+def build(session: Session, view: SurfaceView) -> None:
+    """Put the cards on a new page."""
+    ui.add_css(style.CSS)
+    ui.colors(primary=style.PRIMARY, negative=style.ERROR, warning=style.WARNING)
+    top = Header(session)
+    with ui.element("main").classes("grid"):
+        with ui.element("div").classes("column side"):
+            left = (FocusCard(session), CalibrationCard(session), RecipesCard(session))
+        with ui.element("div").classes("column wide"):
+            right = (SurfaceCard(session, view), ActuatorCards(session))
+            with ui.element("div").classes("pair"):
+                below = (ZernikeCard(view), LogCard(session))
+            health = DiagnosticsCard()
+    cards = (top, *left, *right, *below, health)
+
+    def refresh() -> None:
+        snapshot = session.snapshot()
+        for card in cards:
+            card.refresh(snapshot)
+
+    refresh()
+    ui.timer(REFRESH_S, refresh)

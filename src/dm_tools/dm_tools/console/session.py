@@ -1,0 +1,167 @@
+"""What all open pages of one console share: the operation under way, its progress, and everything that went wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from dm_tools.console.console_node import ConsoleNode, RefusedError, Snapshot
+from dm_tools.console.feedback import calibration_step, converge_step
+from dm_tools.console.loops import Loop
+
+#: Failures that are kept until somebody dismisses them.
+FAILURES_KEPT = 50
+#: What an action that was not started here is called.
+ELSEWHERE = {
+    "calibrate": "A calibration that was started elsewhere",
+    "converge": "A closed loop that was started elsewhere",
+}
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Something that was refused or went wrong."""
+
+    number: int
+    clock: str
+    title: str
+    sentence: str
+
+
+@dataclass
+class Progress:
+    """How far the operation under way is.
+
+    Attributes:
+        title: of the operation, "" = none is under way.
+        step, steps: i of n; steps 0 = not known.
+        words: what it does now.
+        can_cancel: whether it can be cancelled.
+    """
+
+    title: str = ""
+    step: int = 0
+    steps: int = 0
+    words: str = ""
+    can_cancel: bool = False
+
+
+@dataclass
+class Session:
+    """One console.
+
+    Attributes:
+        outcome: the last success, in words.
+        chosen: number of the actuator that is looked at.
+        base: signals to go back to when a poke is released; None = nothing is poked.
+        poked: signals of the last poke.
+        loops: {actuator: measured loop}.
+    """
+
+    ros: ConsoleNode
+    failures: list[Failure] = field(default_factory=list)
+    progress: Progress = field(default_factory=Progress)
+    outcome: str = ""
+    chosen: int = 1
+    base: list[float] | None = None
+    poked: list[float] = field(default_factory=list)
+    loops: dict[int, Loop] = field(default_factory=dict)
+    _numbers: Any = field(default_factory=lambda: itertools.count(1))
+    _cancel: Callable[[], Awaitable[None]] | None = None
+    _task: asyncio.Task[None] | None = None
+    cancelled: bool = False
+
+    def snapshot(self) -> Snapshot:
+        """What is known of the bench now."""
+        return self.ros.snapshot()
+
+    @property
+    def running(self) -> str:
+        """Title of the operation under way, here or elsewhere; "" = none."""
+        return self.progress.title or ELSEWHERE.get(self.ros.busy_elsewhere, "")
+
+    @property
+    def calibrating(self) -> bool:
+        """Whether a calibration is under way, here or elsewhere."""
+        return self.progress.title == "Calibration" or self.ros.busy_elsewhere == "calibrate"
+
+    @property
+    def shown_progress(self) -> Progress:
+        """The operation under way here, else the one elsewhere."""
+        name = self.ros.busy_elsewhere
+        if self.progress.title or not name:
+            return self.progress
+        feedback = self.ros.watched[name].feedback
+        shown = Progress(ELSEWHERE[name], can_cancel=True)
+        if feedback is None:
+            shown.words = "no word of it yet"
+        elif name == "calibrate":
+            shown.step, shown.steps, shown.words = feedback.step, feedback.steps, calibration_step(feedback)
+        else:
+            shown.words = converge_step(feedback)
+        return shown
+
+    def fail(self, title: str, sentence: str) -> None:
+        """Show a sentence until it is dismissed."""
+        self.failures.append(Failure(next(self._numbers), time.strftime("%H:%M:%S"), title, sentence))
+        del self.failures[:-FAILURES_KEPT]
+
+    def dismiss(self, number: int) -> None:
+        """Take a failure off the pages."""
+        self.failures[:] = [failure for failure in self.failures if failure.number != number]
+
+    def begin(
+        self,
+        title: str,
+        work: Callable[[], Awaitable[str]],
+        cancel: Callable[[], Awaitable[None]] | None = None,
+    ) -> None:
+        """Start an operation; when another is under way, say so instead.
+
+        Args:
+            work: returns its outcome in words; raises RefusedError or ValueError with the sentence to show.
+            cancel: how to stop it; None = it cannot be.
+        """
+        if self.running:
+            self.fail(title, f"not begun: {self.running} is under way")
+            return
+        self.progress = Progress(title, can_cancel=cancel is not None)
+        self._cancel, self.cancelled, self.outcome = cancel, False, ""
+        self._task = asyncio.get_running_loop().create_task(self._follow(title, work))
+
+    async def _follow(self, title: str, work: Callable[[], Awaitable[str]]) -> None:
+        try:
+            self.outcome = f"{title}: {await work()}"
+        except (RefusedError, ValueError) as error:
+            self.fail(title, str(error))
+        except Exception as error:  # a defect of the console must be seen, too
+            self.fail(title, f"{type(error).__name__}: {error}")
+            raise
+        finally:
+            self.progress = Progress()
+
+    async def cancel(self) -> None:
+        """Ask the operation under way to stop, here or elsewhere."""
+        try:
+            if not self.progress.title and (name := self.ros.busy_elsewhere):
+                await self.ros.cancel(name)
+            elif self._cancel is not None and self.progress.title:
+                self.cancelled = True
+                self.progress.words = "cancelling"
+                await self._cancel()
+        except RefusedError as error:
+            self.fail("Cancel", str(error))
+
+    async def between_steps(self) -> None:
+        """How work that looks at `cancelled` between its steps is cancelled."""
+
+    async def end(self) -> None:
+        """Cancel what is under way here and wait for its end, for a shutdown in order."""
+        if self.progress.title:
+            await self.cancel()
+        if self._task is not None and not self._task.done():
+            await asyncio.wait([self._task], timeout=10.0)

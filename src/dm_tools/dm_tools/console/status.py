@@ -1,0 +1,159 @@
+"""State of the bench in words: badges, what is missing, why something is not possible, diagnostics and log."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from dm_msgs.msg import ActuatorState, Calibration
+
+from dm_tools.console.view_models import QUALITIES
+
+#: What each node does for the console, in words, when it is missing.
+NODES = {
+    "pdm_driver": "nothing can move, and what stands at the electronics is not known",
+    "interferometer": "no maps can be measured",
+    "calibration": "no calibration can be made or loaded",
+    "focus_controller": "no curvature can be asked for",
+}
+DRIVER_STATES = {
+    ActuatorState.STATE_UNCONFIGURED: "not configured",
+    ActuatorState.STATE_INACTIVE: "inactive",
+    ActuatorState.STATE_ACTIVE: "active",
+    ActuatorState.STATE_LINK_LOST: "link lost",
+    ActuatorState.STATE_SAFING: "going to the safe shape",
+}
+LEVELS = {
+    DiagnosticStatus.OK: "ok",
+    DiagnosticStatus.WARN: "warning",
+    DiagnosticStatus.ERROR: "error",
+    DiagnosticStatus.STALE: "stale",
+}
+
+#: Paths of files, as nodes tell them: at least two folders deep below a folder of the system or a home.
+_PATH = re.compile(r"(?<![\w/.])/(?:home|root|tmp|var|opt|mnt|media|srv|data|work|Users)(?:/[^\s/,;:'\"()]+)+")
+
+
+def shortened(words: str) -> str:
+    """`words` with only the last part of every path in them: who looks at the page knows the folders."""
+    return _PATH.sub(lambda match: f"…/{match[0].rsplit('/', 1)[-1]}", words)
+
+
+@dataclass(frozen=True)
+class Badge:
+    """A few words on the state; `kind` is "", "doubt" or "bad"."""
+
+    words: str
+    kind: str = ""
+
+
+def badges(snapshot: Any, doubt: str) -> list[Badge]:
+    """Mirror, driver, calibration and history in a few words each.
+
+    Args:
+        doubt: why the history is not known, in words; "" = it is.
+    """
+    mirror, state, calibration = snapshot.mirror_info, snapshot.actuator_state, snapshot.calibration
+    shown = [Badge(f"{mirror.name} {mirror.serial}")] if mirror is not None else [Badge("no mirror", "bad")]
+    if "pdm_driver" not in snapshot.present or state is None:
+        shown.append(Badge("driver: not heard", "bad"))
+    else:
+        active = state.driver_state == ActuatorState.STATE_ACTIVE
+        words = DRIVER_STATES.get(state.driver_state, "?") + (", moving" if state.moving else "")
+        shown.append(Badge(f"driver: {words}", "" if active else "bad"))
+    if calibration is None or not calibration.id:
+        shown.append(Badge("no calibration", "doubt"))
+    else:
+        quality = QUALITIES.get(calibration.quality, "?")
+        shown.append(
+            Badge(f"{calibration.id}: {quality}", "" if calibration.quality == Calibration.CALIBRATED else "doubt")
+        )
+        if calibration.hysteresis.play_radius:
+            shown.append(Badge("history: not known" if doubt else "history: known", "doubt" if doubt else ""))
+    worst = max((ord(bytes(status.level)) for status in snapshot.diagnostics.values()), default=0)
+    if worst and worst != ord(DiagnosticStatus.STALE):
+        words = LEVELS.get(bytes([worst]), "?")
+        shown.append(Badge(f"diagnostics: {words}", "bad" if worst >= ord(DiagnosticStatus.ERROR) else "doubt"))
+    return shown
+
+
+def missing(present: frozenset[str], mirror_known: bool) -> list[str]:
+    """What is not there, and what follows from it, in sentences."""
+    if not present & NODES.keys():
+        return ["No node of the suite is heard. Start them (./dm up) or check the namespace and the ROS domain."]
+    lines = [f"The node {name} is not heard: {effect}." for name, effect in NODES.items() if name not in present]
+    if "pdm_driver" in present and not mirror_known:
+        lines.append("The driver has not told which mirror it drives (topic mirror_info).")
+    return lines
+
+
+def why_not(need: str, snapshot: Any, running: str) -> str:
+    """Why an operation is not possible now, in a sentence; "" = it is.
+
+    Args:
+        need: what it needs: "move" (the driver), "focus" (driver and calibration), "measure" (the interferometer),
+            "calibrate" (driver and interferometer), "converge" (all), "store" (the node calibration).
+        snapshot: of :class:`~dm_tools.console.console_node.ConsoleNode`.
+        running: title of the operation under way, "" = none.
+    """
+    if running:
+        return f"{running} is under way."
+    nodes = {
+        "move": ["pdm_driver"],
+        "focus": ["pdm_driver", "focus_controller"],
+        "measure": ["interferometer"],
+        "calibrate": ["pdm_driver", "interferometer", "calibration"],
+        "converge": ["pdm_driver", "interferometer", "focus_controller"],
+        "store": ["calibration"],
+    }[need]
+    for name in nodes:
+        if name not in snapshot.present:
+            return f"The node {name} is not heard."
+    state = snapshot.actuator_state
+    if "pdm_driver" in nodes:
+        if state is None:
+            return "The driver has not reported yet."
+        if state.driver_state != ActuatorState.STATE_ACTIVE:
+            reason = f": {state.message}" if state.message else ""
+            return f"The driver is {DRIVER_STATES.get(state.driver_state, 'in an unknown state')}{reason}."
+    if need in ("focus", "converge"):
+        capabilities = snapshot.capabilities
+        if capabilities is None or not capabilities.calibration_id:
+            return "The mirror is not calibrated: run a calibration or load one."
+    return ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One status of `/diagnostics`; `figures` in full."""
+
+    level: str
+    node: str
+    message: str
+    figures: str
+
+
+def diagnostic_rows(statuses: dict[str, Any]) -> list[Row]:
+    """The latest status of each node, the worst first."""
+    worst_first = sorted(statuses.values(), key=lambda status: (-ord(bytes(status.level)), status.name))
+    return [
+        Row(
+            LEVELS.get(bytes(status.level), "?"),
+            status.name,
+            status.message,
+            ", ".join(f"{pair.key} {pair.value}" for pair in status.values if pair.value),
+        )
+        for status in worst_first
+    ]
+
+
+def log_rows(lines: Sequence[Any], everything: bool) -> list[tuple[str, ...]]:
+    """(level, node, message) of :class:`~dm_common.ros.rosout.LogLine`, the newest first."""
+    return [
+        (line.level, line.node, line.message)
+        for line in reversed(lines)
+        if everything or line.level in ("WARN", "ERROR", "FATAL")
+    ]

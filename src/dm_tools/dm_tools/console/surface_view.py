@@ -1,0 +1,144 @@
+"""The latest map beside what the calibration predicts; worked out once for all open pages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.messages import stamp_ns
+from dm_tools.console.console_node import Snapshot
+from dm_tools.console.state_observer import Following, Standing
+from dm_tools.console.surfaces import Surface, SurfaceModel, difference, measured_surface
+from dm_tools.verify import map_of
+
+NO_CALIBRATION = "No calibration is in use: nothing can be predicted."
+CREEP_BEFORE = "Creep of moves before the console was started is not in it."
+#: Effective signals that differ less do not count as a move: creep, and steps of holding a shape against it.
+SMALL_MOVE = 2e-3
+#: The prediction is drawn again when an effective signal has changed by this much, normalised.
+DRAWN_AGAIN = 1e-4
+
+
+class SurfaceView:
+    """What is shown of the surface.
+
+    Attributes:
+        version: rises whenever something changed.
+        measured, predicted, difference: None with a reason in `why_no_...`. `predicted` is for now, `difference` for
+            the moment of the map.
+        predicted_zernike: (K,) m for the moment of the map; None = not known.
+        doubt: why the prediction is a guess only, in words; "" = it is none.
+        remark: on what the prediction leaves out, in words; "" = nothing.
+        when: whether the map is of the present shape, in words.
+    """
+
+    def __init__(self, following: Following) -> None:
+        self._following = following
+        self.version = 0
+        self.measured: Surface | None = None
+        self.predicted: Surface | None = None
+        self.difference: Surface | None = None
+        self.predicted_zernike: NDArray[np.float64] | None = None
+        self.why_no_map = "No map was measured yet."
+        self.why_no_prediction = self.why_no_difference = NO_CALIBRATION
+        self.doubt = self.remark = self.when = ""
+        self._model: SurfaceModel | None = None
+        self._calibration: Any = None
+        self._map: tuple[int, Any] = (0, None)
+        self._at_map: Standing | None = None
+        self._effective: NDArray[np.float64] | None = None
+
+    @property
+    def stamp(self) -> int:
+        """ns, of the map; 0 = none."""
+        return self._map[0]
+
+    def update(self, snapshot: Snapshot) -> None:
+        """Take what is new."""
+        changed = self._take_calibration(snapshot.calibration)
+        changed |= self._take_map(snapshot)
+        changed |= self._take_prediction(snapshot)
+        if changed:
+            self._compare()
+            self.version += 1
+        when = self._when()
+        if when != self.when:
+            self.when = when
+            self.version += 1
+
+    def _take_calibration(self, calibration: Any) -> bool:
+        if calibration is self._calibration:
+            return False
+        self._calibration, self._model, self._effective = calibration, None, None
+        self.why_no_prediction = NO_CALIBRATION
+        if calibration is not None and calibration.id:
+            try:
+                self._model = SurfaceModel(calibration)
+            except ValueError as error:
+                self.why_no_prediction = str(error)
+        return True
+
+    def _take_map(self, snapshot: Snapshot) -> bool:
+        image, info = snapshot.surface_map, snapshot.surface_map_info
+        if image is None or info is None or image.header.stamp != info.header.stamp:
+            return False
+        stamp = stamp_ns(info.header.stamp)
+        if image is self._map[1]:
+            return False
+        self._map = (stamp, image)
+        self._at_map = self._following.at(1e-9 * stamp)
+        try:
+            self.measured, self.why_no_map = measured_surface(map_of(image), info), ""
+        except ValueError as error:
+            self.measured, self.why_no_map = None, f"The last map cannot be shown: {error}"
+        return True
+
+    def _take_prediction(self, snapshot: Snapshot) -> bool:
+        if self._model is None:
+            changed = self.predicted is not None
+            self.predicted, self.doubt = None, ""
+            return changed
+        standing = self._following.now(snapshot.bench_time)
+        if standing.effective is None or standing.effective.shape != (self._model.actuators,):
+            changed = self.predicted is not None
+            self.predicted, self.why_no_prediction = None, standing.doubt or "the calibration is of another mirror"
+            return changed
+        before = self._effective
+        if (
+            before is not None
+            and standing.doubt == self.doubt
+            and np.abs(before - standing.effective).max() < DRAWN_AGAIN
+        ):
+            return False
+        self._effective, self.doubt = standing.effective, standing.doubt
+        self.remark = CREEP_BEFORE if self._following.creep_before else ""
+        self.predicted = self._model.surface(standing.effective)
+        return True
+
+    def _compare(self) -> None:
+        self.difference = self.predicted_zernike = None
+        if self._model is None:
+            self.why_no_difference = self.why_no_prediction
+        elif self.measured is None or self._at_map is None:
+            self.why_no_difference = self.why_no_map
+        elif self._at_map.effective is None or self._at_map.effective.shape != (self._model.actuators,):
+            self.why_no_difference = f"Not comparable: {self._at_map.doubt or 'the calibration is of another mirror'}."
+        else:
+            try:
+                self.difference = difference(self.measured, self._model.surface(self._at_map.effective))
+                self.predicted_zernike = self._model.coefficients(self._at_map.effective)
+                self.why_no_difference = ""
+            except ValueError as error:
+                self.why_no_difference = f"Not comparable: {error}."
+
+    def _when(self) -> str:
+        if self.measured is None:
+            return ""
+        then, now = self._at_map, self._effective
+        if then is None or then.effective is None or now is None or then.effective.shape != now.shape:
+            return ""
+        if np.abs(then.effective - now).max() > SMALL_MOVE:
+            return "The mirror has moved since this map; the difference is for the moment of the map."
+        return "The map is of the present shape."

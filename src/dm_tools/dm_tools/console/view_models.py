@@ -1,0 +1,247 @@
+"""From messages to what is drawn: pure functions, without a browser and without ROS calls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorState, Calibration, FocusRequest
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+from dm_common.optics.zernike import NAMES, PISTON_TILT
+
+Floats = NDArray[np.float64]
+
+NM = 1e9
+#: Half-width of a 95 % interval in standard deviations.
+SIGMAS_95 = 1.96
+SIGNAL_COLOURS = "cividis"
+QUALITIES = {
+    Calibration.UNCALIBRATED: "uncalibrated",
+    Calibration.APPROXIMATE: "approximate",
+    Calibration.CALIBRATED: "calibrated",
+}
+GRADES = {
+    Calibration.GRADE_WEAK: "weak",
+    Calibration.GRADE_DEAD: "dead",
+    Calibration.GRADE_NOT_EXCITED: "never moved by the calibration",
+}
+MODES = {
+    FocusRequest.MODE_AUTO: "Automatic",
+    FocusRequest.MODE_DIRECT: "Direct",
+    FocusRequest.MODE_CONDITIONED: "Conditioned",
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One actuator of the command map.
+
+    Attributes:
+        number: 1-based.
+        x, y: mm, y up.
+        signal: normalised; None = nothing commanded yet.
+        fill, ink: colours.
+        remarks: flags and grade in words.
+        mark: one sign that stands for the first of them, "" = none.
+    """
+
+    number: int
+    x: float
+    y: float
+    signal: float | None
+    fill: str
+    ink: str
+    remarks: tuple[str, ...]
+    mark: str
+
+    @property
+    def words(self) -> str:
+        """What a screen reader says."""
+        at = "nothing commanded yet" if self.signal is None else f"signal {self.signal:+.3f}"
+        return ", ".join([f"actuator {self.number}", at, *self.remarks])
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of a colour "#rrggbb", 0 to 1, as WCAG 2 defines it."""
+    channels = np.frombuffer(bytes.fromhex(colour[1:7]), dtype=np.uint8) / 255.0
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def ink_on(colour: str) -> str:
+    """Black or white, whichever stands out more; the contrast is at least 4.5 to 1 on any colour."""
+    # (L + 0.05) / 0.05 against 1.05 / (L + 0.05)
+    return "#000000" if (luminance(colour) + 0.05) ** 2 > 0.05 * 1.05 else "#ffffff"
+
+
+def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
+    """The actuators of a dm_msgs/MirrorInfo with a dm_msgs/ActuatorState and the grades of a Calibration, or None."""
+    count = int(mirror.actuators)
+    applied = np.array(state.applied, dtype=np.float64) if state is not None else np.zeros(0)
+    known = applied.shape == (count,)
+    flags = np.frombuffer(bytes(state.flags), dtype=np.uint8) if state is not None else np.zeros(0, np.uint8)
+    flags = flags if flags.shape == (count,) else np.zeros(count, np.uint8)
+    grades = list(calibration.actuator_grade) if calibration is not None else []
+    grades = grades if len(grades) == count else [Calibration.GRADE_GOOD] * count
+    share = (applied - mirror.signal_min) / (mirror.signal_max - mirror.signal_min) if known else np.full(count, 0.5)
+    colours = colormaps[SIGNAL_COLOURS](np.clip(share, 0.0, 1.0), bytes=True)
+    result = []
+    for index in range(count):
+        fill = "#e4e7eb" if not known else "#" + bytes(colours[index, :3]).hex()
+        marks = _marks(int(flags[index]), int(grades[index]), float(applied[index]) if known else None, mirror)
+        result.append(
+            Cell(
+                number=index + 1,
+                x=mirror.actuator_x[index] * 1e3,
+                y=mirror.actuator_y[index] * 1e3,
+                signal=float(applied[index]) if known else None,
+                fill=fill,
+                ink=ink_on(fill),
+                remarks=tuple(words for _sign, words in marks),
+                mark=marks[0][0] if marks else "",
+            )
+        )
+    return result
+
+
+def _marks(flags: int, grade: int, signal: float | None, mirror: Any) -> list[tuple[str, str]]:
+    """(sign, words), the most important first."""
+    middle = 0.5 * (mirror.signal_min + mirror.signal_max)
+    marks = []
+    if flags & ActuatorState.FLAG_REFUSED:
+        marks.append(("!", "its value was refused"))
+    if flags & ActuatorState.FLAG_UNUSED:
+        marks.append(("×", "no channel is wired to it"))
+    if flags & ActuatorState.FLAG_AT_LIMIT and signal is not None:
+        marks.append(("▲", "at its upper limit") if signal > middle else ("▼", "at its lower limit"))
+    if flags & ActuatorState.FLAG_RAMPING:
+        marks.append(("…", "on its way"))
+    if grade in GRADES:
+        marks.append(("?", f"graded {GRADES[grade]}"))
+    return marks
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One Zernike coefficient.
+
+    Attributes:
+        value_nm: measured, or measured minus predicted.
+        reach_nm: half-width of its 95 % interval.
+        predicted_nm: None = no prediction, or not to be shown.
+    """
+
+    name: str
+    value_nm: float
+    reach_nm: float
+    predicted_nm: float | None
+
+
+def bars(zernike: Any, predicted: Floats | None, as_difference: bool) -> list[Bar]:
+    """Coefficients beyond tilt of a dm_msgs/ZernikeCoefficients; empty when it has no known form.
+
+    Args:
+        predicted: (K,) m for the moment of the map; None = not known.
+        as_difference: show measured minus predicted.
+    """
+    measured = np.array(zernike.coefficients, dtype=np.float64)
+    if measured.shape != (len(NAMES),) or not np.isfinite(measured).all():
+        return []
+    sigma = np.array(zernike.sigma, dtype=np.float64)
+    reach = SIGMAS_95 * sigma if sigma.shape == measured.shape else np.zeros_like(measured)
+    usable = predicted is not None and predicted.shape == measured.shape
+    if as_difference and not usable:
+        return []
+    shown = measured - predicted if as_difference and predicted is not None else measured
+    return [
+        Bar(
+            name=NAMES[k].replace("_", "").replace("^", ","),
+            value_nm=float(shown[k]) * NM,
+            reach_nm=float(reach[k]) * NM,
+            predicted_nm=float(predicted[k]) * NM if predicted is not None and usable and not as_difference else None,
+        )
+        for k in range(len(NAMES))
+        if k not in PISTON_TILT
+    ]
+
+
+def reachable(capabilities: Any) -> tuple[float, float] | None:
+    """Smallest and largest reachable curvature, 1/m; None when not known."""
+    if capabilities is None or not capabilities.calibration_id:
+        return None
+    low, high = capabilities.curvature_min, capabilities.curvature_max
+    return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None
+
+
+def prediction_words(state: Any) -> str:
+    """A dm_msgs/FocusState's prediction as a sentence."""
+    words = (
+        f"Predicted residual {state.predicted_rms * NM:.1f} nm rms "
+        f"(95 %: {state.predicted_rms_lower * NM:.1f} to {state.predicted_rms_upper * NM:.1f} nm), "
+        f"largest coefficient error below {state.predicted_max_zernike_upper * NM:.1f} nm"
+    )
+    if state.predicted_duration > 0:
+        words += f", shape stands after {state.predicted_duration:.2f} s"
+    words += f". Mode: {MODES.get(state.mode, '?').lower()}."
+    if state.saturated:
+        words += f" Saturated: actuators {', '.join(map(str, state.saturated_actuators))}."
+    if not state.history_known:
+        words += " The history of the actuators is not known: a degauss would make this better."
+    return words
+
+
+def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: float, high: float) -> list[float]:
+    """`base` (N,) with one actuator (1-based) moved by `amplitude`, or the other way where the range ends.
+
+    Raises:
+        ValueError: no such actuator.
+    """
+    if not 1 <= actuator <= len(base):
+        raise ValueError(f"actuator = {actuator}: must be 1 to {len(base)}")
+    signals = [float(value) for value in base]
+    up = signals[actuator - 1] + amplitude
+    signals[actuator - 1] = up if low <= up <= high else min(max(signals[actuator - 1] - amplitude, low), high)
+    return signals
+
+
+def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:
+    """Recipes of a dm_msgs/Calibration: curvature, conic constant, re-measured errors in nm, maps."""
+    if calibration is None or not calibration.id:
+        return []
+    return [
+        (
+            f"{recipe.curvature:+.4f}",
+            f"{recipe.conic_constant:g}",
+            f"{recipe.max_zernike * NM:.2f}",
+            f"{recipe.rms * NM:.2f}",
+            str(recipe.maps),
+        )
+        for recipe in calibration.recipes.recipes
+    ]
+
+
+def calibration_words(calibration: Any) -> list[str]:
+    """A dm_msgs/Calibration in lines: what it is, how good, and its limitations."""
+    if calibration is None or not calibration.id:
+        return ["No calibration is in use."]
+    lines = [
+        f"{calibration.id}: {QUALITIES.get(calibration.quality, '?')}, method {calibration.method}, "
+        f"{calibration.maps_used} maps, {calibration.maps_dropped} dropped.",
+        f"Residual {calibration.in_sample_rms * NM:.2f} nm rms in-sample, {calibration.held_out_rms * NM:.2f} nm held "
+        f"out; largest held-out coefficient error {calibration.held_out_max_zernike * NM:.2f} nm.",
+    ]
+    if calibration.hysteresis.play_radius:
+        lines.append(
+            f"Hysteresis: {calibration.memory.law}; creep {calibration.memory.creep_rate:.2%} per decade; held-out "
+            f"moves to {calibration.memory.held_out_max_zernike * NM:.2f} nm."
+        )
+    if calibration.recipes.recipes:
+        lines.append(f"Conditioned recipes: {len(calibration.recipes.recipes)}.")
+    if calibration.revision:
+        lines.append(f"Maps that updated it since: {calibration.revision}.")
+    return lines + [f"Limitation: {sentence}" for sentence in calibration.known_limitations]

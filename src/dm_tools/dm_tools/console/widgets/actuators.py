@@ -1,0 +1,171 @@
+"""The cards of the actuators: command map, poke, hysteresis loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+from nicegui import ui
+
+from dm_tools.console import operations
+from dm_tools.console.console_node import Snapshot
+from dm_tools.console.drawing.charts import loop_chart
+from dm_tools.console.drawing.command_map import command_map, signal_scale
+from dm_tools.console.loops import modelled_loop
+from dm_tools.console.session import Session
+from dm_tools.console.status import why_not
+from dm_tools.console.view_models import SIGNAL_COLOURS, Cell, cells
+from dm_tools.console.widgets.components import ActionButton, Line, Picture, card, labelled
+
+#: What a click on the map emits: the number of the hexagon under it.
+CLICKED = "(event) => { const cell = event.target.closest('[data-actuator]'); if (cell) emit(+cell.dataset.actuator); }"
+ARROWS = {"right": 0.0, "up": math.pi / 2, "left": math.pi, "down": -math.pi / 2}
+SCALE_COLOURS = [to_hex(colormaps[SIGNAL_COLOURS](share / 39)) for share in range(40)]
+
+
+def towards(found: list[Cell], chosen: int, direction: float) -> int:
+    """Number of the nearest actuator in a direction (rad from x to y) from `chosen`; itself at the rim."""
+    here = found[chosen - 1]
+
+    def cost(cell: Cell) -> float:
+        dx, dy = cell.x - here.x, cell.y - here.y
+        along = dx * math.cos(direction) + dy * math.sin(direction)
+        across = abs(dy * math.cos(direction) - dx * math.sin(direction))
+        return along + 2.0 * across if along > 1e-6 and across <= 1.8 * along else math.inf
+
+    best = min(found, key=cost)
+    return best.number if math.isfinite(cost(best)) else chosen
+
+
+class ActuatorCards:
+    """The command map, with the chosen actuator and its loop."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._cells: list[Cell] = []
+        self._loop: tuple[Any, ...] = ()
+        with ui.element("div").classes("pair"):
+            with card("Command map"):
+                with ui.element("div").classes("map w-full").props('tabindex="0" role="group"') as self._map:
+                    self._picture = Picture()
+                labelled(self._map, "Actuators. Arrow keys choose, Enter pokes, Escape releases")
+                self._map.on("click", lambda event: self._clicked(int(event.args)), js_handler=CLICKED)
+                for key, direction in ARROWS.items():
+                    self._map.on(f"keydown.{key}.prevent", lambda _event, way=direction: self._step(way))
+                self._map.on("keydown.enter.prevent", lambda: self._poke())
+                self._scale = Picture()
+                ui.label("▲▼ at a limit · … on its way · ! refused · ? doubtful grade · × not wired").classes("words")
+            with card("Actuator"):
+                self._words = Line("words figures", live=True)
+                with ui.element("div").classes("line"):
+                    self._number = ui.number(
+                        "Number", value=session.chosen, min=1, step=1, format="%d", on_change=self._typed
+                    )
+                    self._number.classes("w-20")
+                    self._amplitude = ui.number("Amplitude", value=0.3, min=-2.0, max=2.0, step=0.1).classes("w-24")
+                with ui.element("div").classes("line"):
+                    self._on_click = ui.switch("Poke by click")
+                    self._with_map = ui.switch("Map after a poke", value=True)
+                with ui.element("div").classes("line"):
+                    self._poke_button = ActionButton("Poke", self._poke)
+                    self._release = ActionButton("Release (Esc)", self._start_release, True)
+                    self._measure_loop = ActionButton("Measure its loop", self._start_loop, True)
+                self._why = Line("why")
+                self._loop_words = Line("words figures")
+                self._loop_picture = Picture()
+        ui.keyboard(on_key=self._key, ignore=[])
+
+    # --- choosing ---
+
+    def _clicked(self, number: int) -> None:
+        self._choose(number)
+        if self._on_click.value:
+            self._poke()
+
+    def _typed(self) -> None:
+        if self._number.value is not None and 1 <= self._number.value <= max(len(self._cells), 1):
+            self._session.chosen = int(self._number.value)
+
+    def _choose(self, number: int) -> None:
+        self._session.chosen = number
+        self._number.set_value(number)
+
+    def _step(self, direction: float) -> None:
+        if self._cells:
+            self._choose(towards(self._cells, self._session.chosen, direction))
+
+    def _key(self, event: Any) -> None:
+        if event.action.keydown and event.key.escape and self._session.base is not None:
+            self._start_release()
+
+    # --- moving ---
+
+    def _poke(self) -> None:
+        session, number, amplitude = self._session, self._session.chosen, self._amplitude.value
+        why = why_not("move", session.snapshot(), session.running)
+        if why or amplitude is None:
+            session.fail(f"Poke {number}", why or "the amplitude must be a number")
+            return
+        maps = bool(self._with_map.value) and not why_not("measure", session.snapshot(), "")
+        session.begin(f"Poke {number}", lambda: operations.poke(session, number, float(amplitude), maps))
+
+    def _start_release(self) -> None:
+        self._session.begin("Release", lambda: operations.release(self._session))
+
+    def _start_loop(self) -> None:
+        session, number, amplitude = self._session, self._session.chosen, self._amplitude.value
+        if amplitude is None:
+            session.fail("Measured loop", "the amplitude must be a number")
+            return
+        work = lambda: operations.measure_loop(session, number, float(amplitude))  # noqa: E731
+        session.begin(f"Loop of actuator {number}", work, session.between_steps)
+
+    # --- showing ---
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        mirror, session = snapshot.mirror_info, self._session
+        why = why_not("move", snapshot, session.running)
+        self._poke_button.allow(why)
+        self._release.allow(why or ("" if session.base is not None else "Nothing is poked."))
+        self._measure_loop.allow(why_not("converge", snapshot, session.running))
+        self._why.show(f"Not possible now: {why}" if why else "")
+        if mirror is None:
+            self._picture.show("", "The driver has not told its actuators yet.")
+            return
+        calibration = snapshot.calibration if snapshot.calibration is not None and snapshot.calibration.id else None
+        self._cells = cells(mirror, snapshot.actuator_state, calibration)
+        session.chosen = min(session.chosen, len(self._cells))
+        radius = 0.5e3 * mirror.working_aperture_diameter
+        self._picture.show(command_map(self._cells, session.chosen, radius))
+        self._scale.show(signal_scale(mirror.signal_min, mirror.signal_max, SCALE_COLOURS))
+        cell, state = self._cells[session.chosen - 1], snapshot.actuator_state
+        volts = f", {state.volts[session.chosen - 1]:.1f} V" if state is not None and len(state.volts) else ""
+        limits = f"limits {mirror.signal_min:+.1f} to {mirror.signal_max:+.1f}"
+        self._words.show(f"{cell.words[0].upper()}{cell.words[1:]}{volts}; {limits}.")
+        self._show_loop(snapshot, calibration)
+
+    def _show_loop(self, snapshot: Snapshot, calibration: Any) -> None:
+        session, mirror = self._session, snapshot.mirror_info
+        law = session.ros.following.law
+        if calibration is None or not law.remembers:
+            fault = session.ros.following.fault if calibration is not None else ""
+            self._loop_words.show(f"The hysteresis in the calibration cannot be used: {fault}" if fault else "")
+            self._loop_picture.show("", "No hysteresis was identified: the plan “Memory” of a calibration does.")
+            return
+        standing = session.ros.following.now(snapshot.bench_time)
+        signal, stands = self._cells[session.chosen - 1].signal, None
+        if standing.effective is not None and signal is not None:
+            stands = (signal, round(float(standing.effective[session.chosen - 1]), 4))
+        measured = session.loops.get(session.chosen)
+        key = (session.chosen, calibration.id, stands, id(measured))
+        if key == self._loop:
+            return
+        self._loop = key
+        loop = measured or modelled_loop(law, session.chosen, mirror.signal_min, mirror.signal_max)
+        loop = dataclasses.replace(loop, stands=stands)
+        doubt = f" Its place in the loop is a guess: {standing.doubt}." if standing.doubt else ""
+        self._loop_words.show(f"Hysteresis as identified: {loop.words}; the cross is where it stands.{doubt}")
+        self._loop_picture.show(loop_chart(loop))

@@ -1,0 +1,125 @@
+"""The card of calibrations: run one, see how it goes, load one."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+from dm_msgs.action import Calibrate
+from dm_msgs.srv import ListCalibrations
+from nicegui import background_tasks, ui
+
+from dm_tools.console import operations
+from dm_tools.console.console_node import RefusedError, Snapshot
+from dm_tools.console.drawing.charts import residual_chart
+from dm_tools.console.session import Session
+from dm_tools.console.status import why_not
+from dm_tools.console.view_models import NM, calibration_words
+from dm_tools.console.widgets.components import ActionButton, Line, Picture, card
+
+
+class CalibrationCard:
+    """Plan, progress with the live residual, and the store."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        #: What the list of the store depends on; None = it must be asked for.
+        self._listed: tuple[Any, ...] | None = None
+        with card("Calibration"):
+            self._words = ui.html("", sanitize=False).classes("words figures")
+            self._shown = ""
+            self._plan = ui.select(operations.PLANS, value=Calibrate.Goal.PLAN_HYSTERESIS, label="Plan").classes(
+                "w-full"
+            )
+            self._maps = ui.number("Length: commands of the memory plan", min=0, step=10, format="%d")
+            self._maps.classes("w-full").props('placeholder="as configured"')
+            self._maps.bind_visibility_from(self._plan, "value", value=Calibrate.Goal.PLAN_HYSTERESIS)
+            self._note = ui.input("Note, stored with it").classes("w-full")
+            with ui.element("div").classes("line"):
+                self._start = ActionButton("Calibrate", self._begin)
+                self._estimate = ActionButton("How long?", self._begin_estimate, True)
+                self._cancel = ActionButton("Cancel calibration", session.cancel, True)
+            self._why = Line("why")
+            self._progress = Line("words figures", live=True)
+            self._residuals = Picture()
+            self._choice = ui.select({}, label="In the store").classes("w-full")
+            self._choice.on("popup-show", self._forget_list)
+            self._load = ActionButton("Load", self._begin_load, True)
+
+    def _goal(self) -> Calibrate.Goal:
+        """What the fields ask for. Raises ValueError naming the field."""
+        goal = Calibrate.Goal(plan=int(self._plan.value), note=str(self._note.value or ""), activate=True)
+        if goal.plan == Calibrate.Goal.PLAN_HYSTERESIS and self._maps.value is not None:
+            length = float(self._maps.value)
+            if not (length.is_integer() and 0 <= length <= 100_000):
+                raise ValueError(
+                    f"length = {length:g}: must be a whole number of commands, 0 (as configured) to 100000"
+                )
+            goal.hysteresis_maps = int(length)
+        return goal
+
+    def _begin(self) -> None:
+        session = self._session
+        try:
+            goal = self._goal()
+        except ValueError as error:
+            session.fail("Calibration", str(error))
+            return
+        work = lambda: operations.calibrate(session, goal)  # noqa: E731
+        session.begin("Calibration", work, lambda: session.ros.cancel("calibrate"))
+
+    def _begin_estimate(self) -> None:
+        session = self._session
+        try:
+            goal = self._goal()
+        except ValueError as error:
+            session.fail("Estimate", str(error))
+            return
+        session.begin("Estimate", lambda: operations.estimate(session, goal))
+
+    def _begin_load(self) -> None:
+        session, name = self._session, str(self._choice.value or "")
+        session.begin("Load", lambda: operations.load(session, name))
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        session = self._session
+        why = why_not("calibrate", snapshot, session.running)
+        self._start.allow(why)
+        self._estimate.allow(why)
+        self._why.show(f"Not possible now: {why}" if why else "")
+        running = session.calibrating
+        self._cancel.allow("" if running else "No calibration is under way.")
+        progress = session.shown_progress
+        step = f"Step {progress.step} of {progress.steps}: {progress.words}" if progress.steps else "The run begins."
+        self._progress.show(step if running else "")
+        residuals_nm = [NM * residual for residual in list(session.ros.watched["calibrate"].residuals)]
+        self._residuals.show(residual_chart(residuals_nm) if residuals_nm else "")
+        lines = "".join(f"<div>{escape(line)}</div>" for line in calibration_words(snapshot.calibration))
+        if lines != self._shown:
+            self._shown = lines
+            self._words.set_content(lines)
+        self._load.allow(
+            why_not("store", snapshot, session.running) or ("" if self._choice.value else "Choose a calibration first.")
+        )
+        in_use = snapshot.calibration.id if snapshot.calibration is not None else ""
+        # Also after runs that were not started here, and after the node was started again.
+        key = (in_use, session.ros.watched["calibrate"].goals, "calibration" in snapshot.present)
+        if key != self._listed and key[-1] and not running:
+            self._listed = key
+            background_tasks.create(self._list())
+
+    def _forget_list(self) -> None:
+        self._listed = None
+
+    async def _list(self) -> None:
+        try:
+            answer: Any = await self._session.ros.call("list_calibrations", ListCalibrations.Request())
+        except RefusedError as error:
+            self._session.fail("List of calibrations", str(error))
+            return
+        options = {
+            name: f"{name} ({residual * 1e9:.1f} nm held out){f', {remark}' if remark else ''}"
+            for name, residual, remark in zip(answer.ids, answer.held_out_rms, answer.remarks, strict=True)
+        }
+        if options != self._choice.options:
+            self._choice.set_options(options, value=self._choice.value if self._choice.value in options else None)

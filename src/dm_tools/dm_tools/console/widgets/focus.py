@@ -1,0 +1,152 @@
+"""The card that asks for a curvature."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from dm_msgs.msg import FocusRequest
+from nicegui import background_tasks, ui
+
+from dm_tools.console import operations
+from dm_tools.console.console_node import RefusedError, Snapshot
+from dm_tools.console.session import Session
+from dm_tools.console.status import why_not
+from dm_tools.console.view_models import MODES, reachable
+from dm_tools.console.widgets.components import ActionButton, Line, card, labelled
+
+#: Step of the slider, 1/m.
+STEP = 0.0005
+#: A prediction is asked for when the wish has stood still so long, s.
+CALM_S = 0.3
+
+
+class FocusCard:
+    """Slider, mode, prediction, and the buttons that move the mirror."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._range: tuple[float, float] | None = None
+        self._changed_at = 0.0
+        self._asked = self._asking = self._typing = False
+        #: What a prediction depends on beside the wish.
+        self._basis: tuple[object, ...] = ()
+        with card("Focus"):
+            self._words = Line("words figures")
+            self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
+            labelled(self._slider, "Curvature in 1 per metre").props("label switch-label-side")
+            with ui.element("div").classes("line"):
+                self._number = ui.number("Curvature, 1/m", value=0.0, step=STEP, format="%.4f", on_change=self._typed)
+                self._number.classes("w-36")
+                self._conic = ui.number("Conic constant", value=0.0, step=0.1, on_change=lambda: self._touch())
+                self._conic.classes("w-28")
+                self._power = Line("words figures")
+            self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO, on_change=lambda: self._touch())
+            labelled(self._mode.props("inline"), "Mode")
+            self._prediction = Line("words figures", live=True)
+            with ui.element("div").classes("line"):
+                self._move = ActionButton("Move", self._start_move)
+                self._flatten = ActionButton(
+                    "Flatten", lambda: session.begin("Flatten", lambda: operations.flatten(session)), True
+                )
+                self._degauss = ActionButton(
+                    "Degauss", lambda: session.begin("Degauss", lambda: operations.degauss(session)), True
+                )
+                self._converge = ActionButton("Converge", self._start_converge, True)
+            self._why = Line("why")
+
+    def _slid(self) -> None:
+        if not self._typing:
+            self._number.set_value(round(float(self._slider.value or 0.0), 4))
+
+    def _typed(self) -> None:
+        value = self._number.value
+        if value is not None and self._range is not None and self._range[0] <= value <= self._range[1]:
+            self._typing = True  # what was typed must not be rounded to the slider's steps
+            self._slider.set_value(value)
+            self._typing = False
+        self._touch()
+
+    def _touch(self) -> None:
+        self._changed_at, self._asked = time.monotonic(), False
+
+    def _request(self) -> FocusRequest | None:
+        """The wish; None when a field is empty."""
+        if self._number.value is None or self._conic.value is None:
+            return None
+        return FocusRequest(
+            curvature=float(self._number.value), conic_constant=float(self._conic.value), mode=int(self._mode.value)
+        )
+
+    def _start_move(self) -> None:
+        request, session = self._request(), self._session
+        if request is None:
+            session.fail("Move", "curvature and conic constant must be numbers")
+            return
+        session.begin("Move", lambda: operations.move(session, request), lambda: session.ros.cancel("move_focus"))
+
+    def _start_converge(self) -> None:
+        request, session = self._request(), self._session
+        if request is None:
+            session.fail("Converge", "curvature and conic constant must be numbers")
+            return
+        session.begin("Converge", lambda: operations.converge(session, request), lambda: session.ros.cancel("converge"))
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        session = self._session
+        why = why_not("focus", snapshot, session.running)
+        self._move.allow(why)
+        self._flatten.allow(why)
+        self._degauss.allow(why_not("move", snapshot, session.running))
+        self._converge.allow(why_not("converge", snapshot, session.running))
+        self._why.show(f"Not possible now: {why}" if why else "")
+        self._take_range(snapshot)
+        value = self._number.value
+        self._power.show(f"= {2 * value:+.4f} dioptre" if value is not None else "")
+        basis = self._prediction_basis(snapshot)
+        if basis != self._basis:
+            self._basis = basis
+            self._touch()
+        calm = time.monotonic() - self._changed_at > CALM_S
+        if not why and calm and not self._asked and not self._asking:
+            self._asked = self._asking = True
+            background_tasks.create(self._predict())
+
+    def _prediction_basis(self, snapshot: Snapshot) -> tuple[object, ...]:
+        """Calibration, recipes, whether the history is known, and what runs: at its end the mirror may have moved."""
+        identity = snapshot.capabilities.calibration_id if snapshot.capabilities is not None else ""
+        recipes = len(snapshot.calibration.recipes.recipes) if snapshot.calibration is not None else 0
+        known = snapshot.actuator_state is not None and snapshot.actuator_state.history_known
+        return identity, recipes, known, self._session.running
+
+    def _take_range(self, snapshot: Snapshot) -> None:
+        found = reachable(snapshot.capabilities)
+        if found is None:
+            self._words.show("Reachable range: not known without a calibration.")
+            self._slider.set_enabled(False)
+            return
+        self._slider.set_enabled(True)
+        capabilities = snapshot.capabilities
+        conditioned = capabilities.error_bound_conditioned
+        extra = f", conditioned {conditioned * 1e9:.1f} nm" if conditioned > 0 else ""
+        self._words.show(
+            f"Reachable {found[0]:+.4f} to {found[1]:+.4f} 1/m ({2 * found[0]:+.3f} to {2 * found[1]:+.3f} dioptre).\n"
+            f"95 % bound on a coefficient: {capabilities.error_bound * 1e9:.1f} nm{extra}."
+        )
+        if found != self._range:
+            self._range = found
+            low, high = math.ceil(found[0] / STEP) * STEP, math.floor(found[1] / STEP) * STEP
+            self._slider.props(f"min={low:.4f} max={high:.4f}")
+
+    async def _predict(self) -> None:
+        request = self._request()
+        try:
+            if request is not None:
+                words = await operations.predict(self._session, request)
+                self._prediction.label.classes(remove="refused")
+                self._prediction.show(words)
+        except RefusedError as error:
+            self._prediction.label.classes(add="refused")
+            self._prediction.show(str(error))
+        finally:
+            self._asking = False

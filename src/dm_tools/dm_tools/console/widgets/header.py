@@ -1,0 +1,73 @@
+"""The top of the page, always in sight: state of the bench, what is missing, and everything that was refused."""
+
+from __future__ import annotations
+
+from html import escape
+
+from nicegui import ui
+
+from dm_tools.console.console_node import Snapshot
+from dm_tools.console.session import Session
+from dm_tools.console.status import badges, missing
+from dm_tools.console.widgets.components import ActionButton, Line, heading
+
+
+class Header:
+    """Badges, outcome, progress and failures."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._shown: tuple[object, ...] = ()
+        self._badges_shown = ""
+        with ui.element("header").classes("top"):
+            with ui.element("div").classes("line"):
+                heading("Deformable mirror console", 1)
+                self._badges = ui.html("", sanitize=False).classes("state").props('role="status" aria-label="State"')
+            with ui.element("div").classes("line") as self._line:
+                self._bar = ui.linear_progress(show_value=False).classes("grow").style("flex: 1; min-width: 120px")
+                self._bar.props('aria-label="Progress"')
+                self._words = Line("words figures")
+                self._cancel = ActionButton("Cancel", session.cancel, outline=True)
+            self._outcome = Line("words", live=True)
+            self._failures = ui.element("div").classes("failures")
+            self._failures.props('role="alert" aria-live="assertive" aria-label="Errors"')
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        progress = self._session.shown_progress
+        shown = badges(snapshot, self._session.ros.following.now(snapshot.bench_time).doubt)
+        content = "".join(f'<span class="badge {badge.kind}">{escape(badge.words)}</span>' for badge in shown)
+        if content != self._badges_shown:
+            self._badges_shown = content
+            self._badges.set_content(content)
+        running = bool(progress.title)
+        self._line.set_visibility(running)
+        if running:
+            share = progress.step / progress.steps if progress.steps else 0.0
+            self._bar.set_value(round(share, 3))
+            self._bar.props(
+                add="indeterminate" if not progress.steps else "", remove="" if not progress.steps else "indeterminate"
+            )
+        count = f" {progress.step}/{progress.steps}" if progress.steps else ""
+        self._words.show(f"{progress.title}{count}: {progress.words}" if running else "")
+        self._cancel.allow("" if progress.can_cancel else "This operation cannot be cancelled; it ends by itself.")
+        self._outcome.show(self._session.outcome)
+        lacking = missing(snapshot.present, snapshot.mirror_info is not None)
+        state = snapshot.actuator_state
+        if state is not None and state.error_code and state.message:
+            lacking.append(f"Driver: {state.message} (error {state.error_code})")
+        key = (tuple(lacking), tuple(failure.number for failure in self._session.failures))
+        if key != self._shown:
+            self._shown = key
+            self._fill(lacking)
+
+    def _fill(self, lacking: list[str]) -> None:
+        self._failures.clear()
+        with self._failures:
+            for failure in reversed(self._session.failures):
+                with ui.element("div").classes("failure"):
+                    ui.label(f"{failure.clock} {failure.title}: {failure.sentence}")
+                    button = ui.button("Dismiss", on_click=lambda _event, n=failure.number: self._session.dismiss(n))
+                    button.props(f'flat dense no-caps color=negative aria-label="Dismiss: {failure.title}"')
+            for sentence in lacking:
+                with ui.element("div").classes("failure missing"):
+                    ui.label(sentence)

@@ -1,0 +1,68 @@
+"""The card of log and diagnostics."""
+
+from __future__ import annotations
+
+from html import escape
+
+from nicegui import ui
+
+from dm_tools.console.console_node import Snapshot
+from dm_tools.console.session import Session
+from dm_tools.console.status import diagnostic_rows, log_rows, shortened
+from dm_tools.console.widgets.components import card
+
+
+def _short(words: str) -> str:
+    """HTML of a sentence with its paths shortened; the whole of it is the tooltip."""
+    short = shortened(words)
+    return escape(short) if short == words else f'<span title="{escape(words)}">{escape(short)}</span>'
+
+
+def _empty(words: str) -> str:
+    return f'<div class="empty">{escape(words)}</div>'
+
+
+def _table(rows: list[tuple[str, ...]]) -> str:
+    if not rows:
+        return _empty("Nothing was logged yet.")
+    cells = ("".join(f"<td>{_short(cell)}</td>" for cell in row) for row in rows)
+    return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
+
+
+class DiagnosticsCard:
+    """What the nodes say of their health, the worst first."""
+
+    def __init__(self) -> None:
+        self._shown = ""
+        with card("Diagnostics"):
+            self._place = ui.html("", sanitize=False).classes("scroll")
+            self._place.props('tabindex="0" role="region" aria-label="Diagnostics"')
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        content = "".join(
+            f'<div class="status"><b>{escape(row.level)}: {escape(row.node)}</b> {_short(row.message)}'
+            f'<div class="faint">{_short(row.figures)}</div></div>'
+            for row in diagnostic_rows(snapshot.diagnostics)
+        ) or _empty("No node has told its health yet.")
+        if content != self._shown:
+            self._shown = content
+            self._place.set_content(content)
+
+
+class LogCard:
+    """What the nodes logged since the console was started, the newest first."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._shown: tuple[int, bool] | None = None
+        with card("Log"):
+            self._all = ui.switch("Show everything, not only warnings and errors", value=True)
+            self._place = ui.html("", sanitize=False).classes("scroll")
+            self._place.props('tabindex="0" role="log" aria-label="Log"')
+
+    def refresh(self, _snapshot: Snapshot) -> None:
+        log = self._session.ros.log
+        key = (log.count, bool(self._all.value))
+        if key != self._shown:
+            self._shown = key
+            self._place.set_content(_table(log_rows(list(log.lines), bool(self._all.value))))

@@ -1,0 +1,87 @@
+"""The card of recipes: those of the calibration in use, and how to build more."""
+
+from __future__ import annotations
+
+import math
+from html import escape
+
+from nicegui import ui
+
+from dm_tools.console import operations
+from dm_tools.console.console_node import Snapshot
+from dm_tools.console.session import Session
+from dm_tools.console.status import why_not
+from dm_tools.console.view_models import recipe_rows
+from dm_tools.console.widgets.components import ActionButton, Line, card
+
+#: The paper's range (section 3.2), 1/m, and the number of its curvatures.
+FIRST, LAST, NUMBER = -0.05, 0.05, 11
+NUMBER_MAX = 1000
+HEADER = ("1/m", "conic", "largest coefficient, nm", "rms, nm", "maps")
+
+
+def evenly(first: float | None, last: float | None, number: float | None) -> list[float]:
+    """`number` curvatures from `first` to `last`, 1/m.
+
+    Raises:
+        ValueError: naming the field that makes no sense.
+    """
+    for name, value in (("first", first), ("last", last), ("number", number)):
+        if value is None or not math.isfinite(value):
+            raise ValueError(f"{name}: must be a number")
+    assert first is not None and last is not None and number is not None
+    if not (float(number).is_integer() and 1 <= number <= NUMBER_MAX):
+        raise ValueError(f"number = {number:g}: must be a whole number, 1 to {NUMBER_MAX}")
+    if number == 1:
+        return [float(first)]
+    if first == last:
+        raise ValueError(f"first = last = {first:g} 1/m: must differ, or number must be 1")
+    return [round(first + (last - first) * k / (number - 1), 9) for k in range(int(number))]
+
+
+class RecipesCard:
+    """Table of the recipes, fields and button to build some."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._shown = ""
+        with card("Recipes"):
+            self._words = Line("words")
+            self._table = ui.html("", sanitize=False).classes("scroll")
+            self._table.props('tabindex="0" role="region" aria-label="Recipes of the calibration in use"')
+            with ui.element("div").classes("line"):
+                self._first = ui.number("First, 1/m", value=FIRST, step=0.01, format="%.4f").classes("w-24")
+                self._last = ui.number("Last, 1/m", value=LAST, step=0.01, format="%.4f").classes("w-24")
+                self._number = ui.number("Recipes", value=NUMBER, min=1, max=NUMBER_MAX, step=1, format="%d")
+                self._number.classes("w-20")
+            self._build = ActionButton("Build recipes", self._begin)
+            self._why = Line("why")
+
+    def _begin(self) -> None:
+        session = self._session
+        try:
+            curvatures = evenly(self._first.value, self._last.value, self._number.value)
+        except ValueError as error:
+            session.fail("Recipes", str(error))
+            return
+        work = lambda: operations.build_recipes(session, curvatures)  # noqa: E731
+        session.begin("Recipes", work, lambda: session.ros.cancel("converge"))
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        why = why_not("converge", snapshot, self._session.running)
+        self._build.allow(why)
+        self._why.show(f"Not possible now: {why}" if why else "")
+        rows = recipe_rows(snapshot.calibration)
+        self._table.set_visibility(bool(rows))
+        in_use = snapshot.calibration is not None and bool(snapshot.calibration.id)
+        none = "This calibration holds none." if in_use else "No calibration is in use."
+        self._words.show(
+            "A recipe is a command that was corrected on the interferometer from the conditioned mirror; the mode "
+            f"“Conditioned” uses them. {'' if rows else none}"
+        )
+        head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in HEADER)
+        body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        content = f'<table class="numbers"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>' if rows else ""
+        if content != self._shown:
+            self._shown = content
+            self._table.set_content(content)

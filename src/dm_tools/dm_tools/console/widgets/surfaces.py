@@ -1,0 +1,109 @@
+"""The cards of the surface: measured, predicted, difference, and Zernike coefficients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+
+from dm_common.messages import stamp_ns
+from dm_tools.console import operations
+from dm_tools.console.console_node import Snapshot
+from dm_tools.console.drawing.charts import zernike_chart
+from dm_tools.console.drawing.heat_map import DIFFERENCE_COLOURS, SAG_COLOURS, heat_map
+from dm_tools.console.session import Session
+from dm_tools.console.status import why_not
+from dm_tools.console.surface_view import SurfaceView
+from dm_tools.console.surfaces import Surface
+from dm_tools.console.view_models import bars
+from dm_tools.console.widgets.components import ActionButton, Line, Picture, card, labelled
+
+#: Share of the pixels that the scale of a difference covers: a few stray ones must not flatten it.
+COVERED = 99.5
+#: What the bars show, by whether it is a difference.
+KINDS = {True: "Measured − predicted", False: "Measured"}
+
+
+class SurfaceCard:
+    """Three heat maps."""
+
+    def __init__(self, session: Session, view: SurfaceView) -> None:
+        self._session, self._view = session, view
+        self._shown = -1
+        self._panels: list[tuple[Picture, Line]] = []
+        with card("Surface"):
+            with ui.element("div").classes("line"):
+                self._measure = ActionButton(
+                    "Measure", lambda: session.begin("Measure", lambda: operations.measure(session))
+                )
+                self._when = Line("words")
+            self._why = Line("why")
+            with ui.element("div").classes("panels"):
+                for name in ("Measured", "Predicted now", "Measured − predicted"):
+                    with ui.element("div").classes("panel"):
+                        ui.label(name).classes("words").style("font-weight: 600")
+                        self._panels.append((Picture(), Line("words figures")))
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        why = why_not("measure", snapshot, self._session.running)
+        self._measure.allow(why)
+        self._why.show(f"Not possible now: {why}" if why else "")
+        view = self._view
+        view.update(snapshot)
+        if view.version == self._shown:
+            return
+        self._shown = view.version
+        self._when.show(view.when)
+        limit = max([s.extent for s in (view.measured, view.predicted) if s is not None], default=np.nan)
+        self._panel(0, view.measured, limit, SAG_COLOURS, "measured surface", view.why_no_map)
+        words = " ".join([f"A guess: {view.doubt}." if view.doubt else "", view.remark]).strip()
+        self._panel(1, view.predicted, limit, SAG_COLOURS, "predicted surface", view.why_no_prediction, words)
+        gap = view.difference
+        extent = float(np.nanpercentile(np.abs(gap.sag), COVERED)) if gap is not None else np.nan
+        self._panel(2, gap, extent, DIFFERENCE_COLOURS, "measured minus predicted", view.why_no_difference)
+
+    def _panel(
+        self, place: int, surface: Surface | None, limit: float, colours: str, name: str, why: str, remark: str = ""
+    ) -> None:
+        picture, words = self._panels[place]
+        if surface is None:
+            picture.show("", why)
+            words.show("")
+            return
+        picture.show(heat_map(surface, limit, colours, name))
+        words.show(
+            f"Peak to valley {surface.peak_to_valley * 1e9:.1f} nm, rms {surface.rms * 1e9:.2f} nm, "
+            f"piston and tilt removed. {remark}"
+        )
+
+
+class ZernikeCard:
+    """Bars of the coefficients of the latest map."""
+
+    def __init__(self, view: SurfaceView) -> None:
+        self._view = view
+        self._shown: tuple[Any, ...] = ()
+        with card("Zernike coefficients"):
+            self._kind = ui.radio(KINDS, value=True)
+            labelled(self._kind.props("inline"), "What the bars show")
+            self._bars = Picture()
+            self._note = Line("words")
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        zernike, wanted = snapshot.zernike, bool(self._kind.value)
+        key = (self._view.version, wanted, zernike)
+        if key == self._shown:
+            return
+        self._shown = key
+        of_this_map = zernike is not None and stamp_ns(zernike.header.stamp) == self._view.stamp
+        predicted = self._view.predicted_zernike if of_this_map else None
+        as_difference = wanted and predicted is not None
+        found = bars(zernike, predicted, as_difference) if zernike is not None else []
+        self._bars.show(zernike_chart(found, KINDS[as_difference]) if found else "", "No map was measured yet.")
+        words = ["Terms beyond tilt with their 95 % intervals from the fit of the map."] if found else []
+        if found and predicted is not None and not as_difference:
+            words.append("The diamond is the prediction for the moment of the map.")
+        if found and wanted and not as_difference:
+            words.append(f"Shown as measured. {self._view.why_no_difference}")
+        self._note.show(" ".join(words))

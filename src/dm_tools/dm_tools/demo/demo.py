@@ -1,0 +1,259 @@
+"""`dm demo`: the whole chain on the virtual bench, from the first poke to re-measured spheres."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dm_tools.demo.demo_bench import bench_config
+from dm_tools.demo.demo_bench import free_ports as free_ports
+from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
+
+#: Curvatures of the sweep [1/m]: the paper's range (section 3.2).
+CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
+
+
+class Hysteresis(StrEnum):
+    """Laws of the twin's piezo actuators."""
+
+    off = "off"
+    prandtl_ishlinskii = "prandtl_ishlinskii"
+    preisach = "preisach"
+    bouc_wen = "bouc_wen"
+
+
+def sample_map() -> Path | None:
+    """A real ZYGO map at hand beside the checkout, if there is one."""
+    folder = Path(os.environ.get("DM_ROOT", ".")).resolve().parent / "shared" / "samples"
+    return next(iter(sorted(folder.glob("*.dat"))), None)
+
+
+def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
+    """Read a real map through an interferometer node of its own; returns the figures for JSON."""
+    from dm_bringup.suite import Suite
+    from dm_client.client import STARTING_S, DeformableMirrorClient
+
+    nodes = ("interferometer",)
+    with (
+        Suite({"interferometer": {}}, folder / "ingest", domain, namespace="ingest", nodes=nodes),
+        DeformableMirrorClient("ingest", domain, STARTING_S) as client,
+    ):
+        answer = client.ingest(str(path.resolve()))
+    console.print(
+        f"real map [bold]{path.name}[/]: {answer.info.width} x {answer.info.height}, "
+        f"PV {nanometres(answer.info.pv):.1f} nm, rms {nanometres(answer.info.rms):.1f} nm, "
+        f"21-term residual {nanometres(answer.zernike.residual_rms):.1f} nm"
+    )
+    return {
+        "file": path.name,
+        "pv_nm": nanometres(answer.info.pv),
+        "rms_nm": nanometres(answer.info.rms),
+        "valid_fraction": answer.info.valid_fraction,
+    }
+
+
+def best_possible(calibration: Any, mirror: Any) -> float:
+    """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, as the model says."""
+    from dm_controller.conversions import limits_of, model_of
+    from dm_controller.mirror_model import CalibratedMirror
+    from dm_controller.target import FocusTarget
+
+    calibrated = CalibratedMirror(model_of(calibration), limits_of(mirror))
+    return max(calibrated.plan(FocusTarget(curvature)).rms for curvature in (CURVATURES[0], CURVATURES[-1]))
+
+
+def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
+    """Ask for each curvature, measure what came, and compare."""
+    import numpy as np
+
+    from dm_controller.target import FocusTarget
+    from dm_tools.verify import map_of, surface_error
+
+    rows = []
+    with progress_bar() as progress:
+        task = progress.add_task("focus", total=len(CURVATURES))
+        for curvature in CURVATURES:
+            prediction = client.focus(curvature, dry_run=True)
+            client.move_focus(curvature, settle_time=settle)
+            measurement, image = client.measure_map(f"focus {curvature:+.3f}")
+            sag = map_of(image)
+            error = surface_error(sag, measurement.info, FocusTarget(curvature))
+            rows.append(
+                {
+                    "curvature": curvature,
+                    "prediction": prediction,
+                    "signals": np.asarray(prediction.signals),
+                    "sag": np.array(sag),
+                    "info": measurement.info,
+                    "error": error,
+                }
+            )
+            progress.advance(task)
+    return rows
+
+
+def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> None:
+    """Print the table: predicted, re-measured, limit."""
+    from rich.table import Table
+
+    table = Table(title=f"open-loop focus, {how}: predicted before the move, re-measured after it")
+    for heading in (
+        "curvature 1/m",
+        "dioptre",
+        "predicted rms nm",
+        "measured rms nm",
+        "largest coeff. nm",
+        "",
+        "saturated",
+    ):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        table.add_row(
+            f"{row['curvature']:+.2f}",
+            f"{2 * row['curvature']:+.2f}",
+            f"{nanometres(row['prediction'].predicted_rms):.1f}",
+            f"{nanometres(row['error'].rms):.1f}",
+            f"{nanometres(row['error'].max_zernike):.2f}",
+            as_wavelengths(row["error"].max_zernike),
+            "yes" if row["prediction"].saturated else "no",
+        )
+    console.print(table)
+    worst = max(row["error"].max_zernike for row in rows)
+    console.print(
+        f"fitting limit of this mirror at 0.05 1/m: {nanometres(fitting_limit):.1f} nm rms; "
+        f"largest coefficient error of the sweep: {nanometres(worst):.2f} nm ({as_wavelengths(worst)})"
+    )
+
+
+def remember(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str, Any]]]:
+    """Identify hysteresis and creep, wipe the memory, sweep again; returns the result of the run and the rows."""
+    from dm_msgs.action import Calibrate
+
+    from dm_tools.verbs.calibrate import run_calibration, show_result
+
+    goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=maps, activate=True, note="demo, memory")
+    result = run_calibration(client, goal)
+    show_result(result)
+    if not client.wait(lambda: client.capabilities.calibration_id == result.id):
+        raise RuntimeError("the focus controller did not take the new calibration")
+    client.degauss()
+    return result, sweep(client, settle)
+
+
+def rows_for_json(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The figures of a sweep."""
+    return [
+        {
+            "curvature": row["curvature"],
+            "predicted_rms_nm": nanometres(row["prediction"].predicted_rms),
+            "measured_rms_nm": nanometres(row["error"].rms),
+            "max_zernike_nm": nanometres(row["error"].max_zernike),
+            "saturated": row["prediction"].saturated,
+        }
+        for row in rows
+    ]
+
+
+def demo(
+    hysteresis: Annotated[
+        Hysteresis, typer.Option(help="Law of the twin's actuators; `off` = ideal ones, without creep too.")
+    ] = Hysteresis.prandtl_ishlinskii,
+    creep: Annotated[
+        float | None, typer.Option(min=0.0, max=0.2, help="Creep per decade of time; default 0.01.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the twin.")] = 1,
+    speed: Annotated[float, typer.Option(min=0.0, help="How much faster than real time; 0 = real time.")] = 20.0,
+    hysteresis_maps: Annotated[
+        int, typer.Option(min=0, help="Maps to identify hysteresis and creep from; 0 = leave that out.")
+    ] = 200,
+    map_file: Annotated[Path | None, typer.Option("--map", help="A real ZYGO file to ingest first.")] = None,
+    config_file: Annotated[
+        Path | None, typer.Option("--config", help="Parameter file of another virtual bench, such as mirror_19.yaml.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for logs, calibration and picture.")] = Path("runs/demo"),
+    keep_maps: Annotated[bool, typer.Option(help="Keep the map files (about 4 MB each).")] = False,
+    camera: Annotated[
+        bool, typer.Option("--camera", help="Autofocus a virtual camera behind the mirror on three objects instead.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Calibrate a virtual mirror (a PDM30-37) through the real nodes, wire protocol and file formats, then focus it."""
+    if camera:
+        from dm_tools.demo.demo_camera import demo_camera
+
+        demo_camera(hysteresis, creep, seed, speed, out, json)
+        return
+    from dm_msgs.action import Calibrate
+
+    from dm_bringup.suite import Suite, own_domain
+    from dm_client.client import STARTING_S, DeformableMirrorClient
+    from dm_tools.demo.figures import save_sweep_figure
+    from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
+
+    started = time.monotonic()
+    folder = out.resolve()
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+    actual_creep = creep if creep is not None else (0.0 if hysteresis is Hysteresis.off else 0.01)
+    config = bench_config(folder, hysteresis.value, actual_creep, seed, speed, config_file)
+    name = config["pdm_driver"].get("mirror.name", "PDM30-37")
+    figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": actual_creep, "seed": seed}
+    with own_domain() as domain:
+        real = map_file if map_file is not None else sample_map()
+        if real is not None:
+            figures["real_map"] = ingest_real_map(real, folder, domain)
+        else:
+            console.print("no real ZYGO map at hand; give one with --map FILE")
+        console.print(
+            f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
+            f"seed {seed}; logs in {os.path.relpath(folder)}"
+        )
+        with (
+            Suite(config, folder, domain) as suite,
+            DeformableMirrorClient(domain=domain, timeout_s=STARTING_S) as client,
+        ):
+            try:
+                client.wait_until_active(20.0)
+                begun = time.monotonic()
+                result = run_calibration(client, Calibrate.Goal(activate=True, note="demo"))
+                wall_time = time.monotonic() - begun
+                show_result(result)
+                if not client.wait(lambda: client.capabilities.calibration_id == result.id):
+                    raise RuntimeError("the focus controller did not take the new calibration")
+                console.print(f"reachable: {client.capabilities.message}")
+                mirror = client.mirror_info
+                fitting_limit = best_possible(client.latest("calibration"), mirror)
+                settle = float(config["calibration"]["settle_time"])
+                rows, without_hysteresis = sweep(client, settle), []
+                if hysteresis_maps and (hysteresis is not Hysteresis.off or actual_creep):
+                    show_sweep(rows, fitting_limit, "influence function alone")
+                    without_hysteresis = rows
+                    remembering, rows = remember(client, hysteresis_maps, settle)
+                    figures["hysteresis"] = figures_of(remembering)
+                    figures["focus_without_memory"] = rows_for_json(without_hysteresis)
+            except Exception:
+                suite.check()  # a node that died explains more than the request that failed
+                raise
+    show_sweep(
+        rows, fitting_limit, "hysteresis and creep inverted" if without_hysteresis else "influence function alone"
+    )
+    title = f"{name} twin, hysteresis: {hysteresis.value}"
+    picture = save_sweep_figure(rows, folder / "demo.png", title, mirror, without_hysteresis)
+    console.print(f"picture: {os.path.relpath(picture)}")
+    if not keep_maps:
+        shutil.rmtree(folder / "maps")
+    figures |= {
+        "calibration": figures_of(result) | {"seconds": wall_time, "bench_seconds": result.duration},
+        "focus": rows_for_json(rows),
+        "fitting_limit_nm": nanometres(fitting_limit),
+        "seconds": time.monotonic() - started,
+    }
+    write_json(json, figures)
+    console.print(f"done in {time.monotonic() - started:.0f} s")

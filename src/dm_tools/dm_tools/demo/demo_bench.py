@@ -1,0 +1,82 @@
+"""The virtual bench of a run: a configuration with ports and folders of its own."""
+
+from __future__ import annotations
+
+import copy
+import socket
+from pathlib import Path
+from typing import Any
+
+#: A port of the virtual bench that is not offered.
+OFF = -1
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that are free on loopback now, for TCP and UDP alike."""
+    sockets: list[socket.socket] = []
+    while len(sockets) < count:
+        stream = socket.create_server(("127.0.0.1", 0))
+        datagram = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            datagram.bind(stream.getsockname())
+        except OSError:
+            stream.close()
+            continue
+        finally:
+            datagram.close()
+        sockets.append(stream)
+    ports = [item.getsockname()[1] for item in sockets]
+    for item in sockets:
+        item.close()
+    return ports
+
+
+def bench_config(
+    folder: Path, law: str, creep: float, seed: int, speed: float, source: Path | None = None
+) -> dict[str, dict[str, Any]]:
+    """A configuration of a virtual bench with ports and folders of this run's own, and time `speed` times as fast.
+
+    Args:
+        source: the parameter file; None = the shipped bench.
+
+    Raises:
+        ConfigError: the file cannot be used.
+        ValueError: it has no virtual bench, or the parts of one that a run changes are missing.
+    """
+    from dm_bringup.suite import load_config
+    from dm_tools.verbs.up import shared_config
+
+    source = source if source is not None else shared_config("bench.yaml")
+    config = copy.deepcopy(load_config(source))
+    for node in ("virtual_bench", "pdm_driver", "interferometer", "calibration", "focus_controller"):
+        if node not in config:
+            raise ValueError(f"{source}: no section for {node}: a demo needs a virtual bench and all nodes")
+    bench, driver = config["virtual_bench"], config["pdm_driver"]
+    tcp, udp, discovery, trigger = free_ports(4)
+    old_trigger = str(bench.get("trigger.port", ""))
+    own_ports = {"electronics.tcp_port": tcp, "electronics.udp_port": udp, "electronics.discovery_port": discovery}
+    bench |= {name: port for name, port in own_ports.items() if bench.get(name) != OFF}
+    bench |= {
+        "seed": seed,
+        "piezo.law": "none" if law == "off" else law,
+        "piezo.creep": creep,
+        "trigger.port": trigger,
+        "clock.speed": speed,
+        "output_folder": str(folder / "maps"),
+    }
+    if bench.get("electronics.pty_link"):
+        bench["electronics.pty_link"] = driver["electronics.serial_port"] = str(folder / "tty")
+    driver |= {"electronics.port": tcp, "state_folder": str(folder / "driver")}
+    command = [
+        str(trigger) if part == old_trigger else part for part in config["interferometer"].get("trigger_command", [])
+    ]
+    config["interferometer"] |= {"watch_folder": str(folder / "maps"), "trigger_command": command}
+    config["calibration"] |= {"calibration_folder": str(folder / "calibrations"), "load_on_start": ""}
+    (folder / "maps").mkdir(parents=True, exist_ok=True)
+    if speed > 0:
+        # Ages are in ROS time, in which the same delay between two processes is `speed` times as long.
+        config["pdm_driver"]["limits.command_age"] = max(1.0, speed)
+        config["focus_controller"]["request_age"] = max(1.0, speed)
+        for name in config:
+            config[name]["use_sim_time"] = name != "virtual_bench"
+    return config

@@ -1,0 +1,1 @@
+"""doctor of dm_tools."""

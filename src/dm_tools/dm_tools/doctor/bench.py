@@ -1,0 +1,292 @@
+"""What the doctor checks on one bench: its file, the electronics, ports, folders, the calibration in store."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from dm_bringup.suite import Config, ConfigError, load_config
+from dm_common.names import unknown_name
+from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
+from dm_tools.doctor.finding import Check, Finding
+from dm_tools.doctor.machine import disk
+
+UNSET = "CHANGE"
+DAY_S = 86400.0
+#: Parameters that every node has.
+COMMON = ("use_sim_time",)
+
+
+def bench_checks(file: Path) -> Iterator[Check]:
+    """Those that the file calls for."""
+    try:
+        config = load_config(file)
+    except ConfigError as error:
+        reason = str(error)
+        template = "correct the file; src/dm_bringup/config/hardware.yaml is a template"
+        yield f"configuration {file}", lambda: Finding(reason, template)
+        return
+    yield "required parameters", lambda: required_parameters(config)
+    yield "values of your own", lambda: own_values(config)
+    yield "parameters", lambda: parameters(config)
+    yield "configuration of the driver", lambda: driver_configuration(config)
+    if "virtual_bench" in config:
+        yield "ports of the virtual bench", lambda: free_ports(config["virtual_bench"])
+    else:
+        yield from _electronics(config.get("pdm_driver", {}))
+    watched = _folder_of(config, "interferometer", "watch_folder")
+    if watched is not None:
+        writes = "{path}" in " ".join(map(str, config["interferometer"].get("trigger_command", [])))
+        made = "virtual_bench" in config
+        yield f"watched folder {watched}", lambda: watched_folder(watched, writes, made)
+    store = _folder_of(config, "calibration", "calibration_folder")
+    if store is not None:
+        serial = str(config.get("pdm_driver", {}).get("mirror.serial", ""))
+        yield f"calibration folder {store}", lambda: writable_folder(store)
+        if serial != UNSET:
+            yield "calibration", lambda: stored_calibration(store, serial)
+
+
+def _folder_of(config: Config, node: str, name: str) -> Path | None:
+    text = str(config.get(node, {}).get(name, ""))
+    return Path(text).expanduser() if text and text != UNSET else None
+
+
+def _tables() -> Mapping[str, tuple[Parameter, ...]]:
+    from dm_tools.documentation.parameters import TABLES
+
+    return TABLES
+
+
+def required_parameters(config: Config) -> Finding | None:
+    driver = config.get("pdm_driver", {})
+    missing = [item.name for item in _tables()["pdm_driver"] if item.default is REQUIRED and item.name not in driver]
+    if missing:
+        return Finding(
+            f"pdm_driver lacks {', '.join(missing)}", "add them; docs/parameters.md tells what each of them means"
+        )
+    return None
+
+
+def own_values(config: Config) -> Finding | None:
+    unset = [f"{node}.{name}" for node, values in config.items() for name, value in values.items() if value == UNSET]
+    if unset:
+        return Finding(f"still {UNSET}: {', '.join(unset)}", "put in the values of your bench")
+    return None
+
+
+def parameters(config: Config) -> Finding | None:
+    """Names nobody knows, wrong types, values out of their range; all of them at once."""
+    wrong: list[str] = []
+    for node, values in config.items():
+        known = {item.name: item for item in _tables()[node]}
+        for name, value in values.items():
+            if name in known:
+                problem = "" if value == UNSET else _wrong(known[name], value)
+                wrong += [f"{node}: {problem}"] if problem else []
+            elif name not in COMMON:
+                wrong.append(f"{node}: {unknown_name('parameter', name, known)}")
+    if wrong:
+        return Finding("; ".join(wrong), "correct the file; docs/parameters.md lists every parameter with its range")
+    return None
+
+
+def _wrong(parameter: Parameter, value: Any) -> str:
+    """What is wrong with one value, in words; "" = nothing. ROS 2 converts no types, so an integer is no float."""
+    many = isinstance(parameter.kind, str)
+    kind = {"float[]": float, "int[]": int, "str[]": str}[parameter.kind] if many else parameter.kind  # type: ignore[index]
+    items = value if many and isinstance(value, list) else [value]
+    if many != isinstance(value, list) or any(type(item) is not kind for item in items):
+        hint = f"; write {float(value)}" if kind is float and type(value) is int else ""
+        return f"{parameter.name} = {value!r}: must be {parameter.allowed()}{hint}"
+    try:
+        parameter.check(value)
+    except ParameterError as error:
+        return str(error)
+    return ""
+
+
+def driver_configuration(config: Config) -> Finding | None:
+    """Whether the driver's values fit each other: wiring, volts, limits, frames."""
+    from dm_driver.driver_configuration import build_configuration
+
+    given = config.get("pdm_driver", {})
+    if any(value == UNSET for value in given.values()) or required_parameters(config) or parameters(config):
+        return None  # told already
+    values = {item.name: item.default for item in _tables()["pdm_driver"]} | given
+    try:
+        build_configuration(values)
+    except ValueError as error:
+        return Finding(str(error), "correct the value; the driver refuses to configure with it")
+    return None
+
+
+def _electronics(driver: Mapping[str, Any]) -> Iterator[Check]:
+    kind, address = driver.get("electronics.kind"), str(driver.get("electronics.address", ""))
+    port = driver.get("electronics.port", 1234)
+    if kind == "edac40_tcp" and address and address != UNSET:
+        yield f"electronics at {address}:{port}", lambda: tcp(address, port)
+    discovery = driver.get("electronics.discovery_port", 0)
+    if kind == "edac40_udp" and address and address != UNSET and discovery:
+        yield f"electronics at {address}", lambda: answers_discovery(address, discovery)
+    device = str(driver.get("electronics.serial_port", ""))
+    if kind in ("usb_dac40", "framed_serial") and device and device != UNSET:
+        yield f"serial port {device}", lambda: serial_port(Path(device).expanduser())
+
+
+def tcp(address: str, port: int) -> Finding | None:
+    try:
+        socket.create_connection((address, port), 2.0).close()
+    except OSError as error:
+        return Finding(
+            f"no EDAC40 answers at {address}:{port}: {error}",
+            "check power, cable and address (./dm exec python -m dm_driver.electronics.discover); it takes one client at a time:"
+            " close the vendor's program, or stop the nodes that hold it",
+        )
+    return None
+
+
+def answers_discovery(address: str, port: int) -> Finding | None:
+    from dm_driver.electronics.discovery import discover
+
+    try:
+        if discover(address, port, 1.0):
+            return None
+        reason = "no answer within 1 s"
+    except OSError as error:
+        reason = str(error)
+    return Finding(f"no EDAC40 at {address}: discovery on UDP port {port}: {reason}", "check power, cable and address")
+
+
+def serial_port(device: Path) -> Finding | None:
+    if not device.exists():
+        return Finding(
+            f"{device} does not exist",
+            "plug the unit in; `ls -l /dev/serial/by-id` shows what is there, under names that stay",
+        )
+    if not os.access(device, os.R_OK | os.W_OK):
+        group = _group(device)
+        return Finding(
+            f"no permission for {device}: it belongs to the group {group}",
+            f"sudo usermod -aG {group} $USER, then log out and in again",
+        )
+    if holders := _holders(device):
+        return Finding(
+            f"{device} is in use by {', '.join(holders)}",
+            "end that program: two writers on one unit tear each other's frames",
+            note=True,
+        )
+    return None
+
+
+def _group(path: Path) -> str:
+    try:
+        return path.group()
+    except KeyError:
+        return str(path.stat().st_gid)
+
+
+def _holders(device: Path) -> list[str]:
+    """Programs that have the device open, as far as we may look."""
+    target, holders = device.resolve(), []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if any(link.readlink() == target for link in (process / "fd").iterdir()):
+                holders.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
+        except OSError:
+            continue  # not ours, or gone meanwhile
+    return holders
+
+
+def free_ports(bench: Mapping[str, Any]) -> Finding | None:
+    """Whether the ports that the bench wants are free."""
+    table = {item.name: item.default for item in _tables()["virtual_bench"]}
+    taken = []
+    for name, kind in (
+        ("electronics.tcp_port", socket.SOCK_STREAM),
+        ("electronics.udp_port", socket.SOCK_DGRAM),
+        ("electronics.discovery_port", socket.SOCK_DGRAM),
+        ("trigger.port", socket.SOCK_STREAM),
+    ):
+        port = bench.get(name, table[name])
+        if not isinstance(port, int) or not 0 < port <= 65535:
+            continue
+        with socket.socket(socket.AF_INET, kind) as probe:
+            if kind == socket.SOCK_STREAM:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                taken.append(f"{name} = {port}: {error.strerror}")
+    if taken:
+        return Finding(
+            "; ".join(taken),
+            "stop the ./dm up that is running, or the program that holds the port (ss -lntup shows it); or take others",
+        )
+    return None
+
+
+def watched_folder(folder: Path, written: bool, made: bool) -> Finding | None:
+    """Whether maps can be read there, and written when a command is to write them there.
+
+    Args:
+        written: a trigger writes maps there for us.
+        made: a virtual bench makes the folder when it starts.
+    """
+    if made and not folder.exists():
+        return writable_folder(folder)
+    if not folder.is_dir():
+        what = "is not a folder" if folder.exists() else "does not exist"
+        return Finding(f"{folder} {what}", "create or mount it; the instrument saves its maps there")
+    if not os.access(folder, os.R_OK | os.X_OK):
+        return Finding(f"{folder} cannot be read", f"give this user the right to read it: chmod u+rx {folder}")
+    if written and not os.access(folder, os.W_OK):
+        return Finding(f"{folder} cannot be written to, and trigger_command saves maps there", f"chmod u+w {folder}")
+    return None
+
+
+def writable_folder(folder: Path) -> Finding | None:
+    """Whether a folder can be written to, or made."""
+    nearest = folder
+    while not nearest.exists() and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir():
+        return Finding(f"{nearest} is not a folder", "choose another folder, or remove the file")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        what = "cannot be written to" if nearest == folder else f"cannot be made: {nearest} cannot be written to"
+        return Finding(f"{folder} {what}", f"choose another folder, or: sudo chown $USER {nearest}")
+    return disk(nearest) if shutil.disk_usage(nearest).free != shutil.disk_usage(Path.home()).free else None
+
+
+def stored_calibration(folder: Path, serial: str) -> Finding | None:
+    """Whether there is a readable calibration of this mirror, and how old it is."""
+    from dm_calibration.store.calibration_store import CalibrationStore
+
+    entries = CalibrationStore(folder).entries()
+    own = [entry.calibration for entry in entries if entry.calibration and entry.calibration.mirror_serial == serial]
+    damaged = [entry for entry in entries if entry.calibration is None]
+    if damaged:
+        return Finding(damaged[0].remark, f"move it out of {folder}; restore it from your backup if you need it")
+    if not own:
+        other = sorted({entry.calibration.mirror_serial for entry in entries if entry.calibration})
+        seen = f"; those there are of {', '.join(other)}" if other else ""
+        return Finding(
+            f"no calibration of the mirror {serial} in {folder}{seen}", "./dm calibrate, once the nodes run", note=True
+        )
+    newest = own[0]
+    assert newest is not None
+    table = {item.name: item.default for item in _tables()["calibration"]}
+    checked = max(newest.created_ns * 1e-9, (folder / f"{newest.id}.h5").stat().st_mtime)  # updates rewrite the file
+    days = (time.time() - checked) / DAY_S
+    if days * DAY_S > table["updates.stale_after"]:
+        return Finding(
+            f"{newest.id} is {days:.0f} days old, and no map has been compared with it since",
+            "./dm check tells whether it is still true, and mends small drifts; else ./dm calibrate",
+            note=True,
+        )
+    return None

@@ -1,0 +1,206 @@
+"""What the doctor checks on any machine: packages, messages between nodes, memory, disk, clock."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import time
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from dm_bringup.suite import NODES
+from dm_tools.doctor.finding import Check, Finding
+
+MODULES = ("rclpy", "dm_msgs.msg", "dm_driver", "dm_calibration", "numpy", "scipy", "statsmodels", "h5py", "serial")
+#: Each node takes a segment of 16 MB in /dev/shm, see config/fastdds.xml.
+SHARED_HYSTERESIS_MIN = 128e6
+DISK_MIN = 1e9
+#: DDS takes its ports from the domain; above this they run into those that the system hands out.
+DOMAIN_MAX = 101
+#: A node announces itself once, then every few seconds.
+DISCOVERY_S = 3.0
+#: Commands that seem older than `limits.command_age` or further ahead than `limits.command_lead` are refused.
+CLOCK_SKEW_S = 0.5
+REPORTS_S = 2.5
+
+
+def machine_checks(namespace: str = "") -> list[Check]:
+    """All of them, in the order in which a cure makes sense."""
+    return [
+        ("packages", packages),
+        ("Fast DDS profile", profile),
+        ("shared memory", shared_memory),
+        ("ROS domain", domain),
+        ("messages between nodes", messages),
+        ("nodes that are running", lambda: running_nodes(namespace)),
+        ("disk", lambda: disk(Path.home())),
+        ("clock", clock),
+    ]
+
+
+def packages() -> Finding | None:
+    for name in MODULES:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            return Finding(f"cannot import {name}: {error}", "remove the folder .venv and run ./dm again")
+    return None
+
+
+def profile() -> Finding | None:
+    cure = "run through ./dm, or export FASTRTPS_DEFAULT_PROFILES_FILE=<share>/dm_bringup/config/fastdds.xml"
+    path = os.environ.get("FASTRTPS_DEFAULT_PROFILES_FILE", "")
+    if not path:
+        return Finding("no Fast DDS profile is loaded: surface maps travel slowly, nodes find each other late", cure)
+    try:
+        tree = ElementTree.parse(path)
+    except OSError as error:
+        return Finding(f"the Fast DDS profile {path} cannot be read: {error.strerror}", cure)
+    except ElementTree.ParseError as error:
+        return Finding(f"the Fast DDS profile {path} is no XML: {error}", cure)
+    names = {element.tag.rpartition("}")[2] for element in tree.iter()}
+    if missing := {"segment_size", "maxInitialPeersRange"} - names:
+        return Finding(
+            f"the Fast DDS profile {path} does not set {', '.join(sorted(missing))}",
+            "take over these settings from config/fastdds.xml of dm_controller",
+            note=True,
+        )
+    return None
+
+
+def shared_memory() -> Finding | None:
+    folder = Path("/dev/shm")
+    free = shutil.disk_usage(folder).free if folder.is_dir() else 0
+    if free < SHARED_HYSTERESIS_MIN:
+        return Finding(
+            f"/dev/shm has {free / 1e6:.0f} MB free; each node takes 17 MB",
+            "remove stale fastrtps_* files from /dev/shm (fastdds shm clean); in a container raise --shm-size",
+        )
+    return None
+
+
+def domain() -> Finding | None:
+    text = os.environ.get("ROS_DOMAIN_ID", "0")
+    if not (text.isdecimal() and int(text) <= DOMAIN_MAX):
+        return Finding(f"ROS_DOMAIN_ID = {text!r}: must be 0 to {DOMAIN_MAX}", "export ROS_DOMAIN_ID=0")
+    if os.environ.get("ROS_LOCALHOST_ONLY") not in (None, "", "0"):
+        return Finding(
+            "ROS_LOCALHOST_ONLY is set: it overrules ROS_AUTOMATIC_DISCOVERY_RANGE and is deprecated",
+            "unset ROS_LOCALHOST_ONLY",
+            note=True,
+        )
+    return None
+
+
+def messages() -> Finding | None:
+    from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+
+    with DeformableMirrorClient() as first, DeformableMirrorClient() as second:
+        from std_msgs.msg import String
+
+        received: list[Any] = []
+        second.node.create_subscription(String, "doctor_echo", received.append, 1)
+        publisher = first.node.create_publisher(String, "doctor_echo", 1)
+        try:
+            if not first.wait(lambda: publisher.get_subscription_count() > 0, 5.0):
+                return Finding(
+                    "two nodes on this machine do not find each other",
+                    "check ROS_AUTOMATIC_DISCOVERY_RANGE (LOCALHOST or SUBNET, not OFF) and firewalls (UDP 7400 on)",
+                )
+            publisher.publish(String(data="?"))
+            if not first.wait(lambda: received, 2.0):
+                return Finding(
+                    "a message between two nodes did not arrive", "fastdds shm clean; then ./dm doctor again"
+                )
+        except DeformableMirrorError as error:
+            return Finding(str(error), "run ./dm again")
+    return None
+
+
+def running_nodes(namespace: str = "") -> Finding | None:
+    """Nodes of the suite in this domain: twice is wrong, once is worth knowing; and how their clock differs."""
+    from dm_client.client import DeformableMirrorClient
+
+    with DeformableMirrorClient(namespace) as client:
+        place = client.node.get_namespace()
+        ours = {name for name, _module in NODES}
+
+        def seen() -> Counter[str]:
+            found = client.node.get_node_names_and_namespaces()
+            return Counter(name for name, where in found if where == place and name in ours)
+
+        client.wait(lambda: max(seen().values(), default=0) > 1, DISCOVERY_S)
+        count = seen()
+        where = f"in the domain {os.environ.get('ROS_DOMAIN_ID', '0')}, namespace {place}"
+        twice = [name for name in count if count[name] > 1]
+        if twice:
+            return Finding(
+                f"{', '.join(twice)}: running more than once {where}; they answer and command over each other",
+                "end one of them, or give each mirror a --namespace or each bench a ROS_DOMAIN_ID of its own",
+            )
+        if count and (skew := _skew(client)) is not None:
+            return skew
+    if count:
+        return Finding(
+            f"{', '.join(count)}: running {where}",
+            "fine if they are yours; a second ./dm up needs another --namespace or ROS_DOMAIN_ID",
+            note=True,
+        )
+    return None
+
+
+def _skew(client: Any) -> Finding | None:
+    """How far the clocks of the machines that the nodes run on are from ours; every node reports once a second."""
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    if client.node.get_publishers_info_by_topic("/clock"):
+        return None  # the bench has a time of its own
+    late: list[tuple[float, str]] = []
+
+    def on_report(report: Any) -> None:
+        stamp = report.header.stamp.sec + 1e-9 * report.header.stamp.nanosec
+        if report.status and abs(time.time() - stamp) > CLOCK_SKEW_S:
+            late.append((time.time() - stamp, report.status[0].name))
+
+    client.node.create_subscription(DiagnosticArray, "/diagnostics", on_report, 10)
+    if client.wait(lambda: late, REPORTS_S):
+        return Finding(
+            f"the clock of {late[0][1]} and this one differ by {abs(late[0][0]):.1f} s: commands count as stale",
+            "synchronise the clocks of both machines: sudo apt-get install chrony",
+        )
+    return None
+
+
+def disk(path: Path) -> Finding | None:
+    free = shutil.disk_usage(path).free
+    if free < DISK_MIN:
+        return Finding(f"{free / 1e9:.1f} GB free in {path}", "make room: maps take 4 MB each, recordings more")
+    return None
+
+
+def clock() -> Finding | None:
+    # This file cannot be younger than now.
+    installed = Path(__file__).stat().st_mtime
+    if time.time() < installed:
+        return Finding(
+            f"the system clock says {time.strftime('%Y-%m-%d', time.gmtime())}, but this program is of"
+            f" {time.strftime('%Y-%m-%d', time.gmtime(installed))}",
+            "set the clock (timedatectl set-ntp true): time stamps of maps and commands depend on it",
+        )
+    program = shutil.which("timedatectl")
+    if program is None:
+        return None
+    told = subprocess.run(
+        [program, "show", "--property=NTPSynchronized", "--value"], capture_output=True, text=True, check=False
+    )
+    if told.stdout.strip() == "no":
+        return Finding(
+            "the system clock is not synchronised",
+            "timedatectl set-ntp true; it matters when nodes or the instrument run on other machines",
+            note=True,
+        )
+    return None

@@ -1,0 +1,217 @@
+"""docs/interfaces.md from the code (`python -m dm_tools.documentation.interfaces`).
+
+Every node is made once, on a ROS domain of its own, and asked what it publishes, takes and serves; definitions come
+from the installed dm_msgs, commands from the `dm` command itself.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.action import ActionServer, get_action_server_names_and_types_by_node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+#: What rclpy gives every node, or every lifecycle node.
+STANDARD = ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces")
+STANDARD_TOPICS = ("rosout", "parameter_events")
+GRAPH_S = 20.0
+PART_TITLES = {"msg": ("",), "srv": ("request", "response"), "action": ("goal", "result", "feedback")}
+HEAD = """# Interfaces
+
+Written from the code by `./dm exec python -m dm_tools.documentation.interfaces`; a test keeps it true. Parameters are
+on [a page of their own](parameters.md). Names are relative: with a namespace they lie in it. Units are SI where a
+comment names none; signals are normalised, −1 to +1; sag is that of the surface, positive curvature is concave.
+"""
+
+
+@dataclass(frozen=True)
+class Offer:
+    """One end of an interface.
+
+    Attributes:
+        kind: publishes, subscribes, service or action.
+        name: as the node gives it.
+        type: package/Type.
+        qos: in words; "" for services and actions.
+    """
+
+    kind: str
+    name: str
+    type: str
+    qos: str = ""
+
+
+def qos_words(profile: QoSProfile) -> str:
+    """A quality of service in words."""
+    reliable = profile.reliability == ReliabilityPolicy.RELIABLE
+    latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    words = ["reliable" if reliable else "best effort", *(["latched"] if latched else []), f"depth {profile.depth}"]
+    return ", ".join(words)
+
+
+def type_name(cls: Any) -> str:
+    """package/Type of a message, service or action class."""
+    return f"{cls.__module__.split('.')[0]}/{cls.__name__}"
+
+
+def offers_of(node: Any) -> list[Offer]:
+    """What a node publishes, takes and serves beyond what every node does."""
+    prefix = node.get_fully_qualified_name() + "/"
+
+    def short(name: str) -> str:
+        name = name if name.startswith("/") else f"/{name}"
+        if name.startswith(prefix):
+            return "~/" + name.removeprefix(prefix)
+        return name if name in ("/clock", "/diagnostics") else name.removeprefix("/")
+
+    found = [
+        Offer("publishes", short(item.topic_name), type_name(item.msg_type), qos_words(item.qos_profile))
+        for item in node.publishers
+    ]
+    found += [
+        Offer("subscribes", short(item.topic_name), type_name(item.msg_type), qos_words(item.qos_profile))
+        for item in node.subscriptions
+    ]
+    found += [Offer("service", short(item.srv_name), type_name(item.srv_type)) for item in node.services]
+    found += [Offer("action", short(name), kind.replace("/action/", "/")) for name, kind in _actions(node)]
+    order = ("publishes", "subscribes", "service", "action")
+    kept = {
+        offer
+        for offer in found
+        if offer.type.split("/")[0] not in STANDARD and offer.name.strip("/") not in STANDARD_TOPICS
+    }
+    return sorted(kept, key=lambda offer: (order.index(offer.kind), offer.name))
+
+
+def _actions(node: Any) -> list[tuple[str, str]]:
+    """(name, package/action/Type) of a node's action servers; the graph takes a moment to show them."""
+    count = sum(isinstance(item, ActionServer) for item in node.waitables)
+    deadline = time.monotonic() + GRAPH_S
+    while True:
+        seen = get_action_server_names_and_types_by_node(node, node.get_name(), node.get_namespace())
+        if len(seen) == count:
+            return [(name, kind) for name, (kind, *_others) in seen]
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"{node.get_name()} has {count} action servers, the ROS graph shows {len(seen)}")
+        time.sleep(0.01)
+
+
+def nodes_and_offers() -> dict[str, list[Offer]]:
+    """{node: its offers}; initialises ROS for good, hence for a process of its own."""
+    import importlib
+
+    import rclpy
+
+    from dm_bringup.suite import NODES, own_domain, save_config
+    from dm_tools.demo.demo import bench_config
+
+    result: dict[str, list[Offer]] = {}
+    with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:
+        folder = Path(temporary)
+        config = bench_config(folder, "off", 0.0, 1, 0.0)
+        config["virtual_bench"] |= {"camera.rate": 1.0, "clock.speed": 1.0, "interferometer.pixels": 64}
+        save_config(config, folder / "config.yaml")
+        rclpy.init(args=["--ros-args", "--params-file", str(folder / "config.yaml")], domain_id=domain)
+        for name, module in NODES:
+            node = getattr(importlib.import_module(module), CLASSES[name])()
+            if name == "interferometer":
+                node.trigger_configure()  # its publishers come with it
+            result[name] = offers_of(node)
+            if hasattr(node, "make_safe"):
+                node.make_safe()
+        rclpy.try_shutdown()
+    return result
+
+
+#: The class of each node of `dm_bringup.suite.NODES`.
+CLASSES = {
+    "virtual_bench": "VirtualBenchNode",
+    "pdm_driver": "PdmDriver",
+    "interferometer": "InterferometerNode",
+    "calibration": "CalibrationNode",
+    "focus_controller": "FocusControllerNode",
+    "autofocus": "AutofocusNode",
+}
+
+
+def node_tables(nodes: dict[str, list[Offer]]) -> Iterator[str]:
+    """The interfaces of every node."""
+    for name, offers in nodes.items():
+        yield f"## Node {name}\n\n| | name | type | quality of service |\n|---|---|---|---|"
+        for offer in offers:
+            package, _, short = offer.type.partition("/")
+            linked = f"[{short}](#{short.lower()})" if package == "dm_msgs" else f"{package}/{short}"
+            yield f"| {offer.kind} | `{offer.name}` | {linked} | {offer.qos} |"
+        yield ""
+
+
+def definition(path: Path) -> Iterator[str]:
+    """One message, service or action as tables: what it is, then field, type and meaning."""
+    yield f"### {path.stem}\n"
+    parts = re.split(r"(?m)^---[ \t]*\n?", path.read_text())
+    for title, part in zip(PART_TITLES[path.suffix[1:]], parts, strict=True):
+        lines = part.strip("\n").splitlines()
+        if not title or title in ("request", "goal"):
+            while lines and lines[0].startswith("#"):
+                yield lines.pop(0).removeprefix("#").strip()
+            yield ""
+        rows = [row for row in map(_row, lines) if row]
+        if not rows:
+            continue
+        yield f"| {title or 'field'} | type | meaning |\n|---|---|---|"
+        yield from rows
+        yield ""
+
+
+def _row(line: str) -> str:
+    declaration, _, comment = (text.strip() for text in line.partition("#"))
+    comment = comment.replace("|", r"\|")
+    if not declaration:
+        return f"| | | *{comment}* |" if comment else ""
+    kind, _, rest = declaration.partition(" ")
+    name = " ".join(rest.split())
+    return f"| `{name}` | {kind} | {comment} |"
+
+
+def commands() -> str:
+    """Every command of `dm` with its arguments and options, as Typer tells of them."""
+    import typer
+    from typer.cli import get_docs_for_click
+
+    from dm_tools.cli import app
+
+    group = typer.main.get_command(app)
+    text = get_docs_for_click(obj=group, ctx=typer.Context(group), name="./dm")
+    text = text[text.index("\n## ") :]  # the commands, without the list of them
+    text = re.sub(r"(?ms)^\*\*Usage\*\*:\n+```console\n.*?```\n+", "", text)
+    text = re.sub(r"(?m)^\* `--help`.*\n", "", text)
+    # Nothing left under a heading: a command without options.
+    text = re.sub(r"(?m)^\*\*Options\*\*:\n+(?=#|\Z)", "", text)
+    note = "`./dm exec COMMAND ...` runs any command inside the environment. Every command has `--help`.\n"
+    return f"## Commands\n\n{note}{re.sub(r'(?m)^#', '##', text)}"
+
+
+def interfaces_page() -> str:
+    """The page, in Markdown. For a process of its own: see `nodes_and_offers`."""
+    from ament_index_python.packages import get_package_share_directory
+
+    share = Path(get_package_share_directory("dm_msgs"))
+    parts = [HEAD, *node_tables(nodes_and_offers())]
+    for folder, title in (("msg", "Messages"), ("srv", "Services"), ("action", "Actions")):
+        parts.append(f"## {title}\n")
+        for path in sorted((share / folder).glob(f"*.{folder}")):
+            parts += definition(path)
+    parts.append(commands())
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(parts)).rstrip("\n") + "\n"
+
+
+if __name__ == "__main__":
+    page = interfaces_page()
+    sys.stdout.write(page)

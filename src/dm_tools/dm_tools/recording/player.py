@@ -1,0 +1,105 @@
+"""Publish a recording again, in its own time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from dm_tools.recording.bag import BagReader, Topic
+from dm_tools.recording.interfaces import message_class
+
+#: Topics that would move a real mirror; published only when asked for.
+COMMANDS = ("actuator_command", "focus_request")
+#: Topics that belong to the nodes of the recording, not to its data.
+HOUSEKEEPING = ("/rosout", "/parameter_events")
+DEPTH = 10
+#: Time for subscribers to find the publishers before the first message, s.
+DISCOVERY_S = 1.0
+
+
+def replayed(topics: Sequence[str], names: Sequence[str] = (), commands: bool = False) -> list[str]:
+    """Which of `topics` are published: `names`, or all but commands, hidden and housekeeping ones.
+
+    Raises:
+        ValueError: a name that is not in the recording.
+    """
+    wanted = [name if name.startswith("/") else f"/{name}" for name in names]
+    for name in wanted:
+        if name not in topics:
+            raise ValueError(f"topic {name}: not in the recording, which has {', '.join(sorted(topics))}")
+    chosen = wanted or [name for name in topics if "/_" not in name and name not in HOUSEKEEPING]
+    return [name for name in chosen if commands or name.rsplit("/", 1)[-1] not in COMMANDS]
+
+
+def play(
+    bag: BagReader,
+    names: Sequence[str],
+    rate: float = 1.0,
+    domain: int | None = None,
+    progress: Callable[[float], None] = lambda seconds: None,
+    discovery_s: float = DISCOVERY_S,
+) -> int:
+    """Publish the topics `names` of the recording; returns the number of messages.
+
+    Args:
+        rate: times faster than recorded.
+        progress: told the time in the recording, s.
+
+    Raises:
+        ValueError: a rate that is not above 0.
+        UnknownTypeError: a message type that is not installed.
+        BagError: the file is damaged.
+    """
+    if not rate > 0.0:
+        raise ValueError(f"rate = {rate:g}: must be above 0")
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("dm_player", context=context)
+    try:
+        publishers = {
+            name: node.create_publisher(message_class(bag.topics[name].type_name), name, _offer(bag.topics[name]))
+            for name in names
+        }
+        time.sleep(discovery_s)
+        begun, first, count = time.monotonic(), None, 0
+        for message in bag.read(list(publishers)):
+            first = message.log_time if first is None else first
+            elapsed = 1e-9 * (message.log_time - first)
+            time.sleep(max(0.0, begun + elapsed / rate - time.monotonic()))
+            publishers[message.topic.name].publish(message.data)
+            count += 1
+            progress(elapsed)
+        for publisher in publishers.values():  # or the last messages would leave with their publisher
+            publisher.wait_for_all_acked()
+        return count
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def _offer(topic: Topic) -> QoSProfile:
+    """The quality of service that the recorded publishers had in common."""
+
+    def all_are(key: str, value: str) -> bool:
+        return bool(topic.qos) and all(_word(profile, key) == value for profile in topic.qos)
+
+    return QoSProfile(
+        depth=DEPTH,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.BEST_EFFORT
+        if all_are("reliability", "best_effort")
+        else ReliabilityPolicy.RELIABLE,
+        durability=(
+            DurabilityPolicy.TRANSIENT_LOCAL if all_are("durability", "transient_local") else DurabilityPolicy.VOLATILE
+        ),
+    )
+
+
+def _word(profile: Any, key: str) -> str:
+    return str(profile.get(key, ""))

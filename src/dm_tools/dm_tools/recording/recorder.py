@@ -1,0 +1,256 @@
+"""Record the topics of a suite, whatever their type, as they arrive."""
+
+from __future__ import annotations
+
+import os
+import queue
+import re
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from dm_bringup.suite import NODES
+from dm_tools.recording.bag import BagWriter, Topic
+from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
+
+#: How often new topics are looked for, s.
+DISCOVERY_PERIOD_S = 0.25
+#: Messages that a subscription holds while the writer is busy.
+DEPTH = 100
+#: Longest sleep of the executor, s; only bounds how soon it ends.
+SPIN_S = 0.1
+#: Topics of the maps themselves, several megabytes each; what is fitted to them is on others.
+MAP_TOPIC = "surface_map"
+
+_Item = tuple[str, bytes, int, int] | tuple[Topic, str]
+
+
+class Recorder:
+    """Records until it is closed. Use as a context manager.
+
+    Args:
+        folder: of the new recording.
+        namespace: record only topics in it; "" = all.
+        topics: only these, by their names with or without namespace; empty = all.
+        maps: whether to record the maps themselves.
+        domain: ROS domain; None = the environment's.
+
+    Raises:
+        FileExistsError, OSError: the recording cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        namespace: str = "",
+        topics: Sequence[str] = (),
+        maps: bool = True,
+        domain: int | None = None,
+    ) -> None:
+        self.refused: dict[str, str] = {}
+        self._namespace = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
+        self._wanted = {name if name.startswith("/") else self._namespace + name for name in topics}
+        self._maps = maps
+        self._bag = BagWriter(folder)
+        self._queue: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
+        self._failure: Exception | None = None
+        self._stopping = False
+        self._writer = threading.Thread(target=self._write, name="bag_writer", daemon=True)
+        self._writer.start()
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
+        self._subscribed: set[str] = set()
+        self._parameters: dict[str, dict[str, Any]] = {}
+        self._clients: dict[str, AsyncParameterClient] = {}
+        self._look()
+        self._node.create_timer(DISCOVERY_PERIOD_S, self._look)
+        # The events executor cannot hand over messages as they came (it fails on raw subscriptions).
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._spinning = threading.Thread(target=self._spin, name="recorder", daemon=True)
+        self._spinning.start()
+
+    @property
+    def folder(self) -> Path:
+        """Where the recording is."""
+        return self._bag.folder
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages written of each topic so far."""
+        return self._bag.counts
+
+    @property
+    def parameters(self) -> dict[str, dict[str, Any]]:
+        """Parameters of the suite's nodes that were found so far."""
+        return dict(self._parameters)
+
+    def check(self) -> None:
+        """Raise OSError when the recording can no longer be written (disk full, ...)."""
+        if self._failure is not None:
+            raise OSError(f"{self.folder}: the recording ended early: {self._failure}")
+
+    def close(self) -> None:
+        """Leave the ROS graph and finish the recording.
+
+        Raises:
+            OSError: not everything could be written.
+        """
+        if not self._writer.is_alive():
+            return
+        self._stopping = True
+        self._spinning.join(10.0 * SPIN_S + 1.0)
+        self._executor.shutdown(1.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+        self._queue.put(None)
+        self._writer.join()
+        self._bag.add_parameters(self._parameters)
+        self._bag.close()
+        self.check()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- in the executor's thread ---
+
+    def _spin(self) -> None:
+        try:
+            while not self._stopping:
+                self._executor.spin_once(SPIN_S)
+        except Exception as error:  # or the recording would go on without a word and without messages
+            self._failure = error
+
+    def _look(self) -> None:
+        """Subscribe to topics that are new."""
+        for name, types in self._node.get_topic_names_and_types():
+            if name not in self._subscribed and self._records(name):
+                self._subscribe(name, types[0])
+        self._ask_parameters()
+
+    def _records(self, name: str) -> bool:
+        if self._wanted:
+            return name in self._wanted
+        if name.rsplit("/", 1)[-1] == MAP_TOPIC and not self._maps:
+            return False
+        inside = name.startswith(self._namespace) or name.count("/") == 1  # /diagnostics, /rosout, /clock belong to all
+        return inside and not re.search(r"/_(?!action/(feedback|status)$)", name)
+
+    def _subscribe(self, name: str, type_name: str) -> None:
+        publishers = self._node.get_publishers_info_by_topic(name)
+        if not publishers:
+            return  # nobody says what it is like yet
+        self._subscribed.add(name)
+        profiles = [publisher.qos_profile for publisher in publishers]
+        topic = Topic(name, type_name, [_in_words(profile) for profile in profiles], str(publishers[0].topic_type_hash))
+        try:
+            self._queue.put((topic, definition(type_name)))
+        except UnknownTypeError as error:
+            self.refused[name] = str(error)
+            return
+
+        def take(data: bytes, info: Any) -> None:
+            now = time.time_ns()
+            self._queue.put((name, data, now, int(info["source_timestamp"]) or now))
+
+        self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
+
+    def _ask_parameters(self) -> None:
+        """Ask nodes of the suite for their parameters, once each; answers arrive later."""
+        known = {node for node, _module in NODES}
+        for name, namespace in self._node.get_node_names_and_namespaces():
+            path = f"{namespace.rstrip('/')}/{name}"
+            if name not in known or path in self._clients or not path.startswith(self._namespace):
+                continue
+            client = AsyncParameterClient(self._node, path)
+            if not client.services_are_ready():
+                continue
+            self._clients[path] = client
+            listed = client.list_parameters()
+            listed.add_done_callback(lambda future, path=path: self._on_listed(path, future))
+
+    def _on_listed(self, path: str, listed: Any) -> None:
+        """Fetch the values of the names listed, one after another.
+
+        Where one has no value, rclpy leaves out all that follow; and a service keeps ten requests at most.
+        """
+        names = list(listed.result().result.names)
+        values = self._parameters.setdefault(path, {})
+
+        def fetch_next() -> None:
+            if names:
+                name = names.pop(0)
+                asked = self._clients[path].get_parameters([name])
+                asked.add_done_callback(lambda answer: keep(name, answer.result().values))
+
+        def keep(name: str, answer: Sequence[Any]) -> None:
+            for parameter in answer:
+                value = parameter_value_to_python(parameter)
+                values[name] = value.tolist() if hasattr(value, "tolist") else value
+            fetch_next()
+
+        fetch_next()
+
+    # --- in the writer's thread ---
+
+    def _write(self) -> None:
+        """Write what arrives; compression must not hold up the executor."""
+        while (item := self._queue.get()) is not None:
+            if self._failure is not None:
+                continue
+            try:
+                if len(item) == 2:
+                    self._bag.add_topic(*item)
+                else:
+                    self._bag.write(*item)
+            except (OSError, ValueError) as error:
+                self._failure = error
+
+
+def _request(offered: Sequence[QoSProfile]) -> QoSProfile:
+    """What to ask for, so that all publishers match and latched messages arrive where all are latched."""
+    reliable = all(profile.reliability is ReliabilityPolicy.RELIABLE for profile in offered)
+    latched = all(profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
+    return QoSProfile(
+        depth=DEPTH,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _in_words(profile: QoSProfile) -> dict[str, Any]:
+    """A profile as rosbag2 writes it."""
+    return {
+        "history": profile.history.name.lower(),
+        "depth": profile.depth,
+        "reliability": profile.reliability.name.lower(),
+        "durability": profile.durability.name.lower(),
+        "deadline": _seconds(profile.deadline),
+        "lifespan": _seconds(profile.lifespan),
+        "liveliness": profile.liveliness.name.lower(),
+        "liveliness_lease_duration": _seconds(profile.liveliness_lease_duration),
+        "avoid_ros_namespace_conventions": profile.avoid_ros_namespace_conventions,
+    }
+
+
+def _seconds(duration: Any) -> dict[str, int]:
+    seconds, rest = divmod(int(duration.nanoseconds), 10**9)
+    return {"sec": seconds, "nsec": rest}

@@ -1,0 +1,233 @@
+"""What a recording says of a calibration run, and the calibration made again from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.parameter import parameter_value_to_python
+from rclpy.serialization import deserialize_message
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_messages import calibration_message
+from dm_calibration.calibration_parameters import PARAMETERS, fit_options, procedure_options
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.influence.surfaces import LinearModel
+from dm_calibration.procedure.plan import PlanOptions
+from dm_calibration.procedure.recorded_run import Move, RecordedRun, RecordingError, maps_per_state, repeat_run
+from dm_common.measurement import Measurement
+from dm_common.messages import measurement_from, mirror_from, stamp_ns
+from dm_common.mirror import Mirror
+from dm_common.optics.sampling import SamplePoints
+from dm_tools.recording.bag import BagReader, Message
+from dm_tools.recording.interfaces import message_class
+
+#: Topics that a calibration is made again from; the last part of their names.
+FEEDBACK = "calibrate/_action/feedback"
+TOPICS = ("mirror_info", "actuator_state", "zernike", "surface_samples", "surface_map_info", "calibration", FEEDBACK)
+PARAMETER_EVENTS = "/parameter_events"
+#: Fields of dm_msgs/Calibration that must agree to the last bit.
+COMPARED = (
+    "influence_zernike",
+    "zernike_offset",
+    "influence_sag",
+    "sag_offset",
+    "sample_x",
+    "sample_y",
+    "sample_weight",
+    "region_weights",
+    "hysteresis.play_radius",
+    "hysteresis.play_weight",
+    "hysteresis.duhem_slope",
+    "hysteresis.duhem_weight",
+    "hysteresis.creep_rate",
+    "hysteresis.zernike_sigma",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _InfluenceOnly:
+    """What a shape is solved from, of a calibration that was in use."""
+
+    influence_sag: NDArray[np.float64]
+    sag_offset: NDArray[np.float64]
+    points: SamplePoints
+
+
+@dataclass
+class _Run:
+    """One goal of `calibrate` while its messages are gathered."""
+
+    begun: int
+    labels: dict[int, str] = field(default_factory=dict)
+    steps: int = 0
+    ended: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """One calibration run of a recording, ready to be made again.
+
+    Attributes:
+        run: what was commanded and measured.
+        parameters: of the node `calibration`, defaults where the recording has none.
+        published: the message on `calibration` that the run ended with; None = it was not activated.
+        runs: runs in the recording.
+        remarks: sentences on what the recording does not hold.
+    """
+
+    run: RecordedRun
+    parameters: dict[str, Any]
+    published: Any
+    runs: int
+    remarks: tuple[str, ...]
+
+
+def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Session:
+    """Run `number` (1 = the first, 0 = the last) of the recording.
+
+    Raises:
+        RecordingError: no such run, or topics that are missing.
+        BagError: the file is damaged.
+    """
+    prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
+    missing = [name for name in TOPICS if prefix + name not in bag.topics]
+    if missing:
+        raise RecordingError(f"{bag.file}: no topic {', '.join(prefix + name for name in missing)}: record them all")
+    received: dict[str, list[tuple[int, Any]]] = {name: [] for name in TOPICS}
+    for message in bag.read([prefix + name for name in TOPICS]):
+        received[message.topic.name.removeprefix(prefix)].append((message.log_time, _decode(message)))
+    runs = _runs(received[FEEDBACK])
+    if not runs:
+        raise RecordingError(f"{bag.file}: no calibration was run in it (no message on {prefix}{FEEDBACK})")
+    if not 0 <= number <= len(runs):
+        raise RecordingError(f"run {number}: the recording has 1 to {len(runs)}; 0 = the last")
+    index = (number or len(runs)) - 1
+    chosen = runs[index]
+    end = runs[index + 1].begun if index + 1 < len(runs) else np.iinfo(np.int64).max
+    mirrors = [info for time, info in received["mirror_info"] if time <= chosen.ended]
+    if not mirrors:
+        raise RecordingError(f"{bag.file}: no mirror_info before the run ended: begin the recording earlier")
+    mirror = mirror_from(mirrors[-1])
+    maps = _maps(received, chosen.begun, end)
+    moves = [move for time, move in _moves(received["actuator_state"], mirror) if chosen.begun <= time < end]
+    before = [message for time, message in received["calibration"] if time < chosen.begun and message.id]
+    run = RecordedRun(mirror, tuple(moves), maps, chosen.labels, chosen.steps, _model(before))
+    parameters, remarks = _parameters(bag, f"{prefix}calibration", chosen.begun)
+    last = max((measured.stamp_ns for measured in maps), default=-1)
+    known = {message.id for message in before}
+    published = next(
+        (
+            message
+            for time, message in received["calibration"]
+            if chosen.begun <= time < end and message.id not in known and stamp_ns(message.header.stamp) == last
+        ),
+        None,
+    )
+    return Session(run, parameters, published, len(runs), remarks)
+
+
+def recalibrate(session: Session, identifier: str, created_ns: int) -> Calibration:
+    """The calibration of a recorded run, made again from its maps.
+
+    Raises:
+        RecordingError: the recording does not hold the whole run.
+        TooFewMapsError, ValueError: as live.
+    """
+    values, run = session.parameters, session.run
+    configured = PlanOptions(values["poke_amplitude"], values["reference_every"])
+    options = procedure_options(values, maps_per_state(run))
+    _plan, outcome = repeat_run(run, options, configured)
+    provenance = Provenance(identifier, created_ns, "made again from a recording")
+    return evaluate(outcome, run.mirror, fit_options(values), provenance)[0]
+
+
+def differences(calibration: Calibration, published: Any) -> list[str]:
+    """Names of the fields of the message `published` that `calibration` does not give to the last bit."""
+    again = calibration_message(calibration, None, "", 0.0)
+    return [name for name in COMPARED if not _same(_member(again, name), _member(published, name))]
+
+
+def _member(message: Any, path: str) -> Any:
+    for name in path.split("."):
+        message = getattr(message, name)
+    return message
+
+
+def _same(one: Any, other: Any) -> bool:
+    return np.asarray(one, dtype=np.float64).tobytes() == np.asarray(other, dtype=np.float64).tobytes()
+
+
+def _decode(message: Message) -> Any:
+    return deserialize_message(message.data, message_class(message.topic.type_name))
+
+
+def _runs(feedback: Iterable[tuple[int, Any]]) -> list[_Run]:
+    """Goals in the order they began."""
+    runs: dict[bytes, _Run] = {}
+    for time, message in feedback:
+        told = message.feedback
+        run = runs.setdefault(bytes(message.goal_id.uuid), _Run(begun=time))
+        run.ended, run.steps = time, told.steps
+        if told.step < told.steps and told.phase not in (told.PHASE_FIT, told.PHASE_STORE):
+            run.labels[told.step] = told.label
+    return list(runs.values())
+
+
+def _moves(states: Iterable[tuple[int, Any]], mirror: Mirror) -> Iterator[tuple[int, Move]]:
+    """The moves that ended, with the time received; each is in the first message that counts one turn more."""
+    turns: int | None = None
+    degausses = 0
+    for time, state in states:
+        requested, applied = np.array(state.requested), np.array(state.applied)
+        if requested.size != mirror.actuators or state.moving:
+            continue
+        if turns is not None and state.turns != turns:
+            yield time, Move(stamp_ns(state.header.stamp), requested, applied, state.degausses != degausses)
+        turns, degausses = state.turns, state.degausses
+
+
+def _maps(received: dict[str, list[tuple[int, Any]]], begun: int, end: int) -> tuple[Measurement, ...]:
+    """The maps in the order of their stamps, put together from their topics."""
+    parts: dict[int, dict[str, Any]] = {}
+    for name in ("zernike", "surface_samples", "surface_map_info"):
+        for time, message in received[name]:
+            if begun <= time < end:
+                parts.setdefault(stamp_ns(message.header.stamp), {})[name] = message
+    whole = [parts[stamp] for stamp in sorted(parts) if len(parts[stamp]) == 3]
+    return tuple(
+        measurement_from(
+            SimpleNamespace(zernike=each["zernike"], samples=each["surface_samples"], info=each["surface_map_info"])
+        )
+        for each in whole
+    )
+
+
+def _model(calibrations: list[Any]) -> LinearModel | None:
+    if not calibrations:
+        return None
+    used = calibrations[-1]
+    return _InfluenceOnly(
+        np.array(used.influence_sag).reshape(used.points, used.actuators),
+        np.array(used.sag_offset),
+        SamplePoints(np.array(used.sample_x), np.array(used.sample_y), np.array(used.sample_weight)),
+    )
+
+
+def _parameters(bag: BagReader, node: str, begun: int) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Parameters of `node` when the run began, and what is not known of them."""
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    recorded = bag.parameters.get(node)
+    values |= {name: value for name, value in (recorded or {}).items() if name in values}
+    if PARAMETER_EVENTS in bag.topics:
+        for message in bag.read([PARAMETER_EVENTS]):
+            event = _decode(message)
+            if message.log_time < begun and event.node == node:
+                changed = [*event.new_parameters, *event.changed_parameters]
+                values |= {p.name: parameter_value_to_python(p.value) for p in changed if p.name in values}
+    remarks = () if recorded else (f"The recording does not hold the parameters of {node}; defaults are taken.",)
+    return values, remarks

@@ -1,0 +1,95 @@
+"""Whether a keystore keeps to the profile: its policies, its permissions, and who may read its private keys."""
+
+from __future__ import annotations
+
+import stat
+from datetime import UTC, datetime
+from pathlib import Path
+from xml.etree import ElementTree as xml
+
+from dm_tools.security.policy import ROOT, Profile, dds_topics, governance_xml, policy_xml
+
+_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+
+
+def check_keystore(folder: Path, profile: Profile) -> list[str]:
+    """What is wrong with a keystore, in words; empty when nothing is.
+
+    Raises:
+        ValueError: there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"--check {folder}: no such folder")
+    found: list[str] = []
+    enclaves = profile.enclaves()
+    for enclave in enclaves:
+        found += _compare_text(folder / "policies" / f"{enclave}.policy.xml", policy_xml(profile, enclave))
+    found += _compare_text(folder / "enclaves" / "governance.xml", governance_xml(profile))
+    expected = {profile.path(enclave).lstrip("/") for enclave in enclaves}
+    for path in sorted((folder / "enclaves").rglob("permissions.xml")):
+        place = path.parent.relative_to(folder / "enclaves").as_posix()
+        if place in expected:
+            found += _check_permissions(path, profile, place.rsplit("/", 1)[-1])
+        elif place.startswith(f"{ROOT.lstrip('/')}/"):
+            found.append(f"{path}: an enclave that no node of this profile has")
+    for path in sorted(folder.rglob("*.pem")):
+        if path.name.endswith("key.pem") and path.stat().st_mode & _OTHERS:
+            found.append(f"{path}: mode {stat.S_IMODE(path.stat().st_mode):04o}: a private key must be 0600")
+    return found
+
+
+def keys_missing(folder: Path, profile: Profile) -> list[str]:
+    """The enclaves that have no key and permissions yet."""
+    paths = [profile.path(enclave) for enclave in profile.enclaves()]
+    parts = ("key.pem", "cert.pem", "permissions.p7s", "governance.p7s")
+    return [
+        path for path in paths if not all((folder / "enclaves" / path.lstrip("/") / part).exists() for part in parts)
+    ]
+
+
+def _compare_text(path: Path, wanted: str) -> list[str]:
+    if not path.is_file():
+        return [f"{path}: missing"]
+    old, new = (set(map(str.strip, text.splitlines())) for text in (path.read_text(errors="replace"), wanted))
+    more, less = sorted(old - new), sorted(new - old)
+    if path.read_text(errors="replace") == wanted:
+        return []
+    words = [f"more: {' '.join(more[:3])}"] if more else []
+    words += [f"missing: {' '.join(less[:3])}"] if less else []
+    return [f"{path}: differs from the profile; {'; '.join(words) or 'in its order'}"]
+
+
+def _check_permissions(path: Path, profile: Profile, enclave: str) -> list[str]:
+    """Compare signed permissions with the policy, and look at their dates."""
+    try:
+        document = xml.parse(path)  # written by sros2 in a folder that its owner alone can write
+    except xml.ParseError as error:
+        return [f"{path}: not XML: {error}"]
+    found = []
+    signed = path.with_name("permissions.p7s")
+    if not signed.is_file():
+        found.append(f"{signed}: missing")
+    elif _plain(path) not in _plain(signed):
+        found.append(f"{signed}: holds other permissions than {path.name}: sign them again")
+    if [item.text for item in document.iter("default")] != ["DENY"] * len(list(document.iter("grant"))):
+        found.append(f"{path}: the default must be DENY")
+    for rule, wanted in dds_topics(profile, enclave).items():
+        allowed = {
+            str(topic.text)
+            for allow in document.iter("allow_rule")
+            for part in allow.findall(rule)
+            for topic in part.iter("topic")
+        }
+        if allowed - wanted:
+            found.append(f"{path}: {rule}: more than the policy: {', '.join(sorted(allowed - wanted)[:5])}")
+        if wanted - allowed:
+            found.append(f"{path}: {rule}: missing: {', '.join(sorted(wanted - allowed)[:5])}")
+    for item in document.iter("not_after"):
+        end = datetime.fromisoformat(str(item.text))
+        if (end if end.tzinfo else end.replace(tzinfo=UTC)) < datetime.now(UTC):
+            found.append(f"{path}: not valid any more since {item.text}")
+    return found
+
+
+def _plain(path: Path) -> str:
+    return "".join(path.read_text(errors="replace").split())

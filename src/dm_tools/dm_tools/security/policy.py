@@ -1,0 +1,186 @@
+"""SROS 2 policy and governance files from the table of interfaces, and the DDS topics that a policy allows."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree as xml
+
+from dm_tools.security.interfaces import NodeInterface, interfaces
+
+#: Version of the policy format (sros2, policy.xsd).
+POLICY_VERSION = "0.2.0"
+#: Enclaves of the suite stand under this one.
+ROOT = "/dm"
+_RULES = (
+    ("topics", "topic", "publish"),
+    ("topics", "topic", "subscribe"),
+    ("services", "service", "reply"),
+    ("services", "service", "request"),
+    ("actions", "action", "execute"),
+    ("actions", "action", "call"),
+)
+_ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
+_ACTION_TOPICS = ("feedback", "status")
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What to generate.
+
+    Attributes:
+        namespace: of the mirror, "" for none.
+        domain: ROS domain.
+        twin: with the virtual bench and its clock.
+    """
+
+    namespace: str = ""
+    domain: int = 0
+    twin: bool = False
+
+    @property
+    def ns(self) -> str:
+        """The namespace as ROS writes it."""
+        return f"/{self.namespace.strip('/')}" if self.namespace.strip("/") else "/"
+
+    def path(self, enclave: str) -> str:
+        """Path of an enclave."""
+        return f"{ROOT}{self.ns.rstrip('/')}/{enclave}"
+
+    def enclaves(self) -> dict[str, list[NodeInterface]]:
+        """The nodes of each enclave, by its last part."""
+        found: dict[str, list[NodeInterface]] = {}
+        for node in interfaces(self.twin):
+            found.setdefault(node.enclave, []).append(node)
+        return found
+
+
+def full_name(name: str, ns: str, node: str) -> str:
+    """A name as it stands in the ROS graph."""
+    prefix = ns.rstrip("/")
+    if name.startswith("~"):
+        return f"{prefix}/{node}{name[1:]}"
+    return name if name.startswith("/") else f"{prefix}/{name}"
+
+
+def policy_xml(profile: Profile, enclave: str) -> str:
+    """The policy file of one enclave.
+
+    Raises:
+        KeyError: no such enclave.
+    """
+    policy = xml.Element("policy", version=POLICY_VERSION)
+    place = xml.SubElement(xml.SubElement(policy, "enclaves"), "enclave", path=profile.path(enclave))
+    profiles = xml.SubElement(place, "profiles")
+    for node in profile.enclaves()[enclave]:
+        one = xml.SubElement(profiles, "profile", ns=profile.ns, node=node.name)
+        for group, element, rule in _RULES:
+            names = getattr(node, rule)
+            if names:
+                listed = xml.SubElement(one, group, {rule: "ALLOW"})
+                for name in names:
+                    xml.SubElement(listed, element).text = f"~{name[1:]}" if name.startswith("~") else name
+    return _text(policy)
+
+
+def governance_xml(profile: Profile) -> str:
+    """Who may join the domain and how: authenticated participants only, access control, everything encrypted."""
+    head = {
+        "xmlns:xsi": "http://www.w3.org/2001/XMLSchema-instance",
+        "xsi:noNamespaceSchemaLocation": "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd",
+    }
+    document = xml.Element("dds", head)
+    rule = xml.SubElement(xml.SubElement(document, "domain_access_rules"), "domain_rule")
+    xml.SubElement(xml.SubElement(rule, "domains"), "id").text = str(profile.domain)
+    for name, value in (
+        ("allow_unauthenticated_participants", "false"),
+        ("enable_join_access_control", "true"),
+        ("discovery_protection_kind", "ENCRYPT"),
+        ("liveliness_protection_kind", "ENCRYPT"),
+        ("rtps_protection_kind", "SIGN"),
+    ):
+        xml.SubElement(rule, name).text = value
+    topics = xml.SubElement(xml.SubElement(rule, "topic_access_rules"), "topic_rule")
+    for name, value in (
+        ("topic_expression", "*"),
+        ("enable_discovery_protection", "true"),
+        ("enable_liveliness_protection", "true"),
+        ("enable_read_access_control", "true"),
+        ("enable_write_access_control", "true"),
+        ("metadata_protection_kind", "ENCRYPT"),
+        ("data_protection_kind", "ENCRYPT"),
+    ):
+        xml.SubElement(topics, name).text = value
+    return _text(document)
+
+
+def _text(document: xml.Element) -> str:
+    xml.indent(document)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml.tostring(document, encoding="unicode")}\n'
+
+
+def dds_topics(profile: Profile, enclave: str) -> dict[str, set[str]]:
+    """The DDS topics that an enclave may "publish" and "subscribe", as sros2 writes them into its permissions."""
+    publish, subscribe = {"ros_discovery_info"}, {"ros_discovery_info"}
+    for node in profile.enclaves()[enclave]:
+
+        def names(rule: str, node: NodeInterface = node) -> list[str]:
+            return [full_name(name, profile.ns, node.name) for name in getattr(node, rule)]
+
+        publish |= {f"rt{name}" for name in names("publish")}
+        subscribe |= {f"rt{name}" for name in names("subscribe")}
+        actions = {
+            rule: [f"{name}/_action/{part}" for name in names(rule) for part in _ACTION_SERVICES]
+            for rule in ("execute", "call")
+        }
+        offered, called = names("reply") + actions["execute"], names("request") + actions["call"]
+        publish |= {f"rr{name}Reply" for name in offered} | {f"rq{name}Request" for name in called}
+        subscribe |= {f"rq{name}Request" for name in offered} | {f"rr{name}Reply" for name in called}
+        publish |= {f"rt{name}/_action/{part}" for name in names("execute") for part in _ACTION_TOPICS}
+        subscribe |= {f"rt{name}/_action/{part}" for name in names("call") for part in _ACTION_TOPICS}
+    return {"publish": publish, "subscribe": subscribe}
+
+
+def environment(profile: Profile, keystore: Path) -> str:
+    """A shell script that makes the keys with sros2, and what to set for each process."""
+    store = shlex.quote(str(keystore))
+    lines = [
+        "# Sourced by whoever starts the nodes. Without the keys nothing starts: that is what Enforce means.",
+        f"export ROS_SECURITY_KEYSTORE={store}",
+        "export ROS_SECURITY_ENABLE=true",
+        "export ROS_SECURITY_STRATEGY=Enforce",
+        f"export ROS_DOMAIN_ID={profile.domain}",
+        "",
+        "# Make the keys, once, on a machine with `ros2 security` (apt: ros-jazzy-sros2); again after each",
+        "# `dm security --out`, for the permissions. sros2 writes keys as the umask lets it:",
+        "#   umask 077",
+        f"#   ros2 security create_keystore {store}",
+    ]
+    for enclave in profile.enclaves():
+        path, file = profile.path(enclave), keystore / "policies" / f"{enclave}.policy.xml"
+        lines.append(f"#   ros2 security create_enclave {store} {path}")
+        lines.append(f"#   ros2 security create_permission {store} {path} {shlex.quote(str(file))}")
+    lines += ["", "# Each process its own enclave, by the environment: all its nodes belong to it then."]
+    lines += [f"#   ROS_SECURITY_ENCLAVE_OVERRIDE={profile.path(enclave)}" for enclave in profile.enclaves()]
+    return "\n".join(lines) + "\n"
+
+
+def write_profile(profile: Profile, folder: Path) -> list[Path]:
+    """Write policies, governance and environment into a keystore's folder; returns the files.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    folder = folder.absolute()
+    files = {
+        folder / "policies" / f"{enclave}.policy.xml": policy_xml(profile, enclave) for enclave in profile.enclaves()
+    }
+    files[folder / "enclaves" / "governance.xml"] = governance_xml(profile)
+    files[folder / "environment.sh"] = environment(profile, folder)
+    private = folder / "private"
+    private.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)
+    return list(files)

@@ -1,0 +1,1 @@
+"""verbs of dm_tools."""

@@ -1,0 +1,173 @@
+"""`dm calibrate`: measure and store a calibration on the running suite."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+import typer
+
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
+
+
+class CalibrationPlan(StrEnum):
+    """What to measure."""
+
+    full = "full"
+    pokes = "pokes"
+    surfaces = "surfaces"
+    poke_check = "poke-check"
+    hysteresis = "hysteresis"
+
+
+def run_calibration(client: Any, goal: Any) -> Any:
+    """Run a Calibrate goal with a progress bar; returns the action's result."""
+    phases = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
+    with progress_bar() as progress:
+        task = progress.add_task("calibration", total=None)
+
+        def show(feedback: Any) -> None:
+            dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
+            name = phases[feedback.phase] if feedback.phase < len(phases) else "?"
+            progress.update(
+                task,
+                total=feedback.steps or None,
+                completed=feedback.step,
+                description=f"calibration: {name} {feedback.label}{dropped}",
+            )
+
+        result = client.calibrate(goal, show)
+        progress.update(task, description="calibration: done", completed=progress.tasks[0].total or 0)
+    return result
+
+
+def start_fresh(client: Any) -> None:
+    """Have the next goal begin anew.
+
+    Raises:
+        DeformableMirrorError: the node does not answer, or refuses.
+    """
+    from rclpy.parameter import Parameter
+    from rclpy.parameter_client import AsyncParameterClient
+
+    from dm_client.client import DeformableMirrorError
+    from dm_common.ros.worker import answers_arrive
+
+    parameters = AsyncParameterClient(client.node, "calibration")
+    if not client.wait(lambda: answers_arrive(parameters, parameters.services_are_ready)):
+        raise DeformableMirrorError(599, "the node `calibration` does not answer: is it running (./dm up)?")
+    answer = parameters.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, True)])
+    if not client.wait(answer.done) or not all(each.successful for each in answer.result().results):
+        raise DeformableMirrorError(599, "the node `calibration` did not take start_fresh = true")
+
+
+def show_result(result: Any) -> None:
+    """Print a calibration's figures and everything a person should know about it."""
+    if result.id:
+        console.print(
+            f"calibration [bold]{result.id}[/]: {result.maps} maps in {result.duration:.0f} s, residual "
+            f"{nanometres(result.in_sample_rms):.2f} nm rms in-sample, {nanometres(result.held_out_rms):.2f} nm held "
+            f"out, condition number {result.condition_number:.1f}"
+        )
+    if result.hysteresis_model:
+        console.print(
+            f"hysteresis: {result.hysteresis_model}, moves right to {nanometres(result.hysteresis_held_out_max_zernike):.2f} nm "
+            f"(largest coefficient, 95 %, on moves held out){_foretold(result)}"
+        )
+    for entry in result.dropped:
+        console.print(f"[yellow]dropped[/] {entry}")
+    for entry in result.poke_findings:
+        console.print(f"[yellow]poke check[/] {entry}")
+    if result.poke_check_passed:
+        console.print("poke check: wiring and orientation are as configured")
+
+
+def _foretold(result: Any) -> str:
+    expected = result.expected_max_zernike
+    return f"; expected were {nanometres(expected):.2f} nm" if expected > 0.0 else ""
+
+
+def figures_of(result: Any) -> dict[str, Any]:
+    """A calibration's figures for JSON."""
+    return {
+        "id": result.id,
+        "maps": result.maps,
+        "maps_dropped": result.maps_dropped,
+        "seconds": result.duration,
+        "in_sample_rms_nm": nanometres(result.in_sample_rms),
+        "held_out_rms_nm": nanometres(result.held_out_rms),
+        "condition_number": result.condition_number,
+        "hysteresis_model": result.hysteresis_model,
+        "hysteresis_held_out_max_zernike_nm": nanometres(result.hysteresis_held_out_max_zernike),
+        "expected_max_zernike_nm": nanometres(result.expected_max_zernike),
+        "expected_seconds": result.expected_duration,
+        "poke_findings": list(result.poke_findings),
+    }
+
+
+def calibrate(
+    plan: Annotated[CalibrationPlan, typer.Option(help="What to measure.")] = CalibrationPlan.full,
+    surfaces: Annotated[
+        str, typer.Option(help="Names from Table 1, comma separated, such as p01,pz02; empty = all.")
+    ] = "",
+    amplitude: Annotated[float, typer.Option(help="Half-swing of a poke, normalised; 0 = configured.")] = 0.0,
+    settle: Annotated[float, typer.Option(help="Seconds between command and map; 0 = configured.")] = 0.0,
+    maps_per_state: Annotated[int, typer.Option(min=1, help="Maps averaged per state.")] = 1,
+    hysteresis: Annotated[
+        int | None,
+        typer.Option(
+            "--memory",
+            min=60,
+            max=2000,
+            help="Identify hysteresis and creep from so many maps: short for --plan memory.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Tell duration and expected accuracy, move nothing.")
+    ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Begin anew; an interrupted run of the same plan is set aside.")
+    ] = False,
+    activate: Annotated[bool, typer.Option(help="Use the new calibration at once.")] = True,
+    note: Annotated[str, typer.Option(help="Stored with the calibration.")] = "",
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Calibrate the mirror on the bench: command, settle, measure, fit, store.
+
+    Needs the running suite (`dm up`). Ctrl-C cancels and leaves the mirror at mid range; what was measured is kept, and
+    the same command goes on from there.
+    """
+    from dm_msgs.action import Calibrate
+
+    from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+
+    if hysteresis is not None:
+        plan = CalibrationPlan.hysteresis
+    goal = Calibrate.Goal(
+        plan=list(CalibrationPlan).index(plan),
+        hysteresis_maps=hysteresis or 0,
+        dry_run=dry_run,
+        surfaces=[name.strip() for name in surfaces.split(",") if name.strip()],
+        poke_amplitude=amplitude,
+        settle_time=settle,
+        maps_per_state=maps_per_state,
+        activate=activate,
+        note=note,
+    )
+    with DeformableMirrorClient(namespace) as client:
+        if fresh and not dry_run:
+            start_fresh(client)
+        try:
+            result = run_calibration(client, goal)
+        except DeformableMirrorError as error:
+            if error.response is not None:
+                show_result(error.response)
+            raise
+    if dry_run:
+        console.print(result.message)
+    else:
+        if result.message.startswith("resumed run"):
+            console.print(result.message.partition(";")[0])
+        show_result(result)
+    write_json(json, {"calibration": figures_of(result)})

@@ -1,0 +1,40 @@
+"""`dm doctor`: what is wrong on this machine or bench, in words, and how to cure it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dm_tools.output import JsonOption, NamespaceOption, console, write_json
+
+
+def doctor(
+    config: Annotated[Path | None, typer.Option(help="Check this bench configuration too.")] = None,
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Say what is wrong on this machine or bench, and how to cure it.
+
+    A note is worth knowing; only what is WRONG makes the exit status 1. Nothing is changed, no output is written to.
+    """
+    from dm_tools.doctor.bench import bench_checks
+    from dm_tools.doctor.machine import machine_checks
+
+    checks = machine_checks(namespace)
+    if config is not None:
+        checks += bench_checks(config)
+    findings = {}
+    for name, run in checks:
+        finding = run()
+        findings[name] = None if finding is None else finding._asdict()
+        if finding is None:
+            console.print("[green]ok[/]   ", name, markup=True)
+        else:
+            mark = "[yellow]note[/] " if finding.note else "[red]WRONG[/]"
+            console.print(mark, end=" ")
+            console.print(f"{name}: {finding.problem}\n      cure: {finding.cure}", soft_wrap=True, markup=False)
+    write_json(json, {"doctor": findings})
+    if any(finding and not finding["note"] for finding in findings.values()):
+        raise typer.Exit(1)

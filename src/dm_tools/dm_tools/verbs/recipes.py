@@ -1,0 +1,104 @@
+"""`dm recipes`: build recipes on the bench, and list those of the calibration in use."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
+
+#: The paper's range, section 3.2.
+DEFAULT = "-0.05:0.05:11"
+
+
+def curvatures_of(text: str) -> list[float]:
+    """Curvatures (1/m) from a list such as "-0.02,0,0.02", or from first:last:number.
+
+    Raises:
+        typer.BadParameter: naming what is not a number.
+    """
+    parts = text.split(":")
+    try:
+        if len(parts) == 1:
+            return [float(part) for part in text.split(",") if part.strip()]
+        first, last, number = float(parts[0]), float(parts[1]), int(parts[2])
+    except (ValueError, IndexError) as error:
+        raise typer.BadParameter(f"curvatures = {text!r}: must be like -0.02,0,0.02 or like {DEFAULT}") from error
+    if len(parts) != 3 or not 2 <= number <= 1000:
+        raise typer.BadParameter(f"curvatures = {text!r}: first:last:number, with 2 to 1000 of them")
+    step = (last - first) / (number - 1)
+    return [round(first + k * step, 12) for k in range(number)]
+
+
+def _build(client: Any, curvatures: list[float], conic: float, tolerance: float, max_maps: int) -> Any:
+    """Build with a progress bar; returns the action's result."""
+    order = {curvature: place for place, curvature in enumerate(sorted(curvatures))}
+    with progress_bar() as progress:
+        task = progress.add_task("recipes", total=len(order))
+
+        def show(feedback: Any) -> None:
+            progress.update(
+                task,
+                completed=order.get(feedback.curvature, 0),
+                description=f"recipe {feedback.curvature:+.4f} 1/m: map {feedback.step}, largest coefficient error "
+                f"{nanometres(feedback.max_zernike):.2f} nm",
+            )
+
+        result = client.build_recipes(
+            curvatures, conic, tolerance=tolerance, max_maps=max_maps, on_feedback=show
+        )  # fmt: skip
+        progress.update(task, completed=len(order), description="recipes: done")
+    return result
+
+
+def _figures(book: Any) -> dict[str, Any]:
+    return {
+        "degauss_steps": book.degauss_steps,
+        "interpolation_error_nm": nanometres(book.interpolation_error),
+        "recipes": [
+            {
+                "curvature": recipe.curvature,
+                "conic_constant": recipe.conic_constant,
+                "max_zernike_nm": nanometres(recipe.max_zernike),
+                "rms_nm": nanometres(recipe.rms),
+                "maps": recipe.maps,
+            }
+            for recipe in book.recipes
+        ],
+    }
+
+
+def recipes(
+    curvatures: Annotated[
+        str, typer.Option(help=f"Curvatures [1/m]: -0.02,0,0.02 or first:last:number; empty = {DEFAULT}.")
+    ] = "",
+    conic: Annotated[float, typer.Option(help="Conic constant of all: 0 = sphere, -1 = paraboloid.")] = 0.0,
+    tolerance: Annotated[float, typer.Option(help="Largest coefficient error [nm]; 0 = configured.")] = 0.0,
+    max_maps: Annotated[int, typer.Option(min=0, max=100, help="Maps per recipe; 0 = configured.")] = 0,
+    show: Annotated[bool, typer.Option("--list", help="Only list the recipes of the calibration in use.")] = False,
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Build recipes on the bench: degauss, go, measure, correct, for each curvature; stored with the calibration.
+
+    Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps the recipes that are whole and leaves the mirror
+    at mid range.
+    """
+    from dm_client.client import DeformableMirrorClient
+
+    wanted = curvatures_of(curvatures or DEFAULT)
+    with DeformableMirrorClient(namespace) as client:
+        if not show:
+            result = _build(client, wanted, conic, tolerance * 1e-9, max_maps)
+            console.print(result.message)
+            client.wait(lambda: len(client.latest("calibration").recipes.recipes) >= result.recipes)
+        calibration = client.latest("calibration")
+    for recipe in calibration.recipes.recipes:
+        console.print(
+            f"{recipe.curvature:+.4f} 1/m, conic constant {recipe.conic_constant:g}: largest coefficient error "
+            f"{nanometres(recipe.max_zernike):.2f} nm, {nanometres(recipe.rms):.1f} nm rms, {recipe.maps} maps"
+        )
+    if not calibration.recipes.recipes:
+        console.print(f"calibration {calibration.id or '(none)'} holds no recipes")
+    write_json(json, {"calibration": calibration.id, **_figures(calibration.recipes)})

@@ -1,0 +1,60 @@
+"""`dm record`: the topics of a session in an MCAP file that `ros2 bag` and Foxglove read."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dm_tools.output import JsonOption, NamespaceOption, console, write_json
+
+#: How often the count on the screen is renewed, s.
+SHOWN_EVERY_S = 0.5
+
+
+def record(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the recording; must not exist yet. Default: runs/recording-TIME.")
+    ] = None,
+    topics: Annotated[str, typer.Option(help="Only these, comma separated; empty = all of the suite.")] = "",
+    maps: Annotated[bool, typer.Option(help="Record the maps themselves too, megabytes each.")] = True,
+    duration: Annotated[float, typer.Option(min=0.0, help="Seconds to record; 0 = until Ctrl-C.")] = 0.0,
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Record the running suite until Ctrl-C; begin before a calibration that is to be made again from it.
+
+    Writes a folder with one MCAP file and metadata.yaml, as `ros2 bag record -s mcap` does.
+    """
+    from dm_tools.recording.recorder import Recorder
+
+    # SIGTERM must finish the file as Ctrl-C does.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    folder = out if out is not None else Path("runs") / time.strftime("recording-%Y%m%dT%H%M%S")
+    names = [name.strip() for name in topics.split(",") if name.strip()]
+    started = time.monotonic()
+    with Recorder(folder, namespace, names, maps) as recorder:
+        console.print(f"recording into {folder}; Ctrl-C ends it")
+        try:
+            with console.status("") as status:
+                while not duration or time.monotonic() - started < duration:
+                    recorder.check()
+                    counts = recorder.counts
+                    status.update(f"{sum(counts.values())} messages on {len(counts)} topics")
+                    time.sleep(min(SHOWN_EVERY_S, duration or SHOWN_EVERY_S))
+        except KeyboardInterrupt:
+            console.print("\nstopping")
+    counts = recorder.counts
+    for name, count in sorted(counts.items()):
+        console.print(f"{count:8d}  {name}")
+    for name, reason in recorder.refused.items():
+        console.print(f"[yellow]not recorded[/] {name}: {reason}")
+    console.print(f"{sum(counts.values())} messages, recording: {os.path.relpath(folder)}")
+    if not sum(counts.values()):
+        raise RuntimeError("nothing was recorded: are the nodes running (./dm up), and in this ROS_DOMAIN_ID?")
+    seconds = time.monotonic() - started
+    write_json(json, {"folder": str(folder), "messages": counts, "refused": recorder.refused, "seconds": seconds})

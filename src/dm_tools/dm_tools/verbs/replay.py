@@ -1,0 +1,85 @@
+"""`dm replay`: a recording published again, or the calibration in it made again."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(help="Folder of a recording, or its MCAP file.")],
+    rate: Annotated[float, typer.Option(help="Times faster than recorded.")] = 1.0,
+    topics: Annotated[str, typer.Option(help="Only these, comma separated.")] = "",
+    commands: Annotated[
+        bool, typer.Option("--commands", help="Publish commands and requests too: a driver that runs will obey them.")
+    ] = False,
+    recalibrate: Annotated[
+        bool, typer.Option("--recalibrate", help="Publish nothing; make the recorded calibration again and compare.")
+    ] = False,
+    run: Annotated[int, typer.Option(min=0, help="Which calibration of the recording, from 1; 0 = the last.")] = 0,
+    store: Annotated[
+        Path | None, typer.Option(help="With --recalibrate: folder to store the calibration made again in.")
+    ] = None,
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Publish a recording's topics with their own timing, or make its calibration again, to the last bit."""
+    from dm_tools.recording.bag import BagReader
+    from dm_tools.recording.player import play, replayed
+
+    bag = BagReader(recording)
+    if recalibrate:
+        write_json(json, _again(bag, run, namespace, store))
+        return
+    names = replayed(list(bag.topics), [name.strip() for name in topics.split(",") if name.strip()], commands)
+    console.print(f"{bag.messages} messages of {bag.duration_s:.1f} s; publishing {', '.join(sorted(names))}")
+    with progress_bar() as bar:
+        task = bar.add_task("replay, s", total=round(bag.duration_s))
+        count = play(bag, names, rate, progress=lambda seconds: bar.update(task, completed=round(seconds)))
+    console.print(f"{count} messages published")
+    write_json(json, {"recording": str(bag.file), "messages": count, "topics": sorted(names)})
+
+
+def _again(bag: Any, run: int, namespace: str, store: Path | None) -> dict[str, Any]:
+    """Make the calibration again; returns its figures."""
+    from dm_calibration.store.calibration_store import CalibrationStore
+    from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate
+
+    session = read_session(bag, run, namespace)
+    now, mirror = time.time_ns(), session.run.mirror
+    folder = CalibrationStore(store if store is not None else Path("runs/replayed"))
+    calibration = recalibrate(session, folder.new_id(mirror.name, mirror.serial, now), now)
+    for remark in session.remarks:
+        console.print(f"[yellow]remark[/] {remark}")
+    fit = calibration.fit
+    console.print(
+        f"{int(fit.used.sum())} of {len(calibration.maps)} maps, residual {nanometres(fit.in_sample_rms):.2f} nm "
+        f"in-sample, {nanometres(fit.held_out_rms):.2f} nm held out"
+    )
+    published = session.published
+    differing = differences(calibration, published) if published is not None else None
+    if differing is None:
+        console.print("the recording holds no calibration to compare with: it was not activated")
+    elif differing:
+        console.print(f"[red]differs[/] from {published.id} in {', '.join(differing)}")
+    else:
+        console.print(f"the same as {published.id} to the last bit, in all {len(COMPARED)} fields compared")
+    file = ""
+    if store is not None:
+        file = str(folder.save(calibration))
+        console.print(f"stored: {file}")
+    if differing:
+        raise RuntimeError("the calibration made again is not the one that was recorded")
+    return {
+        "maps": len(calibration.maps),
+        "in_sample_rms_nm": nanometres(fit.in_sample_rms),
+        "held_out_rms_nm": nanometres(fit.held_out_rms),
+        "compared_with": published.id if published is not None else None,
+        "identical": None if differing is None else not differing,
+        "file": file,
+    }

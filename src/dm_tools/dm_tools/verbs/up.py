@@ -1,0 +1,108 @@
+"""`dm up`: the nodes on this terminal, against hardware or the virtual bench."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import signal
+import tempfile
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dm_bringup.suite import Config, load_config
+from dm_tools.output import console
+
+#: Between the ports of two virtual benches.
+PORTS_APART = 10
+
+
+def shared_config(name: str) -> Path:
+    """A file of the package's config folder."""
+    from ament_index_python.packages import get_package_share_directory
+
+    return Path(get_package_share_directory("dm_bringup")) / "config" / name
+
+
+def up(
+    config: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Parameter file of your bench, see config/hardware.yaml; none = virtual bench. With several mirrors "
+            "one per --namespace, in that order."
+        ),
+    ] = None,
+    namespace: Annotated[
+        list[str] | None, typer.Option(help="Namespace of the mirror; several times for as many mirrors.")
+    ] = None,
+    logs: Annotated[Path | None, typer.Option(help="Write the nodes' output to files in this folder instead.")] = None,
+) -> None:
+    """Start the nodes and keep them running until Ctrl-C or SIGTERM; the mirror is then ramped to its safe shape."""
+    from dm_bringup.suite import Suite
+
+    mirrors = configurations(config or [], namespace or [""])
+    stop = threading.Event()
+    # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
+    # because a shell starts commands in the background with SIGINT ignored.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: stop.set())
+    with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
+        folder = logs if logs is not None else Path(temporary)
+        suites = [
+            stack.enter_context(Suite(configuration, folder / name, namespace=name, echo=logs is None))
+            for name, configuration in mirrors.items()
+        ]
+        for name, configuration in mirrors.items():
+            kind = "virtual bench" if "virtual_bench" in configuration else "hardware"
+            console.print(f"the nodes {f'of {name} ' if name else ''}are starting ({kind})")
+        console.print("Ctrl-C stops them and makes every mirror safe")
+        while not stop.wait(0.2):
+            for suite in suites:
+                suite.check()
+        console.print("\nstopping")
+
+
+def configurations(files: list[Path], namespaces: list[str]) -> dict[str, Config]:
+    """The configuration of the mirror in each namespace.
+
+    Several mirrors on virtual benches get ports and folders of their own.
+
+    Raises:
+        ConfigError: a file cannot be used.
+        ValueError: the numbers do not match, a namespace comes twice, or a section is missing.
+    """
+    names = [namespace.strip("/") for namespace in namespaces]
+    if len(set(names)) < len(names):
+        raise ValueError(f"--namespace {', '.join(namespaces)}: each mirror needs one of its own")
+    if len(files) not in (0, len(names)):
+        raise ValueError(f"--config: {len(files)} files for {len(names)} mirrors; give one for each --namespace")
+    result = {}
+    for number, name in enumerate(names):
+        configuration = load_config(files[number] if files else shared_config("bench.yaml"))
+        if "pdm_driver" not in configuration:
+            raise ValueError(f"{files[number]}: no section for pdm_driver: its required parameters must be given")
+        result[name] = configuration if files or len(names) == 1 else virtual_mirror(configuration, name, number)
+    return result
+
+
+def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
+    """The shipped virtual bench for mirror `number` of several: ports, folders, serial and seed of its own."""
+    own = copy.deepcopy(configuration)
+    twin, driver = own["virtual_bench"], own["pdm_driver"]
+    shift = PORTS_APART * number
+    old_trigger = str(twin["trigger.port"])
+    for key in ("electronics.tcp_port", "electronics.udp_port", "electronics.discovery_port", "trigger.port"):
+        twin[key] += shift
+    driver["electronics.port"] += shift
+    twin["seed"] += number
+    driver["mirror.serial"] = f"virtual-{name}"
+    folder = f"~/.ros/dm_bench/{name}"
+    twin["output_folder"] = own["interferometer"]["watch_folder"] = f"{folder}/maps"
+    own["calibration"]["calibration_folder"] = f"{folder}/calibrations"
+    command = own["interferometer"]["trigger_command"]
+    own["interferometer"]["trigger_command"] = [
+        str(twin["trigger.port"]) if part == old_trigger else part for part in command
+    ]
+    return own

@@ -1,0 +1,257 @@
+"""Curvature request to actuator command, between processes: the focus controller beside a bare relay.
+
+Every request waits for its answer before the next one, in turns, so that a busy moment of the machine meets relay and
+controller alike; figures are medians over blocks of such turns. The controller runs as on a bench: a calibration whose
+memory is identified, and a driver that reports every move.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
+from numpy.typing import NDArray
+
+from dm_common.messages import doubles
+from dm_common.ros import qos
+from studies.benchmarks import stand_in_mirror
+from studies.benchmarks.ros_jobs.ros_processes import Laboratory, laboratory
+from studies.benchmarks.timing import Effort
+
+Floats = NDArray[np.float64]
+
+#: Class of the memory law in the calibration.
+LAW = "Preisach"
+#: Largest curvature asked for, 1/m: reachable, some actuators at their limits.
+REACH = 0.03
+#: Between two requests, s: what the node has to do after a command is over; and so long that each of two peers gets
+#: some 100 requests a second.
+PAUSE_S, CAMERA_PAUSE_S = 1e-3, 4e-3
+#: Requests for each in one block; figures are medians over blocks.
+BLOCK = 150
+WARM_UP = 50
+#: The stream that must not grow queues.
+STREAM_RATE = 500.0
+ANSWER_S = 2.0
+#: As the driver reports when nothing happens: one that is silent is taken for dead.
+REPORT_PERIOD_S = 0.5
+EXECUTORS = ("events", "single", "multi")
+
+
+@dataclass
+class Peer:
+    """One node under test: its publishers, and the times its answers came.
+
+    Attributes:
+        answers: commands in order, each with the time it came, ns.
+    """
+
+    room: Laboratory
+    namespace: str
+    answers: list[tuple[int, ActuatorCommand]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        node = self.room.node
+        self.publisher = node.create_publisher(FocusRequest, f"/{self.namespace}/focus_request", qos.COMMAND)
+        topic = f"/{self.namespace}/actuator_command"
+        self.subscription = node.create_subscription(ActuatorCommand, topic, self._on_command, qos.STATE)
+
+    def _on_command(self, command: ActuatorCommand) -> None:
+        self.answers.append((time.perf_counter_ns(), command))
+        self.after(command)
+
+    def asked_by(self) -> list[tuple[int, float]]:
+        """Times of the answers (ns) with the curvatures they answer."""
+        return [(when, command.signals[0]) for when, command in self.answers]
+
+    def after(self, command: ActuatorCommand) -> None:
+        """What the neighbours do with a command."""
+
+    def connected(self) -> bool:
+        """Whether the node is there."""
+        return bool(
+            self.publisher.get_subscription_count() and self.room.node.count_publishers(self.subscription.topic)
+        )
+
+    def request(self, curvature: float) -> int:
+        """Send a request; returns when, ns."""
+        message = FocusRequest(curvature=curvature)
+        message.header.stamp = self.room.node.get_clock().now().to_msg()
+        sent = time.perf_counter_ns()
+        self.publisher.publish(message)
+        return sent
+
+    def round_trip(self, curvature: float) -> float:
+        """Time to the command, s; NaN when none came."""
+        self.answers.clear()
+        sent = self.request(curvature)
+        self.room.serve(ANSWER_S, lambda: bool(self.answers))
+        return 1e-9 * (self.answers[0][0] - sent) if self.answers else float("nan")
+
+
+class FocusPeer(Peer):
+    """The focus controller between stand-ins of its neighbours: calibration, and a driver that moves at once."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        node, prefix = self.room.node, f"/{self.namespace}"
+        self._info = node.create_publisher(MirrorInfo, f"{prefix}/mirror_info", qos.LATCHED)
+        self._calibration = node.create_publisher(Calibration, f"{prefix}/calibration", qos.LATCHED)
+        self._state = node.create_publisher(ActuatorState, f"{prefix}/actuator_state", qos.STATE)
+        self._capabilities: list[Capabilities] = []
+        node.create_subscription(Capabilities, f"{prefix}/capabilities", self._capabilities.append, qos.LATCHED)
+        self.focus_states: list[FocusState] = []
+        node.create_subscription(FocusState, f"{prefix}/focus_state", self.focus_states.append, qos.STATE)
+        self._turns = 0
+        self._degausses = 0
+        self._reported: ActuatorState | None = None
+        node.create_timer(REPORT_PERIOD_S, lambda: self._reported and self._state.publish(self._reported))
+
+    def asked_by(self) -> list[tuple[int, float]]:
+        asked = {_ns(state.header.stamp): state.curvature for state in self.focus_states if state.applied}
+        stamped = [(when, _ns(command.header.stamp)) for when, command in self.answers]
+        return [(when, asked[stamp]) for when, stamp in stamped if stamp in asked]
+
+    def after(self, command: ActuatorCommand) -> None:
+        self._turns += 1
+        self._report(command.signals)
+
+    def _report(self, signals: Any) -> None:
+        report = ActuatorState(
+            driver_state=ActuatorState.STATE_ACTIVE,
+            requested=signals,
+            applied=signals,
+            turns=self._turns,
+            turned_at=signals,
+            degausses=self._degausses,
+            history_known=self._degausses > 0,
+        )
+        report.header.stamp = self.room.node.get_clock().now().to_msg()
+        self._reported = report
+        self._state.publish(report)
+
+    def calibrate(self) -> None:
+        """Have the controller take the calibration, and tell of a degauss, so that it knows the history."""
+        self._info.publish(stand_in_mirror.mirror_info())
+        self._calibration.publish(stand_in_mirror.calibration(LAW))
+        self.room.wait_for(
+            "the controller's calibration",
+            lambda: self._capabilities and self._capabilities[-1].quality == Capabilities.CALIBRATED,
+        )
+        for self._degausses in (0, 1):
+            self._report(doubles(np.zeros(37)))
+            self.room.serve(0.5)
+
+
+def _ns(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
+    """Figures `relay`, `focus`, `executors` and `stream`; times in us.
+
+    Raises:
+        RuntimeError: a node ended, or did not answer.
+    """
+    generator = np.random.default_rng(500)
+    blocks = 2 if effort.quick else 16
+    with laboratory() as room:
+        relay, focus = _started(room, "events"), _controller(room)
+        _collected([relay, focus], WARM_UP, generator)
+        turns = [_collected([relay, focus], BLOCK, generator) for _ in range(blocks)]
+        camera = [_collected([relay, focus], BLOCK, generator, CAMERA_PAUSE_S) for _ in range(max(blocks // 4, 2))]
+        stream = {
+            name: _stream(room, peer, 2.0 if effort.quick else 10.0, generator)
+            for name, peer in (("relay", relay), ("focus", focus))
+        }
+    with laboratory() as room:
+        peers = [_started(room, kind) for kind in EXECUTORS]
+        _collected(peers, WARM_UP, generator)
+        # The multi-threaded one of Jazzy slows down what runs beside it, so it comes only here.
+        executors = [_collected(peers, BLOCK, generator, CAMERA_PAUSE_S) for _ in range(1 if effort.quick else 4)]
+    return {
+        "relay": _percentiles(turns, 0),
+        "focus": _percentiles(turns, 1) | _ratios(turns) | {"law": LAW},
+        "at_100_hz": {"relay": _percentiles(camera, 0), "focus": _percentiles(camera, 1) | _ratios(camera)},
+        "executors": {kind: _percentiles(executors, row) for row, kind in enumerate(EXECUTORS)},
+        "stream": stream,
+    }
+
+
+def _started(room: Laboratory, executor: str) -> Peer:
+    namespace = f"relay_{executor}"
+    room.start("studies.benchmarks.ros_jobs.relay_node", executor, namespace=namespace)
+    peer = Peer(room, namespace)
+    room.wait_for(f"the relay with the executor {executor}", peer.connected)
+    room.serve(0.5)
+    return peer
+
+
+def _controller(room: Laboratory) -> FocusPeer:
+    room.start("dm_controller.focus_controller_node", namespace="focus")
+    peer = FocusPeer(room, "focus")
+    room.wait_for("the focus controller", peer.connected)
+    room.serve(0.5)
+    peer.calibrate()
+    return peer
+
+
+def _collected(peers: list[Peer], rounds: int, generator: np.random.Generator, pause_s: float = PAUSE_S) -> Floats:
+    """(peers, rounds) round trips in turns, us; NaN = no answer."""
+    seconds = np.empty((len(peers), rounds))
+    gc.collect()
+    gc.disable()
+    try:
+        for turn in range(rounds):
+            for row in generator.permutation(len(peers)):
+                seconds[row, turn] = peers[row].round_trip(float(generator.uniform(-REACH, REACH)))
+                peers[row].room.serve(pause_s)
+    finally:
+        gc.enable()
+    return 1e6 * seconds
+
+
+def _percentiles(turns: list[Floats], peer: int) -> dict[str, float]:
+    """Of one peer in blocks (peers, n): medians over the blocks."""
+    microseconds = np.array(turns)[:, peer]
+    p50, p99 = np.median(np.nanpercentile(microseconds, (50, 99), axis=1), axis=1)
+    return {"p50_us": float(p50), "p99_us": float(p99), "lost": int(np.count_nonzero(np.isnan(microseconds)))}
+
+
+def _ratios(turns: list[Floats]) -> dict[str, float]:
+    """Of blocks (2, n), relay and controller: medians over the blocks, and the least, of the ratio within each."""
+    levels = np.nanpercentile(np.array(turns), (50, 99), axis=2)  # (2, B, 2)
+    ratio = levels[:, :, 1] / levels[:, :, 0]
+    return {
+        "ratio_p50": float(np.median(ratio[0])),
+        "ratio_p99": float(np.median(ratio[1])),
+        "least_ratio_p50": float(ratio[0].min()),
+        "least_ratio_p99": float(ratio[1].min()),
+    }
+
+
+def _stream(room: Laboratory, peer: Peer, seconds: float, generator: np.random.Generator) -> dict[str, float]:
+    """Requests at STREAM_RATE whatever becomes of them: how many are answered, and whether answers grow older."""
+    peer.answers.clear()
+    sent: dict[float, int] = {}
+    began = time.monotonic()
+    for number, curvature in enumerate(generator.uniform(-REACH, REACH, round(seconds * STREAM_RATE))):
+        room.serve(began + number / STREAM_RATE - time.monotonic())
+        sent[float(curvature)] = peer.request(float(curvature))
+    lasted = time.monotonic() - began
+    room.serve(1.0)
+    age = 1e-3 * np.array([when - sent[curvature] for when, curvature in peer.asked_by()])
+    quarter = max(len(age) // 4, 1)
+    return {
+        "rate": len(sent) / lasted,
+        "answered_share": len(peer.answers) / len(sent),
+        "p50_us": float(np.median(age)),
+        "p99_us": float(np.percentile(age, 99)),
+        "first_quarter_p50_us": float(np.median(age[:quarter])),
+        "last_quarter_p50_us": float(np.median(age[-quarter:])),
+    }

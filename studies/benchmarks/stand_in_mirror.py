@@ -1,0 +1,151 @@
+"""A mirror to measure with: an analytic plate under a hexagon of actuators that remember, and what is known of it.
+
+The memory laws are identified as in a calibration, but from the displacements of the twin's actuators seen through a
+random matrix, so that no maps have to be made.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from dm_msgs.msg import Calibration, MirrorInfo
+from numpy.typing import NDArray
+
+from dm_calibration.calibration_messages import hysteresis_message
+from dm_calibration.hysteresis.excitation import excitation
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
+from dm_calibration.hysteresis.identify import CANDIDATES, Run, identify
+from dm_calibration.hysteresis.responses import Responses
+from dm_common.geometry import hexagonal_positions, neighbour_pairs, ring_count
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.messages import doubles
+from dm_common.mirror import Mirror
+from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.zernike import TERMS, basis
+from dm_controller.mirror_model import InfluenceModel
+from dm_controller.planner import HysteresisFigures
+from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+from studies.benchmarks.jobs.bounded_solve import PITCH, STROKE
+from studies.solvers.plate_model import PlateProperties, plate_influence
+
+Floats = NDArray[np.float64]
+
+#: By the class of the law that is fitted: what the twin's actuators follow.
+TWIN_LAWS = {
+    "Prandtl-Ishlinskii": "prandtl_ishlinskii",
+    "Preisach": "preisach",
+    "Preisach and Duhem": "bouc_wen",
+}
+MAPS = 120
+#: Actuators of the run, and numbers measured per map.
+ACTUATORS, NUMBERS = 7, 12
+SIGMA = 3e-10  # m, of a coefficient
+WORKING_RADIUS = 11e-3  # m, of 37 actuators
+SLEW_RATE = 40.0  # 1/s
+SERIAL = "bench"
+
+
+@cache
+def identified_law(name: str) -> HysteresisModel:
+    """The law of class `name` (of TWIN_LAWS), fitted to actuators of the twin that follow a like one."""
+    x, y = hexagonal_positions(ACTUATORS, PITCH)
+    mirror = Mirror("hexagon", "", x, y, WORKING_RADIUS, neighbours=np.column_stack(neighbour_pairs(x, y)))
+    generator = np.random.default_rng(ACTUATORS)
+    piezo = PiezoActuators(PiezoConfig(law=TWIN_LAWS[name]), generator, np.zeros(ACTUATORS))
+    commands = excitation(mirror, MAPS)
+    mixing = generator.standard_normal((ACTUATORS, NUMBERS)) / 4.0
+    time = np.cumsum(1.0 + commands.dwell)
+    values = np.empty((MAPS, NUMBERS))
+    before = 0.0
+    for row, (signals, seen) in enumerate(zip(commands.signals, time, strict=True)):
+        piezo.apply(signals, before)
+        piezo.advance(float(seen))
+        values[row], before = piezo.displacement @ mixing, float(seen)
+    values += SIGMA * generator.standard_normal(values.shape)
+    responses = Responses(values, NUMBERS, np.ones(MAPS, dtype=bool))
+    candidate = next(one for one in CANDIDATES if one.name == name)
+    return identify(Run(commands.signals, time, responses, 0.0), candidates=(candidate,), folds=2).fit.law
+
+
+def figures(law: HysteresisModel) -> HysteresisFigures:
+    """What a calibration would say of `law`."""
+    return HysteresisFigures(law, np.full(len(TERMS), SIGMA), 1e-9, 0.05)
+
+
+def influence_model(actuators: int = 37) -> InfluenceModel:
+    """The plate's influence function over an aperture that grows with the hexagon.
+
+    Raises:
+        ValueError: no full hexagon has that number of actuators.
+    """
+    positions = np.column_stack(hexagonal_positions(actuators, PITCH))
+    radius = WORKING_RADIUS * ring_count(actuators) / 3
+    points = edge_clustered_points(max(500, 2 * actuators))
+    sag = STROKE * plate_influence(radius * np.column_stack([points.x, points.y]), positions, PlateProperties())
+    weights = np.sqrt(points.weight)[:, None]
+    terms: Floats = np.linalg.lstsq(weights * basis(points.x, points.y), weights * sag, rcond=None)[0].astype(float)
+    return InfluenceModel(
+        aperture_radius=radius,
+        influence_zernike=terms,
+        zernike_offset=np.zeros(len(TERMS)),
+        sample_x=points.x,
+        sample_y=points.y,
+        sample_weight=points.weight,
+        influence_sag=sag,
+        sag_offset=np.zeros(len(sag)),
+        held_out_rms=2e-10,
+        held_out_max_zernike=SIGMA,
+    )
+
+
+def mirror_info() -> MirrorInfo:
+    """The mirror as the driver announces it."""
+    x, y = hexagonal_positions(37, PITCH)
+    first, second = neighbour_pairs(x, y)
+    return MirrorInfo(
+        name="PDM30-37",
+        serial=SERIAL,
+        actuators=37,
+        actuator_x=doubles(x),
+        actuator_y=doubles(y),
+        neighbour_a=first.tolist(),
+        neighbour_b=second.tolist(),
+        full_aperture_diameter=0.03,
+        working_aperture_diameter=2 * WORKING_RADIUS,
+        signal_min=-1.0,
+        signal_max=1.0,
+        neighbour_difference_max=2.0,
+        slew_rate_max=SLEW_RATE,
+    )
+
+
+def calibration(name: str, serial: str = SERIAL) -> Calibration:
+    """A calibration of that mirror whose memory is of the class `name` (of TWIN_LAWS)."""
+    model, law = influence_model(), identified_law(name)
+    known = figures(law)
+    hysteresis = HysteresisFit(
+        name, law, known.zernike_sigma, known.held_out_max_zernike, known.unknown_sigma, MAPS, ()
+    )
+    return Calibration(
+        id=SERIAL,
+        mirror_serial=serial,
+        method="analytic plate",
+        aperture_radius=model.aperture_radius,
+        actuators=37,
+        terms=len(TERMS),
+        influence_zernike=doubles(model.influence_zernike.ravel()),
+        zernike_offset=doubles(model.zernike_offset),
+        points=len(model.sample_x),
+        sample_x=doubles(model.sample_x),
+        sample_y=doubles(model.sample_y),
+        sample_weight=doubles(model.sample_weight),
+        influence_sag=doubles(model.influence_sag.ravel()),
+        sag_offset=doubles(model.sag_offset),
+        in_sample_rms=model.held_out_rms,
+        held_out_rms=model.held_out_rms,
+        held_out_max_zernike=model.held_out_max_zernike,
+        maps_used=MAPS,
+        quality=Calibration.CALIBRATED,
+        hysteresis=hysteresis_message(hysteresis),
+    )

@@ -1,0 +1,307 @@
+"""What each part of the memory brings: open loop in random order on twins of several laws, part by part.
+
+Each seed is a twin of its own, calibrated once by the memory plan; every model is made of the same maps. Requests are
+spheres of random curvature, each held for a dwell time of its own; the true surface is judged when the dwell ends.
+Models learn of the twin only what the driver reports.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.procedure.procedure import Progress
+from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_controller.creep_hold import PERIOD_S
+from dm_controller.planner import SETTLE_S, Move
+from dm_controller.recipes import find
+from dm_controller.target import FocusTarget
+from studies.comparison.ablation_models import MODELS, Variant, make_variants
+from studies.comparison.compare import peak_to_valley
+from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, plan_steps
+from studies.comparison.true_surface import TrueSurface
+
+#: What precedes the requests. Tracked: all that the calibration did, and no degauss. Power cycle: off for a time in
+#: which creep goes on unseen, then a degauss.
+#: Conditioned: a degauss before each request, as recipes need it.
+TRACKED, DEGAUSSED, POWER_CYCLE, CONDITIONED = "tracked", "degaussed", "power cycle", "conditioned"
+HISTORIES = (TRACKED, DEGAUSSED, POWER_CYCLE)
+#: Hysteresis laws of the twins; `mixed` is one that no candidate of the identification holds.
+PLANTS = ("prandtl_ishlinskii", "preisach", "bouc_wen", "mixed")
+#: Times that shapes are held, s.
+DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
+#: Largest curvature asked for, 1/m.
+CURVATURE_MAX = 0.05
+#: The longest hold, from when its drift counts, and the curvature, s, s, 1/m.
+HOLD_S, HOLD_FROM_S, HOLD_CURVATURE = 3600.0, 1.0, 0.03
+#: Share of the time since the move that the next correction of a held shape waits: creep slows down like that, and an
+#: experiment need not correct more often than it matters. The first ones come as the controller's do.
+CORRECTION_GROWTH = 0.07
+
+
+@dataclass(frozen=True)
+class AblationOptions:
+    """What to run.
+
+    Attributes:
+        twin: its law and seed are replaced by each of `plants` and `seeds`.
+        requests: per seed and history.
+        maps: of the calibration.
+        power_off: length of a power cycle, s.
+    """
+
+    twin: SimulationConfig = field(default_factory=SimulationConfig)
+    plants: Sequence[str] = PLANTS
+    seeds: Sequence[int] = (1, 2, 3, 4, 5)
+    histories: Sequence[str] = HISTORIES
+    requests: int = 40
+    maps: int = 300
+    power_off: float = 600.0
+
+    def __post_init__(self) -> None:
+        if not self.seeds or not self.plants or not self.histories:
+            raise ValueError("seeds, plants and histories: at least one each is needed")
+        if self.requests < len(DWELLS):
+            raise ValueError(f"requests = {self.requests}: must be at least {len(DWELLS)}, one of each dwell time")
+        for name in self.histories:
+            if name not in HISTORIES:
+                raise ValueError(f"history = {name!r}: must be one of {', '.join(HISTORIES)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Requests:
+    """Outcomes of one sequence, or of several: R requests.
+
+    Attributes:
+        dwell: (R,) s.
+        curvature: (R,) 1/m.
+        max_zernike, upper: (R,) m, largest coefficient error of the true surface, and the bound told beforehand.
+        rms, limit: (R,) m, sag error, and the best that this mirror could do.
+    """
+
+    dwell: Floats
+    curvature: Floats
+    max_zernike: Floats
+    upper: Floats
+    rms: Floats
+    limit: Floats
+
+    @classmethod
+    def pooled(cls, parts: Iterable[Requests]) -> Requests:
+        parts = list(parts)
+        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in cls.__dataclass_fields__))
+
+    def held(self, dwell: float) -> Requests:
+        keep = self.dwell == dwell
+        return Requests(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One model on one plant after one history, all seeds together.
+
+    Attributes:
+        hold_1h: (S,) m, drift of a shape held for an hour; of the seeds.
+    """
+
+    plant: str
+    model: str
+    history: str
+    requests: Requests
+    hold_1h: Floats
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What the calibration of one twin found."""
+
+    plant: str
+    seed: int
+    law: str
+    held_out_max_zernike: float
+
+
+@dataclass(frozen=True, eq=False)
+class Ablation:
+    """All series."""
+
+    series: tuple[Series, ...]
+    identified: tuple[Identified, ...]
+    radius: float
+
+
+@dataclass(frozen=True)
+class RowFigures:
+    """Figures of some requests.
+
+    Attributes:
+        p50, p90: m, of the largest coefficient error.
+        rms_share: median of rms sag error over PV.
+        excess_share: the same of what exceeds the fitting limit (root of the difference of squares).
+        bound_coverage: share of requests inside the bound told beforehand.
+    """
+
+    requests: int
+    p50: float
+    p90: float
+    rms_share: float
+    excess_share: float
+    bound_coverage: float
+
+
+def figures_of(requests: Requests, radius: float) -> RowFigures:
+    """Figures of `requests` on an aperture of `radius` (m)."""
+    depth = np.array([peak_to_valley(c, radius) for c in requests.curvature])
+    excess = np.sqrt(np.maximum(np.square(requests.rms) - np.square(requests.limit), 0.0))
+    return RowFigures(
+        requests=len(depth),
+        p50=float(np.quantile(requests.max_zernike, 0.5)),
+        p90=float(np.quantile(requests.max_zernike, 0.9)),
+        rms_share=float(np.median(requests.rms / depth)),
+        excess_share=float(np.median(excess / depth)),
+        bound_coverage=float(np.mean(requests.max_zernike <= requests.upper)),
+    )
+
+
+# --- sequences ---
+
+
+class _Mirror:
+    """A twin under one model: moves, holds, follows the memory."""
+
+    def __init__(self, bench: SimulatedBench, variant: Variant) -> None:
+        self.bench, self._variant = bench, variant
+        self._tracker = HysteresisTracker(variant.loop.law)
+        self._seen = 0
+        self._follow()
+
+    def _follow(self) -> None:
+        for report in self.bench.reports[self._seen :]:
+            self._tracker.observe(report)
+        self._seen = len(self.bench.reports)
+
+    def move(self, target: FocusTarget) -> Move:
+        effective, error = None, None
+        if self._variant.book.recipes:
+            found = find(self._variant.book, target)
+            effective, error = found.effective, found.error
+            self.bench.degauss()
+        self._follow()
+        tracker, loop = self._tracker, self._variant.loop
+        move = loop.plan(target, tracker.state, self.bench.time, tracker.known, effective, SETTLE_S, error)
+        self.bench.apply(move.plan.signals)
+        return move
+
+    def hold(self, move: Move, dwell: float) -> None:
+        """Let `dwell` s pass since the move, correcting what creep does."""
+        began = self.bench.time
+        passed = PERIOD_S
+        while self._variant.holds and passed < dwell:
+            self.bench.time = began + passed
+            self._follow()
+            wait = min(max(PERIOD_S, CORRECTION_GROWTH * passed), dwell - passed)
+            assert self._tracker.state is not None
+            self.bench.apply(
+                self._variant.loop.hold(self._tracker.state, self.bench.time, move.effective, 0.5 * wait)
+            )  # fmt: skip
+            passed += wait
+        self.bench.time = began + dwell
+
+
+def _prepare(bench: SimulatedBench, history: str, power_off: float) -> SimulatedBench:
+    bench = bench.fork()
+    if history == POWER_CYCLE:
+        bench.power_cycle(power_off)
+    if history != TRACKED:
+        bench.degauss()
+        bench.settle()
+    return bench
+
+
+def _sequence(
+    bench: SimulatedBench, variant: Variant, surface: TrueSurface, curvatures: Floats, dwells: Floats, limits: Floats
+) -> tuple[Requests, float]:
+    """The requests in order, and then the drift of a shape held for an hour, m."""
+    mirror = _Mirror(bench, variant)
+    targets = [FocusTarget(float(c)) for c in curvatures]
+    upper, stands = [], []
+    for target, dwell in zip(targets, dwells, strict=True):
+        move = mirror.move(target)
+        mirror.hold(move, float(dwell))
+        upper.append(move.plan.max_zernike_upper)
+        stands.append(bench.true_displacement)
+    errors, rms = surface.errors(np.array(stands), targets)
+    requests = Requests(dwells, curvatures, np.abs(errors).max(axis=1), np.array(upper), rms, limits)
+    return requests, _drift(mirror, surface)
+
+
+def _drift(mirror: _Mirror, surface: TrueSurface) -> float:
+    """Largest change of a coefficient while a shape is held for HOLD_S, from HOLD_FROM_S after the move on, m."""
+    target = FocusTarget(HOLD_CURVATURE)
+    move = mirror.move(target)
+    stands = []
+    began = mirror.bench.time
+    mirror.hold(move, HOLD_FROM_S)
+    stands.append(mirror.bench.true_displacement)
+    mirror.hold(move, HOLD_S - (mirror.bench.time - began))
+    stands.append(mirror.bench.true_displacement)
+    errors, _ = surface.errors(np.array(stands), [target] * len(stands))
+    return float(np.abs(errors[-1] - errors[0]).max())
+
+
+def total_steps(options: AblationOptions) -> int:
+    """Steps that `ablate` reports."""
+    runs = len(options.plants) * len(options.seeds)
+    plan = plan_steps(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps))
+    return runs * (plan + 1 + (len(MODELS) - 1) * len(options.histories) + 1)
+
+
+def ablate(options: AblationOptions, progress: Callable[[str], None] = lambda step: None) -> Ablation:
+    """Run the ablation.
+
+    Args:
+        progress: called with a description before each of `total_steps` steps.
+
+    Raises:
+        TooFewMapsError, BenchError: a twin could not be calibrated.
+    """
+    parts: dict[tuple[str, str, str], list[tuple[Requests, float]]] = {}
+    identified = []
+    radius = 0.0
+    for plant in options.plants:
+        for seed in options.seeds:
+            where = f"{plant}, seed {seed}"
+            bench = SimulatedBench(replace(options.twin, law=plant, seed=seed))
+            radius = bench.mirror.working_radius
+
+            def calibrating(now: Progress, where: str = where) -> None:
+                if now.done < now.steps:
+                    progress(f"{where}: calibration {now.label}")
+
+            calibration = bench.calibrate(
+                PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps), progress=calibrating
+            )  # fmt: skip
+            progress(f"{where}: identification")
+            hysteresis = calibration.hysteresis
+            assert hysteresis is not None
+            identified.append(Identified(plant, seed, hysteresis.name, hysteresis.held_out_max_zernike))
+            surface = TrueSurface(bench)
+            rng = np.random.default_rng([seed, 4])
+            curvatures = rng.uniform(-CURVATURE_MAX, CURVATURE_MAX, options.requests)
+            dwells = rng.permutation(np.resize(DWELLS, options.requests))
+            limits = surface.limits([FocusTarget(float(c)) for c in curvatures])
+            variants = make_variants(bench, calibration)
+            prepared = {h: _prepare(bench, h, options.power_off) for h in (*options.histories, CONDITIONED)}
+            for variant in variants:
+                for history in (CONDITIONED,) if variant.book.recipes else options.histories:
+                    progress(f"{where}: {variant.name}, {history}")
+                    outcome = _sequence(prepared[history].fork(), variant, surface, curvatures, dwells, limits)
+                    parts.setdefault((plant, variant.name, history), []).append(outcome)
+    series = tuple(
+        Series(*key, Requests.pooled(r for r, _ in outcomes), np.array([drift for _, drift in outcomes]))
+        for key, outcomes in parts.items()
+    )
+    return Ablation(series, tuple(identified), radius)

@@ -1,0 +1,73 @@
+"""The models of the ablation, from linear to recipes, each made of the maps of one calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibrator import fit_remembering
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
+from dm_calibration.hysteresis.identify import CANDIDATES
+from dm_calibration.influence.fit import FitOptions
+from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.recipes import NO_RECIPES, RecipeBook
+from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
+from dm_controller.mirror_model import CalibratedMirror
+from dm_controller.planner import HysteresisFigures, Planner
+from dm_controller.target import FocusTarget
+from studies.comparison.compare import CURVATURES
+from studies.comparison.simulated_bench import SimulatedBench, influence_model
+
+#: `plays only` is the whole law, chosen among candidates without the Duhem operator.
+LINEAR, PLAYS, HYSTERESIS, CREEP, RECIPES = "linear", "plays only", "+ hysteresis", "+ creep", "+ recipes"
+MODELS = (LINEAR, PLAYS, HYSTERESIS, CREEP, RECIPES)
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A model of the mirror, whether it corrects shapes while they are held, and its recipes, if it goes by them."""
+
+    name: str
+    loop: Planner
+    holds: bool
+    book: RecipeBook = NO_RECIPES
+
+
+def make_variants(bench: SimulatedBench, calibration: Calibration) -> tuple[Variant, ...]:
+    """The models, each made of the maps of `calibration` alone."""
+    hysteresis = calibration.hysteresis
+    assert hysteresis is not None
+    plays = fit_hysteresis(calibration.maps, candidates=[c for c in CANDIDATES if not c.slopes])
+    still = replace(hysteresis, law=replace(hysteresis.law, creep_rate=0.0))
+    whole = _variant(CREEP, bench, calibration, hysteresis, True)
+    return (
+        _variant(LINEAR, bench, calibration, None, False),
+        _variant(PLAYS, bench, calibration, plays, True),
+        _variant(HYSTERESIS, bench, calibration, still, False),
+        whole,
+        replace(whole, name=RECIPES, book=_recipes(bench.fork(), whole.loop)),
+    )
+
+
+def _recipes(bench: SimulatedBench, loop: Planner) -> RecipeBook:
+    """Recipes over the range of the requests, built on the bench as it stands."""
+    tracker = HysteresisTracker(loop.law)
+    for report in bench.reports:
+        tracker.observe(report)
+    options = BuildOptions(settle_time=bench.config.settle_time)
+    builder = RecipeBuilder(loop, bench, lambda: bench.time, options, state=tracker.state)
+    recipes = [builder.build(FocusTarget(c)) for c in CURVATURES]
+    return recipe_book(recipes, loop, bench.config.degauss_steps, round(1e9 * bench.time))
+
+
+def _variant(
+    name: str, bench: SimulatedBench, calibration: Calibration, hysteresis: HysteresisFit | None, holds: bool
+) -> Variant:
+    fit = fit_remembering(calibration.maps, hysteresis, FitOptions(), bench.mirror)
+    mirror = CalibratedMirror(influence_model(fit, calibration.aperture_radius), bench.limits)
+    if hysteresis is None:
+        return Variant(name, Planner(mirror, slew_rate=bench.slew_rate), holds)
+    # A law without creep was not what the held-out maps tested: then its influence function's own figure counts.
+    held_out = hysteresis.held_out_max_zernike if hysteresis.law.creep_rate else fit.held_out_max_zernike
+    figures = HysteresisFigures(hysteresis.law, hysteresis.zernike_sigma, held_out, hysteresis.unknown_sigma)
+    return Variant(name, Planner(mirror, figures, bench.slew_rate), holds)

@@ -1,0 +1,284 @@
+"""All methods side by side on the same twins: how near they bring a sweep of spheres, and what that costs.
+
+Each seed is a twin of its own, calibrated once by the full plan. Every method then starts from the same state of that
+twin, noise to come included, rested by a degauss, and goes through the same spheres in the same random order. Open-loop
+rows take the solver's command as it is; closed-loop rows let the same solver correct it on the interferometer.
+
+Errors are those of the true surface, which only a twin knows: a loop that stops on its own measurement would otherwise
+be judged by the noise it stopped on. Curvature 0 has no peak to valley and does not count in the relative figures.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.fit import FitOptions, fit_influence
+from dm_calibration.influence.gaps import regress, usable_sag
+from dm_calibration.influence.maps import SURFACE
+from dm_calibration.influence.region_weighting import choose_weighting
+from dm_calibration.influence.regression import least_squares, make_design
+from dm_calibration.procedure.procedure import Progress
+from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
+from dm_controller.mirror_model import InfluenceModel
+from dm_controller.solvers.base import Solver, target_shape
+from dm_controller.solvers.bounded import BoundedProgramme, Limits
+from dm_controller.solvers.pseudo_inverse import PseudoInverse
+from dm_controller.target import FocusTarget
+from dm_tools.verify import SurfaceError, surface_error
+from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, influence_model, plan_steps
+from studies.solvers.registry import SOLVERS, MirrorFacts, check_method, make_solver
+from studies.solvers.steepest_descent import SteepestDescent
+
+#: Curvatures of the sweep, 1/m: the paper's range (section 3.2).
+CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
+#: Added to the name of a method where it runs in the closed loop.
+CLOSED = "_closed_loop"
+#: Methods from before the paper: their influence matrix is that of single pokes, without the surfaces of Table 1.
+CLASSICAL = (PseudoInverse.name, SteepestDescent.name)
+
+
+@dataclass(frozen=True)
+class CompareOptions:
+    """What to compare on.
+
+    Attributes:
+        twin: the twin; its seed is replaced by each of `seeds`.
+        seeds: of the twins; the order of the sweep follows from them too.
+        methods: names of solvers; empty = all.
+        curvatures: of the spheres, 1/m.
+        loop: of the closed-loop rows; by default wavelength / 1000, and three iterations of measuring and correcting.
+        creep: share per decade that the loops foresee, see `closed_loop.Creep`; 0 = they do not.
+    """
+
+    twin: SimulationConfig = field(default_factory=SimulationConfig)
+    seeds: Sequence[int] = (1,)
+    methods: Sequence[str] = ()
+    curvatures: Sequence[float] = CURVATURES
+    loop: LoopOptions = field(default_factory=lambda: LoopOptions(632.8e-12, 3, correct_last=True))
+    creep: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not self.seeds:
+            raise ValueError("seeds: at least one is needed")
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds = {list(self.seeds)}: the same twin twice says nothing new; name each seed once")
+        if min(self.seeds) < 0:
+            raise ValueError(f"seeds = {list(self.seeds)}: must not be negative")
+        if not any(self.curvatures):
+            raise ValueError("curvatures: at least one other than 0 is needed")
+        for name in self.methods:
+            check_method(name)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One set-point by one method.
+
+    Attributes:
+        seed, method, closed: which.
+        curvature: 1/m.
+        max_zernike: largest coefficient error beyond tilt of the true surface, m.
+        rms: of the true surface's error, piston and tilt removed, m.
+        maps: taken by the loop.
+        seconds: bench time of moves, settling and maps, and computing time.
+    """
+
+    seed: int
+    method: str
+    closed: bool
+    curvature: float
+    max_zernike: float
+    rms: float
+    maps: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class MethodFigures:
+    """One row: medians and percentiles over all set-points and seeds."""
+
+    p50: float  # m, largest coefficient error
+    p90: float
+    rms_share: float  # median of rms sag error over PV of the sphere
+    maps: float  # median
+    seconds: float  # median
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """All rows, and what no method can undercut.
+
+    Attributes:
+        trials: every set-point.
+        fitting_limit: rms sag that the ideal command inside the limits leaves of the hardest sphere of the sweep, m;
+            median over the seeds.
+        fitting_limit_share: the same over PV, median over all spheres.
+    """
+
+    trials: tuple[Trial, ...]
+    fitting_limit: float
+    fitting_limit_share: float
+    radius: float
+
+    def rows(self) -> dict[str, MethodFigures]:
+        """Figures by method, closed-loop rows with CLOSED added to the name."""
+        groups: dict[str, list[Trial]] = {}
+        for trial in self.trials:
+            groups.setdefault(trial.method + (CLOSED if trial.closed else ""), []).append(trial)
+        return {name: self._figures(group) for name, group in groups.items()}
+
+    def _figures(self, trials: list[Trial]) -> MethodFigures:
+        worst = [trial.max_zernike for trial in trials]
+        shares = [t.rms / peak_to_valley(t.curvature, self.radius) for t in trials if t.curvature]
+        return MethodFigures(
+            p50=float(np.quantile(worst, 0.5)),
+            p90=float(np.quantile(worst, 0.9)),
+            rms_share=float(np.median(shares)),
+            maps=float(np.median([trial.maps for trial in trials])),
+            seconds=float(np.median([trial.seconds for trial in trials])),
+        )
+
+
+def peak_to_valley(curvature: float, radius: float) -> float:
+    """PV of a weakly curved sphere over an aperture, m."""
+    return abs(curvature) * radius**2 / 2.0
+
+
+@dataclass(frozen=True)
+class _MapInfo:
+    """What `surface_error` asks of a map."""
+
+    centre_x: float
+    centre_y: float
+    aperture_radius_px: float
+    aperture_radius: float
+
+
+def true_error(bench: SimulatedBench, target: FocusTarget) -> SurfaceError:
+    """The true surface of the twin against `target`."""
+    aperture = bench.aperture
+    info = _MapInfo(aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px, aperture.radius_px * bench.pitch)
+    return surface_error(bench.true_map(), info, target)
+
+
+def fitting_limits(bench: SimulatedBench, curvatures: Sequence[float]) -> Floats:
+    """(C,) rms sag error of the best possible displacements of this very mirror inside its stroke, m.
+
+    Computed on the true influence functions and figure, without hysteresis, creep and noise.
+    """
+    influence, figure = bench.true_influence()
+    rows, columns = np.nonzero(np.isfinite(bench.true_map()))
+    aperture = bench.aperture
+    x: Floats = (columns.astype(float) - aperture.centre_x_px) / aperture.radius_px
+    y: Floats = (aperture.centre_y_px - rows.astype(float)) / aperture.radius_px
+    plane = np.linalg.qr(np.column_stack([np.ones_like(x), x, y]))[0]
+
+    def tilt_free(sag: Floats) -> Floats:
+        result: Floats = sag - plane @ (plane.T @ sag)
+        return result / np.sqrt(len(x))
+
+    matrix = tilt_free(influence * bench.true_stroke)
+    box = Limits(bench.limits.low, bench.limits.high, bench.limits.pairs, bench.limits.neighbour_difference)
+    programme = BoundedProgramme(matrix, box, ridge=1e-26)
+    limits = []
+    for curvature in curvatures:
+        wanted = tilt_free(FocusTarget(curvature).sag(x, y, bench.mirror.working_radius) - figure)
+        limits.append(np.linalg.norm(matrix @ programme.solve(wanted) - wanted))
+    return np.array(limits)
+
+
+def poke_model(calibration: Calibration) -> InfluenceModel:
+    """The influence function of the pokes and reference frames alone."""
+    maps = calibration.maps.select(np.array([kind != SURFACE for kind in calibration.maps.kind], dtype=bool))
+    return influence_model(fit_influence(maps, FitOptions()), calibration.aperture_radius)
+
+
+def region_weights_of(calibration: Calibration) -> Floats:
+    """(10,) weights of Eq. (8) from the surfaces of a calibration, epsilon by cross-validation."""
+    maps = calibration.maps.select(calibration.fit.used)
+    design = make_design(maps)
+    _, responses = regress(least_squares, design, maps, usable_sag(maps, [""] * len(maps)))
+    return choose_weighting(design, maps, responses[:, maps.terms :]).weights
+
+
+def make_solvers(calibration: Calibration, limits: Limits, methods: Sequence[str]) -> dict[str, Solver]:
+    """The solvers, each on the influence function it would have."""
+    full = influence_model(calibration.fit, calibration.aperture_radius)
+    pokes = poke_model(calibration) if any(name in CLASSICAL for name in methods) else full
+    facts = MirrorFacts(calibration.actuator_x, calibration.actuator_y, region_weights_of(calibration))
+    return {name: make_solver(name, pokes if name in CLASSICAL else full, limits, facts) for name in methods}
+
+
+def _sweep(
+    bench: SimulatedBench, solver: Solver, closed: bool, order: Sequence[float], options: CompareOptions
+) -> list[Trial]:
+    bench.degauss()
+    bench.settle()
+    before = bench.mirror.rest
+    trials = []
+    for curvature in order:
+        target = FocusTarget(curvature)
+        began, computing = bench.time, time.perf_counter()
+        maps = 0
+        if closed:
+            creep = Creep(options.creep, before, lambda: bench.time)
+            result = converge(solver, target, bench, options.loop, creep=creep)
+            before, maps = result.signals, result.maps
+        else:
+            before = solver.solve(target_shape(target, solver.model)).signals
+            bench.apply(before)
+            bench.settle()
+        seconds = bench.time - began + time.perf_counter() - computing
+        error = true_error(bench, target)
+        trials.append(
+            Trial(
+                bench.config.seed, solver.name, closed, curvature, error.max_zernike, error.rms, maps, seconds
+            )
+        )  # fmt: skip
+    return trials
+
+
+def total_steps(options: CompareOptions) -> int:
+    """Steps that `compare` reports."""
+    return len(options.seeds) * (plan_steps() + 2 * len(options.methods or SOLVERS))
+
+
+def compare(options: CompareOptions, progress: Callable[[str], None] = lambda step: None) -> Comparison:
+    """Run the comparison.
+
+    Args:
+        progress: called with a description before each of `total_steps` steps.
+
+    Raises:
+        UnknownNameError: an unknown method, listing all.
+        TooFewMapsError, BenchError: the twin could not be calibrated.
+    """
+    methods = tuple(dict.fromkeys(options.methods)) or tuple(SOLVERS)
+    trials: list[Trial] = []
+    limits: list[float] = []
+    shares: list[float] = []
+    radius = 0.0
+    for seed in options.seeds:
+        bench = SimulatedBench(replace(options.twin, seed=seed))
+        radius = bench.mirror.working_radius
+
+        def calibrating(now: Progress, seed: int = seed) -> None:
+            if now.done < now.steps:
+                progress(f"seed {seed}: calibration {now.label}")
+
+        calibration = bench.calibrate(progress=calibrating)
+        limit = fitting_limits(bench, options.curvatures)
+        limits.append(float(limit.max()))
+        shares += [r / peak_to_valley(c, radius) for r, c in zip(limit, options.curvatures, strict=True) if c]
+        order = [float(c) for c in np.random.default_rng(seed).permutation(options.curvatures)]
+        solvers = make_solvers(calibration, bench.limits, methods)
+        for closed in (False, True):
+            for name, solver in solvers.items():
+                progress(f"seed {seed}: {name}{', closed loop' if closed else ''}")
+                trials += _sweep(bench.fork(), solver, closed, order, options)
+    return Comparison(tuple(trials), float(np.median(limits)), float(np.median(shares)), radius)

@@ -1,0 +1,306 @@
+"""The virtual bench in process: the twin's mirror, electronics and interferometer without sockets, files or waiting.
+
+Implements `dm_calibration.procedure.procedure.Bench`, so calibrations and closed loops on it run the code they run on hardware.
+What a seed stands for is the same as on the bench behind the sockets: gains, initial figure and noise.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.surfaces import LinearModel
+from dm_calibration.optics.aperture import Aperture, configured_aperture
+from dm_calibration.optics.map_fit import MapFitter
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
+from dm_common.hysteresis.tracker import Applied
+from dm_common.measurement import Measurement
+from dm_common.mirror import Mirror
+from dm_common.optics.sampling import edge_clustered_points, sample_map
+from dm_controller.mirror_model import InfluenceModel
+from dm_controller.solvers.bounded import Limits
+from dm_driver.degauss import degauss_waypoints
+from dm_driver.output.volts import VoltScale
+from dm_driver.safety_limiter import Limits as DriverLimits
+from dm_driver.safety_limiter import SafetyLimiter
+from dm_simulation.electronics.drive_unit import EDAC40_FULL_SCALE, DriveConfig, DriveUnit
+from dm_simulation.electronics.frames import EDAC40_VALUE, EdacFrame
+from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
+from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
+from studies.comparison.bench_config import SimulationConfig
+
+Floats = NDArray[np.float64]
+
+#: Pixels of the instrument that speck counts are stated for.
+FULL_CAMERA = InterferometerConfig().pixels
+#: Shortest time between two reports of the driver during a degauss, s.
+REPORT_INTERVAL_S = 0.02
+
+
+class SimulatedBench:
+    """One twin with its time, which only waits and maps advance.
+
+    Raises:
+        ValueError: a configuration that makes no sense, naming the parameter.
+
+    Attributes:
+        mirror: what the calibration is told of it.
+        limits: what solvers are told of it.
+        time: s since the start.
+        maps: maps taken so far.
+        reports: what the driver would have reported after each move, from the first power-on.
+    """
+
+    def __init__(self, config: SimulationConfig | None = None) -> None:
+        self.config = config = config or SimulationConfig()
+        gains, figure, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(config.seed).spawn(3))
+        self.plate = Plate(PlateConfig())
+        self._drive = DriveUnit(DriveConfig())
+        drive = self._drive.config
+        self._scale = VoltScale(
+            EDAC40_FULL_SCALE,
+            drive.dac_volts_at_zero,
+            drive.dac_volts_at_full,
+            drive.amplifier_gain,
+            drive.volts_min,
+            drive.volts_max,
+        )
+        self._channels = np.asarray(drive.wiring)
+        piezo = PiezoConfig(law=config.law, hysteresis=config.hysteresis, creep=config.creep)
+        self._piezo = PiezoActuators(piezo, gains, self._drive.signals(), 0.0)
+        share = (config.pixels / FULL_CAMERA) ** 2
+        camera = InterferometerConfig(pixels=config.pixels, specks=round(InterferometerConfig().specks * share))
+        self._interferometer = Interferometer(camera, self.plate, figure, noise)
+        self._noise = noise
+        self._points = edge_clustered_points(config.samples)
+        pairs = neighbour_pairs(self.plate.x, self.plate.y)
+        self._limiter = SafetyLimiter(
+            DriverLimits(
+                actuators=len(self.plate.x),
+                neighbour_difference=config.neighbour_difference,
+                neighbour_a=pairs[:, 0],
+                neighbour_b=pairs[:, 1],
+            )
+        )
+        self._fitter: MapFitter | None = None
+        self._written: Floats = self._drive.signals()
+        self._turns = self._degausses = 0
+        self._turned_at: Floats | None = None
+        #: Of the signals, 1/s.
+        self.slew_rate = self._limiter.limits.slew_rate
+        self.time = self._moved = 0.0
+        self.maps = 0
+        self.reports: list[Applied] = []
+        self._report()
+        self.mirror = Mirror(
+            "PDM30-37",
+            f"twin-{config.seed}",
+            self.plate.x,
+            self.plate.y,
+            camera.field_diameter / 2,
+            neighbours=pairs,
+            neighbour_difference_max=config.neighbour_difference,
+        )
+        self.limits = Limits(-1.0, 1.0, pairs, config.neighbour_difference)
+
+    def fork(self) -> SimulatedBench:
+        """A second bench in exactly this state, noise to come included, so that methods can be compared."""
+        other = copy.copy(self)
+        other._drive, other._piezo = copy.deepcopy(self._drive), copy.deepcopy(self._piezo)
+        other._noise = copy.deepcopy(self._noise)
+        other._interferometer = self._interferometer.with_noise(other._noise)
+        other._fitter = None
+        other.reports = list(self.reports)
+        return other
+
+    # --- dm_calibration.procedure.procedure.Bench ---
+
+    def degauss(self) -> None:
+        """Wipe the hysteresis memory as the driver does, and end at mid range."""
+        rest = self.mirror.rest
+        points = degauss_waypoints(len(rest), float(rest[0]), 1.0, self.config.degauss_steps, rest)
+        self._follow(list(self._limiter.path(self._written, points)), known=False)
+        self._turns, self._degausses = self._turns + 1, self._degausses + 1
+        self._turned_at = self._drive.signals()
+        self._report()
+
+    def apply(self, signals: Floats) -> Floats:
+        """Ramp to `signals` (N,) by the driver's limiter, through the codes of the DAC; returns what was written.
+
+        Raises:
+            dm_driver.refusal.Refusal: signals that the driver would refuse.
+        """
+        target = self._limiter.check_shape(signals)
+        if not np.array_equal(target, self._written):
+            self._turns, self._turned_at = self._turns + 1, self._drive.signals()
+        self._follow(list(self._limiter.ramp(self._written, target)))
+        self._report()
+        return self._drive.signals()
+
+    def power_cycle(self, off: float) -> None:
+        """Switch the electronics off for `off` s and on again: the actuators rest at 0 V, the driver starts anew."""
+        self._drive = DriveUnit(self._drive.config)
+        self._written = self._drive.signals()
+        self._piezo.apply(self._written, self.time)
+        self.time += off
+        self._moved = self.time
+        self._turns = self._degausses = 0
+        self._turned_at = None
+        self._report()
+
+    def _report(self, known: bool = True, moving: bool = False) -> None:
+        known = known and self._degausses > 0
+        self.reports.append(
+            Applied(self._moved, self._drive.signals(), self._turns, self._turned_at, self._degausses, known, moving)
+        )
+
+    def _follow(self, shapes: list[Floats], known: bool = True) -> None:
+        """Write a way, reporting as often as the driver does."""
+        told = -REPORT_INTERVAL_S
+        for shape in shapes:
+            self._drive.take_edac40(EdacFrame(EDAC40_VALUE, self._channels, self._scale.codes(shape)))
+            self._piezo.apply(self._drive.signals(), self.time)
+            self._moved = self.time
+            self.time += self._limiter.pause_after(self._written, shape)
+            self._written = shape
+            if self._moved - told >= REPORT_INTERVAL_S:
+                told = self._moved
+                self._report(known, moving=True)
+
+    def settle(self, dwell: float = 0.0) -> bool:
+        """Let the settle time and `dwell` s pass."""
+        self.time += self.config.settle_time + dwell
+        return True
+
+    def measure(self, label: str) -> Measurement:
+        """Take one map, fit and sample it as the interferometer node does a file."""
+        self.time += self.config.exposure
+        self.maps += 1
+        return self.measurement_of(self.take_map())
+
+    # --- the map itself ---
+
+    def take_map(self) -> Floats:
+        """One noisy map (pixels, pixels), m, at this moment; row 0 = top, NaN = no data."""
+        self._piezo.advance(self.time)
+        return self._interferometer.measure(self._piezo.displacement)
+
+    def true_map(self) -> Floats:
+        """The noise-free surface (pixels, pixels), m, at this moment: for judging only."""
+        self._piezo.advance(self.time)
+        return self._interferometer.true_sag(self._piezo.displacement)
+
+    @property
+    def pitch(self) -> float:
+        """m per pixel."""
+        return self._interferometer.pitch
+
+    @property
+    def aperture(self) -> Aperture:
+        """The working aperture on the maps."""
+        pixels = self.config.pixels
+        return configured_aperture((pixels, pixels), self.pitch, self.mirror.working_radius)
+
+    def measurement_of(self, sag: Floats) -> Measurement:
+        """Fit and sample a map: the same steps as `dm_calibration.acquisition.ingest.Ingest`, without a file."""
+        aperture = self.aperture
+        valid = np.isfinite(sag)
+        if self._fitter is None or not self._fitter.fits(valid, aperture):
+            self._fitter = MapFitter(valid, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
+        fit = self._fitter.fit(sag)
+        samples = sample_map(sag, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px, self._points)
+        return Measurement(
+            points=self._points,
+            sag=samples,
+            coefficients=fit.coefficients,
+            sigma=fit.sigma,
+            stamp_ns=round(self.time * 1e9),
+            moved_ns=round(self._moved * 1e9),
+            residual_rms=fit.residual_rms,
+            valid_fraction=fit.valid_fraction,
+            radius=aperture.radius_px * self.pitch,
+            wavelength=self._interferometer.config.wavelength,
+        )
+
+    def true_influence(self) -> tuple[Floats, Floats]:
+        """(V, N) m per m of base displacement at the valid pixels, and the initial figure (V,) m: for judging only."""
+        count = len(self.plate.x)
+        inside = self._interferometer.aperture
+        figure = self._interferometer.true_sag(np.zeros(count))[inside]
+        columns = [self._interferometer.true_sag(unit)[inside] - figure for unit in np.eye(count)]
+        return np.column_stack(columns), figure
+
+    @property
+    def true_displacement(self) -> Floats:
+        """(N,) base displacements at this moment, m: for judging only."""
+        self._piezo.advance(self.time)
+        return np.asarray(self._piezo.displacement)
+
+    @property
+    def true_stroke(self) -> Floats:
+        """(N,) largest base displacement from mid range of each actuator, m: for judging only."""
+        config = self._piezo.config
+        return np.asarray(0.5 * config.stroke * self._piezo.gain)
+
+    # --- calibration ---
+
+    def calibrate(
+        self,
+        kind: PlanKind = PlanKind.FULL,
+        plan_options: PlanOptions | None = None,
+        options: ProcedureOptions | None = None,
+        *,
+        model: LinearModel | None = None,
+        progress: Callable[[Progress], None] = lambda progress: None,
+    ) -> Calibration:
+        """Run a plan and fit it, as the node `calibration` does, and go back to mid range.
+
+        Raises:
+            TooFewMapsError, BenchError, ValueError: as `Procedure` and `evaluate`.
+        """
+        options = options or ProcedureOptions()
+        plan = make_plan(kind, self.mirror, plan_options)
+        procedure = Procedure(plan, self.mirror, self, options, model=model, progress=progress)
+        try:
+            procedure.run()
+        finally:
+            self.apply(self.mirror.rest)
+        provenance = Provenance(f"{self.mirror.serial}-{self.config.law}", round(self.time * 1e9))
+        return evaluate(procedure.outcome, self.mirror, options.fit, provenance)[0]
+
+
+def plan_steps(kind: PlanKind = PlanKind.FULL, options: PlanOptions | None = None) -> int:
+    """Steps of a plan on the twin's mirror, for progress bars."""
+    plate = Plate(PlateConfig())
+    mirror = Mirror(
+        "PDM30-37", "", plate.x, plate.y, InterferometerConfig().field_diameter / 2,
+        neighbours=neighbour_pairs(plate.x, plate.y),
+    )  # fmt: skip
+    return len(make_plan(kind, mirror, options).steps)
+
+
+def influence_model(fit: InfluenceFit, aperture_radius: float) -> InfluenceModel:
+    """The model that the focus controller would make of a calibration's message."""
+    return InfluenceModel(
+        aperture_radius=aperture_radius,
+        influence_zernike=fit.influence_zernike,
+        zernike_offset=fit.zernike_offset,
+        sample_x=fit.points.x,
+        sample_y=fit.points.y,
+        sample_weight=fit.points.weight,
+        influence_sag=fit.influence_sag,
+        sag_offset=fit.sag_offset,
+        held_out_rms=fit.held_out_rms,
+        held_out_max_zernike=fit.held_out_max_zernike,
+    )
+
+
+__all__ = ["Floats", "SimulatedBench", "SimulationConfig", "influence_model", "plan_steps"]

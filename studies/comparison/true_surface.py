@@ -1,0 +1,60 @@
+"""The true surface of a twin against targets, many at once: what `compare.true_error` says, as matrix products."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.optics.zernike import basis
+from dm_controller.mirror_model import FREE_TERMS
+from dm_controller.solvers.bounded import BoundedProgramme, Limits
+from dm_controller.target import FocusTarget
+from studies.comparison.simulated_bench import SimulatedBench
+
+Floats = NDArray[np.float64]
+
+
+class TrueSurface:
+    """Judges displacements of one twin; for judging only."""
+
+    def __init__(self, bench: SimulatedBench) -> None:
+        self._influence, self._figure = bench.true_influence()
+        aperture = bench.aperture
+        rows, columns = np.nonzero(np.isfinite(bench.true_map()))
+        self._x = (columns.astype(float) - aperture.centre_x_px) / aperture.radius_px
+        self._y = (aperture.centre_y_px - rows.astype(float)) / aperture.radius_px
+        self._radius = aperture.radius_px * bench.pitch
+        modes = basis(self._x, self._y)
+        self._fit = np.linalg.solve(modes.T @ modes, modes.T)[FREE_TERMS:]
+        self._plane = np.linalg.qr(modes[:, :FREE_TERMS])[0]
+        self._stroke, self._limits = bench.true_stroke, bench.limits
+
+    def _difference(self, displacements: Floats, targets: Sequence[FocusTarget]) -> Floats:
+        """(V, R) true less wanted sag, piston and tilt removed, m."""
+        wanted = np.column_stack([target.sag(self._x, self._y, self._radius) for target in targets])
+        error = self._influence @ displacements.T + self._figure[:, None] - wanted
+        return np.asarray(error - self._plane @ (self._plane.T @ error))
+
+    def errors(self, displacements: Floats, targets: Sequence[FocusTarget]) -> tuple[Floats, Floats]:
+        """Errors of the surfaces of `displacements` (R, N) m against the R `targets`.
+
+        Returns:
+            (R, K - 3) coefficient errors beyond tilt and (R,) rms sag error without piston and tilt, m.
+        """
+        error = self._difference(displacements, targets)
+        return (self._fit @ error).T, np.sqrt(np.mean(np.square(error), axis=0))
+
+    def limits(self, targets: Sequence[FocusTarget]) -> Floats:
+        """(R,) m, rms sag error of the best displacements inside the stroke, see `compare.fitting_limits`."""
+        matrix = self._influence * self._stroke
+        matrix = matrix - self._plane @ (self._plane.T @ matrix)
+        box = Limits(self._limits.low, self._limits.high, self._limits.pairs, self._limits.neighbour_difference)
+        # What lies outside the span of the matrix no command reaches: small right-hand sides say the same.
+        axes, triangle = np.linalg.qr(matrix)
+        programme = BoundedProgramme(triangle, box, ridge=1e-26 * len(matrix))
+        misses = -self._difference(np.zeros((len(targets), matrix.shape[1])), targets)
+        inside = axes.T @ misses
+        best = np.column_stack([programme.solve(column) for column in inside.T])
+        return np.sqrt(np.mean(np.square(matrix @ best - misses), axis=0))

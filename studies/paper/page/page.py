@@ -1,0 +1,50 @@
+"""The page: all sections in the order of the paper, as HTML with pictures and as PDF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from dm_calibration.report.document import Section, write_html, write_pdf
+from studies.paper.page import content, content_coefficients, content_control, content_regressions, content_sampling
+from studies.paper.results import Results
+
+TITLE = "Flexible spherical/aspherical surface control: the paper's tables and figures on the virtual bench"
+
+
+class Written(NamedTuple):
+    """The files of a page."""
+
+    html: Path
+    pdf: Path
+    pictures: list[Path]
+
+
+def sections(results: Results) -> list[Section]:
+    """All sections, in the order of the paper."""
+    return [
+        content.introduction(results),
+        content.table_1(results),
+        content_sampling.sampling(results),
+        content.figure_4(results),
+        content.figure_5(results),
+        content.weights(results),
+        content_regressions.table_2(results),
+        content_regressions.table_3(results),
+        content_control.controlled_surfaces(results),
+        content_coefficients.coefficient_errors(results),
+        content_control.conics(results),
+        content_control.readings(results),
+        content_control.claims(results),
+    ]
+
+
+def write_page(results: Results, folder: Path) -> Written:
+    """Write the page into `folder`.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+    made = sections(results)
+    pictures = [folder / f"{picture.name}.png" for section in made for picture in section.pictures]
+    return Written(write_html(folder, TITLE, made), write_pdf(folder / "paper.pdf", TITLE, made), pictures)

@@ -1,0 +1,165 @@
+"""The sample surfaces of Table 1 measured on a twin, and what sections 2.2 and 3.1 of the paper need of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.maps import SURFACE, MapSet
+from dm_calibration.influence.region_weighting import RegionWeighting, weighting_of
+from dm_calibration.influence.weights import region_weights, surface_control_error, weights_cancel_max_abs
+from dm_calibration.optics.map_fit import MapFitter
+from dm_calibration.optics.regions import ConcentricRegions, RegionStatistics, figure_5
+from dm_calibration.procedure.procedure import Progress
+from dm_common.measurement import Measurement
+from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.sample_regions import regional_rms
+from dm_common.optics.zernike import PISTON_TILT
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
+
+Floats = NDArray[np.float64]
+
+#: Ways to read Fig. 5: rms about zero over the sampling points, or over all pixels, each with piston and tilt removed
+#: once over the whole aperture; and over the points with every region levelled on its own.
+POINTS, PIXELS, LEVELLED = "sampling points", "every pixel", "sampling points, each region levelled"
+#: Maps of a mirror at rest that tell the noise of one.
+REPEATS = 20
+#: Creep has come to rest after so long, s.
+LONG_REST = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """One calibrated twin with its regional errors.
+
+    Attributes:
+        bench: the twin right after its calibration, at rest.
+        calibration: all maps, with the fit by AZreg.
+        labels: (M,) names of the sample surfaces.
+        regional: (M, 10) m, rms surface control error inside the regions.
+        actuator_surfaces, zernike_surfaces: panels (a) and (b) of Fig. 5.
+        readings: (a) of Fig. 5 by the way it is read, see POINTS, PIXELS, LEVELLED; without PIXELS unless asked for.
+        weighting: Eq. (8) with the epsilon of the cross-validation.
+        median_weights: (10,) Eq. (8) with epsilon = the median variance, where weights act in full.
+        weights_cancel: m per unit signal, largest change of G when Eq. (7) replaces Eq. (6).
+        influence_max: m per unit signal, largest entry of G, to compare it with.
+    """
+
+    bench: SimulatedBench
+    calibration: Calibration
+    labels: tuple[str, ...]
+    regional: Floats
+    actuator_surfaces: RegionStatistics
+    zernike_surfaces: RegionStatistics
+    readings: dict[str, RegionStatistics]
+    weighting: RegionWeighting
+    median_weights: Floats
+    weights_cancel: float
+    influence_max: float
+
+    @property
+    def fit(self) -> InfluenceFit:
+        return self.calibration.fit
+
+    @cached_property
+    def noise(self) -> float:
+        """Median over repeated maps of a mirror at rest of the largest coefficient's deviation from their mean, m.
+
+        No controlled surface can be shown by one map to be better than this.
+        """
+        bench = self.bench.fork()
+        bench.apply(bench.mirror.rest)
+        bench.settle()
+        bench.time += LONG_REST
+        taken = np.stack([bench.measure(f"repeat {k}").coefficients for k in range(REPEATS)])
+        beyond_tilt = np.abs(taken - taken.mean(axis=0))[:, len(PISTON_TILT) :]
+        return float(np.median(beyond_tilt.max(axis=1)))
+
+    def row(self, label: str) -> int:
+        """Row of a surface in the calibration's maps."""
+        return self.calibration.maps.label.index(label)
+
+
+class _MapKeepingBench(SimulatedBench):
+    """Keeps the latest map of each label, in single precision: rounding is some 1e-13 m."""
+
+    def __init__(self, config: SimulationConfig) -> None:
+        super().__init__(config)
+        self.kept: dict[str, NDArray[np.float32]] = {}
+        self._latest: Floats = np.empty((0, 0))
+
+    def take_map(self) -> Floats:
+        self._latest = super().take_map()
+        return self._latest
+
+    def measure(self, label: str) -> Measurement:
+        measured = super().measure(label)
+        self.kept[label] = self._latest.astype(np.float32)
+        return measured
+
+
+def measure_samples(
+    config: SimulationConfig, progress: Callable[[Progress], None] = lambda progress: None, *, every_pixel: bool = False
+) -> Samples:
+    """Measure Table 1 on a new twin, with the pokes and reference frames of a full calibration, and judge the maps.
+
+    Args:
+        every_pixel: judge the regions of Fig. 5 on all pixels too; all maps are in memory meanwhile.
+
+    Raises:
+        TooFewMapsError, ValueError: as the calibration and the region weights do.
+    """
+    bench = _MapKeepingBench(config) if every_pixel else SimulatedBench(config)
+    calibration = bench.calibrate(progress=progress)
+    maps, influence = calibration.maps, calibration.fit.influence_zernike
+    chosen = maps.select(np.array([kind == SURFACE for kind in maps.kind], dtype=bool))
+    error = surface_control_error(chosen.sag, chosen.applied, influence, chosen.points)
+    regional = regional_rms(error, chosen.points, labels=chosen.label)
+    panel_a, panel_b = figure_5(regional, chosen.label)
+    levelled = regional_rms(error, chosen.points, labels=chosen.label, level_each=True)
+    readings = {POINTS: panel_a, LEVELLED: figure_5(levelled, chosen.label)[0]}
+    if isinstance(bench, _MapKeepingBench):
+        readings[PIXELS] = figure_5(_on_every_pixel(bench, chosen, influence), chosen.label)[0]
+        bench.kept.clear()
+    weighting = weighting_of(maps, calibration.fit.used)
+    return Samples(
+        bench=bench,
+        calibration=calibration,
+        labels=chosen.label,
+        regional=regional,
+        actuator_surfaces=panel_a,
+        zernike_surfaces=panel_b,
+        readings=readings,
+        weighting=weighting,
+        median_weights=region_weights(weighting.variance, float(np.median(weighting.variance))),
+        weights_cancel=_cancel(chosen),
+        influence_max=float(np.abs(influence).max()),
+    )
+
+
+def _on_every_pixel(bench: _MapKeepingBench, surfaces: MapSet, influence: Floats) -> Floats:
+    """(M, 10) m: rms surface control error inside the regions over all pixels of the maps."""
+    aperture = bench.aperture
+    where = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
+    # Only evaluates the nominal surfaces; the maps' own gaps stay NaN.
+    evaluator = MapFitter(aperture.disc((bench.config.pixels,) * 2), *where)
+    regions = ConcentricRegions((bench.config.pixels,) * 2, aperture)
+
+    def errors() -> Iterator[Floats]:
+        for label, signals in zip(surfaces.label, surfaces.applied, strict=True):
+            yield remove_piston_tilt(evaluator.residual(bench.kept[label].astype(np.float64), influence @ signals))
+
+    return regions.rms_of_each(errors(), surfaces.label)
+
+
+def _cancel(surfaces: MapSet) -> float:
+    """Changes from the first sample surface, and weights that differ a hundredfold from row to row."""
+    delta_c = (surfaces.coefficients[1:] - surfaces.coefficients[0]).T
+    delta_s = (surfaces.applied[1:] - surfaces.applied[0]).T
+    return weights_cancel_max_abs(delta_c, delta_s, np.geomspace(0.01, 1.0, len(delta_c)))

@@ -1,0 +1,170 @@
+"""`dm compare`: every method on the same twins, open loop and closed loop."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
+
+
+class Plant(StrEnum):
+    """Hysteresis laws of the twin; `all` = all that remember, for the ablation."""
+
+    none = "none"
+    prandtl_ishlinskii = "prandtl_ishlinskii"
+    preisach = "preisach"
+    bouc_wen = "bouc_wen"
+    mixed = "mixed"
+    all = "all"
+
+
+def figures_of(comparison: Any) -> dict[str, Any]:
+    """A comparison's figures for JSON."""
+    return {
+        "methods": {
+            name: {
+                "p50_nm": nanometres(row.p50),
+                "p90_nm": nanometres(row.p90),
+                "rms_pct_pv": 100.0 * row.rms_share,
+                "maps": row.maps,
+                "seconds": row.seconds,
+            }
+            for name, row in comparison.rows().items()
+        },
+        "fitting_limit_nm": nanometres(comparison.fitting_limit),
+        "fitting_limit_pct_pv": 100.0 * comparison.fitting_limit_share,
+    }
+
+
+def show(comparison: Any) -> None:
+    """Print the table."""
+    from rich.table import Table
+
+    from studies.comparison.compare import CLOSED
+
+    table = Table(title="largest coefficient error of the true surface, over all spheres and seeds")
+    for heading, side in (
+        ("method", "left"),
+        ("p50 nm", "right"),
+        ("", "right"),
+        ("p90 nm", "right"),
+        ("", "right"),
+        ("rms, % of PV", "right"),
+        ("maps", "right"),
+        ("s per focus", "right"),
+    ):
+        table.add_column(heading, justify=side)  # type: ignore[arg-type]
+    loops = False
+    for name, row in comparison.rows().items():
+        if name.endswith(CLOSED) and not loops:
+            loops = True
+            table.add_section()
+        table.add_row(
+            name.removesuffix(CLOSED) + (", closed loop" if name.endswith(CLOSED) else ""),
+            f"{nanometres(row.p50):.2f}",
+            as_wavelengths(row.p50),
+            f"{nanometres(row.p90):.2f}",
+            as_wavelengths(row.p90),
+            f"{100 * row.rms_share:.2f}",
+            f"{row.maps:g}",
+            f"{row.seconds:.2f}",
+        )
+    console.print(table)
+    console.print(
+        f"fitting limit of this mirror, best possible command: {nanometres(comparison.fitting_limit):.1f} nm rms for "
+        f"the hardest sphere, {100 * comparison.fitting_limit_share:.2f} % of PV in the median"
+    )
+
+
+def compare(
+    plant: Annotated[Plant, typer.Option(help="Hysteresis law of the twin.")] = Plant.prandtl_ishlinskii,
+    seed: Annotated[
+        list[int] | None, typer.Option(min=0, help="Seed of a twin; repeat it for several. Default: 1.")
+    ] = None,
+    method: Annotated[list[str] | None, typer.Option(help="Only these methods; repeat it for several.")] = None,
+    creep: Annotated[float, typer.Option(min=0.0, max=0.2, help="Creep of the twin per decade of time.")] = 0.01,
+    foreseen: Annotated[
+        float, typer.Option(min=0.0, max=0.2, help="Creep that closed loops expect per decade; 0 = none.")
+    ] = 0.01,
+    max_maps: Annotated[
+        int, typer.Option(min=1, help="Maps that a closed loop may take, each followed by a correction.")
+    ] = 3,
+    pixels: Annotated[int, typer.Option(min=64, max=2048, help="Camera of the twin, pixels x pixels.")] = 236,
+    history: Annotated[
+        bool, typer.Option("--history", help="What each part of the memory brings: hysteresis, creep, recipes.")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="With --history: fewer maps and requests.")] = False,
+    json: JsonOption = None,
+) -> None:
+    """Compare all methods on the virtual bench: spheres from -0.05 to +0.05 1/m in random order.
+
+    Runs in process, without nodes. Errors are those of the true surface, which only a twin knows.
+    With --history it is models that are compared, in open loop: any order, dwell times from 0.1 s to 10 min, tracked
+    from the calibration on, after a degauss and after a power cycle.
+    """
+    if history:
+        _compare_history(plant, tuple(seed or (1,)), creep, pixels, quick, json)
+        return
+    if plant is Plant.all:
+        raise typer.BadParameter("all: only with --history", param_hint="--plant")
+    from studies.comparison.compare import CompareOptions, total_steps
+    from studies.comparison.compare import compare as run
+    from studies.comparison.simulated_bench import SimulationConfig
+
+    started = time.monotonic()
+    options = CompareOptions(
+        twin=SimulationConfig(law=plant.value, creep=creep, pixels=pixels),
+        seeds=tuple(seed or (1,)),
+        methods=tuple(method or ()),
+        loop=replace(CompareOptions().loop, max_maps=max_maps),
+        creep=foreseen,
+    )
+    with progress_bar() as bar:
+        task = bar.add_task("compare", total=total_steps(options))
+
+        def step(description: str) -> None:
+            bar.update(task, advance=1, description=description)
+
+        comparison = run(options, step)
+        bar.update(task, description="compare: done", completed=total_steps(options))
+    show(comparison)
+    figures = {
+        "plant": plant.value,
+        "seeds": list(options.seeds),
+        "creep_per_decade": creep,
+        "creep_foreseen": foreseen,
+        "max_maps": max_maps,
+        "tolerance_nm": nanometres(options.loop.tolerance),
+    } | figures_of(comparison)
+    write_json(json, figures | {"seconds": time.monotonic() - started})
+    console.print(f"done in {time.monotonic() - started:.0f} s")
+
+
+def _compare_history(
+    plant: Plant, seeds: tuple[int, ...], creep: float, pixels: int, quick: bool, json: Path | None
+) -> None:
+    from studies.comparison.ablation import PLANTS
+    from studies.comparison.simulated_bench import SimulationConfig
+    from studies.verbs import compare_history
+
+    if plant is Plant.none:
+        raise typer.BadParameter("none: a twin without memory has no history", param_hint="--plant")
+    started = time.monotonic()
+    plants = PLANTS if plant is Plant.all else (plant.value,)
+    result = compare_history.run(plants, seeds, SimulationConfig(creep=creep, pixels=pixels), quick)
+    compare_history.show(result)
+    figures = {
+        "plant": plant.value,
+        "seeds": list(seeds),
+        "creep_per_decade": creep,
+        "ablation": compare_history.rows_of(result),
+        "identified": compare_history.identified_of(result),
+    }
+    write_json(json, figures | {"seconds": time.monotonic() - started})
+    console.print(f"done in {time.monotonic() - started:.0f} s")

@@ -1,0 +1,199 @@
+"""Trigger commands and waiting for files: real processes, real files, real time (but no timed assertions)."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dm_calibration.acquisition.acquisition import (
+    Acquisition,
+    AcquisitionSettings,
+    AcquisitionStoppedError,
+    MapTimeoutError,
+    NothingToAcquireError,
+)
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
+from dm_calibration.acquisition.trigger import TriggerError, run_trigger
+from dm_calibration.map_files import MapFileError
+from map_fixtures import dat_bytes, disc_counts
+from support import wait_until
+
+MAP = dat_bytes(disc_counts(40))
+
+
+def python(code: str, *arguments: str) -> list[str]:
+    return [sys.executable, "-S", "-c", code, *arguments]
+
+
+class Bench:
+    """An Acquisition on a folder, with what it reported."""
+
+    def __init__(self, folder: Path | None, command: list[str] | None = None, **settings: Any) -> None:
+        self.files: list[Path] = []
+        self.troubles: list[str] = []
+        ingest = Ingest()
+        self.acquisition = Acquisition(
+            AcquisitionSettings(folder, ["*.dat"], 0.1, command or [], ".dat", **settings),
+            lambda path: ingest.read(path, IngestSettings()),
+            time.time_ns,
+            self.files.append,
+            self.troubles.append,
+        )
+        self.acquisition.start()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Any]:
+    made: list[Bench] = []
+
+    def make(*arguments: Any, **settings: Any) -> Bench:
+        made.append(Bench(*arguments, **settings))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.acquisition.stop()
+
+
+def test_command_that_is_told_its_output(tmp_path: Path, bench: Any) -> None:
+    (tmp_path / "source").write_bytes(MAP)
+    code = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
+    one = bench(tmp_path, python(code, str(tmp_path / "source"), "{path}"))
+    before = time.time_ns()
+    acquired = one.acquisition.acquire(20)
+    assert Path(acquired.measurement.source.file).parent == tmp_path
+    assert before <= acquired.began_ns < acquired.ended_ns <= time.time_ns()
+    (tmp_path / "marker.dat").write_bytes(MAP)
+    wait_until(lambda: one.files, what="the marker, which stands still later than the triggered file")
+    assert one.files == [tmp_path / "marker.dat"]
+
+
+def test_output_that_grows_after_the_command_has_ended(tmp_path: Path, bench: Any) -> None:
+    (tmp_path / "source").write_bytes(MAP)
+    child = (
+        "import sys, time\ndata = open(sys.argv[1], 'rb').read()\nout = open(sys.argv[2], 'wb')\n"
+        "for start in range(0, len(data), 2000): out.write(data[start:start + 2000]); out.flush(); time.sleep(0.02)"
+    )
+    code = f"import subprocess, sys; subprocess.Popen([sys.executable, '-S', '-c', {child!r}, *sys.argv[1:]])"
+    one = bench(tmp_path, python(code, str(tmp_path / "source"), "{path}"))
+    assert one.acquisition.acquire(20).measurement.sag.shape == (40, 40)
+
+
+def test_no_shell_ever_sees_the_arguments(tmp_path: Path) -> None:
+    seen = tmp_path / "seen"
+    run_trigger(
+        python("import sys; open(sys.argv[1], 'w').write(sys.argv[2])", str(seen), "$(id); `id` > {path} & *"),
+        tmp_path / "a b.dat",
+        20,
+    )
+    assert seen.read_text() == f"$(id); `id` > {tmp_path / 'a b.dat'} & *"
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (
+            python("import sys; sys.exit('laser is off')", "{path}"),
+            "ended with status 1; its output ends: laser is off",
+        ),
+        (["/nonexistent/program", "{path}"], "'/nonexistent/program' cannot be started"),
+    ],
+)
+def test_failing_command(tmp_path: Path, bench: Any, command: list[str], words: str) -> None:
+    with pytest.raises(TriggerError, match=words):
+        bench(tmp_path, command).acquisition.acquire(20)
+
+
+def test_hanging_command_is_ended_with_its_children(tmp_path: Path) -> None:
+    child = "import os, sys, time; open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
+    code = f"import subprocess, sys; subprocess.run([sys.executable, '-S', '-c', {child!r}, sys.argv[1]])"
+    with pytest.raises(TriggerError, match=r"did not end within 1\.5 s"):
+        run_trigger(python(code, str(tmp_path / "pid")), None, 1.5)
+    process = Path("/proc") / (tmp_path / "pid").read_text()
+    wait_until(
+        lambda: not process.exists() or "Z" in (process / "stat").read_text().split()[2], what="the end of the child"
+    )
+
+
+def test_command_that_writes_nothing(tmp_path: Path, bench: Any) -> None:
+    with pytest.raises(MapTimeoutError, match="did not appear in time"):
+        bench(tmp_path, python("", "{path}")).acquisition.acquire(1.0)
+
+
+def test_command_that_writes_half_a_map(tmp_path: Path, bench: Any) -> None:
+    (tmp_path / "source").write_bytes(MAP[:-7])
+    code = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
+    with pytest.raises(MapFileError, match="truncated"):
+        bench(tmp_path, python(code, str(tmp_path / "source"), "{path}")).acquisition.acquire(20)
+
+
+def test_command_whose_file_is_found_in_the_folder(tmp_path: Path, bench: Any) -> None:
+    (tmp_path / "source").write_bytes(MAP)
+    code = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
+    one = bench(tmp_path, python(code, str(tmp_path / "source"), str(tmp_path / "from_instrument.dat")))
+    acquired = one.acquisition.acquire(20)
+    assert acquired.measurement.source.file == str(tmp_path / "from_instrument.dat")
+    assert acquired.began_ns is not None
+    assert one.files == []
+
+
+def test_without_a_command_the_next_new_file_is_the_measurement(tmp_path: Path, bench: Any) -> None:
+    one = bench(tmp_path)
+    results: list[Any] = []
+    thread = threading.Thread(target=lambda: results.append(one.acquisition.acquire(20)))
+    thread.start()
+    time.sleep(0.05)
+    (tmp_path / "by_hand.dat").write_bytes(MAP)
+    thread.join(20)
+    assert results[0].measurement.source.file == str(tmp_path / "by_hand.dat")
+    assert results[0].began_ns is None
+    (tmp_path / "next.dat").write_bytes(MAP)
+    wait_until(lambda: one.files, what="the next file")
+    assert one.files == [tmp_path / "next.dat"]
+
+
+def test_no_new_file_in_time(tmp_path: Path, bench: Any) -> None:
+    with pytest.raises(MapTimeoutError, match="no new map file"):
+        bench(tmp_path).acquisition.acquire(0.2)
+
+
+def test_folder_that_does_not_exist_is_reported_once_and_waited_for(tmp_path: Path, bench: Any) -> None:
+    one = bench(tmp_path / "later")
+    with pytest.raises(MapTimeoutError, match="cannot be read: No such file"):
+        one.acquisition.acquire(0.3)
+    assert len(one.troubles) == 1
+    (tmp_path / "later").mkdir()
+    wait_until(lambda: not one.acquisition.folder_trouble, what="the folder is watched")
+    (tmp_path / "later" / "a.dat").write_bytes(MAP)
+    wait_until(lambda: one.files, what="the first file")
+
+
+def test_stopping_ends_a_measurement(tmp_path: Path, bench: Any) -> None:
+    one = bench(tmp_path, python("import time; time.sleep(600)", "{path}"))
+    errors: list[Exception] = []
+
+    def measure() -> None:
+        try:
+            one.acquisition.acquire(300)
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=measure)
+    thread.start()
+    time.sleep(0.2)
+    one.acquisition.stop()
+    thread.join(20)
+    assert [type(error) for error in errors] == [AcquisitionStoppedError]
+
+
+def test_settings_that_contradict_each_other(bench: Any) -> None:
+    with pytest.raises(ValueError, match="trigger_command needs watch_folder"):
+        bench(None, ["trigger"])
+    with pytest.raises(NothingToAcquireError, match="neither"):
+        bench(None).acquisition.acquire(1)

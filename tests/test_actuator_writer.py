@@ -1,0 +1,318 @@
+"""The writer's thread against a unit on a real TCP socket, judged by the frames that arrive."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_driver.actuator_writer import ActuatorWriter
+from dm_driver.electronics import Edac40Tcp
+from dm_driver.moves import Kind, Outcome, WriterState
+from dm_driver.output.output_stage import OutputStage
+from dm_driver.output.volts import VoltScale
+from dm_driver.output.wiring import TABLES, wiring_table
+from dm_driver.refusal import Reason, Refusal
+from dm_driver.safety_limiter import Limits, SafetyLimiter
+from drive_unit_servers import Edac40TcpUnit, Frame
+from support import wait_until
+
+A, B = neighbour_pairs(*hexagonal_positions(37))
+SCALE = VoltScale(65535, -6.0, 6.0, 80.0, 0.0, 300.0)
+CODE = SCALE.resolution
+
+
+@pytest.fixture
+def unit() -> Iterator[Edac40TcpUnit]:
+    with Edac40TcpUnit() as server:
+        assert isinstance(server, Edac40TcpUnit)
+        yield server
+
+
+@contextmanager
+def running_writer(
+    unit: Edac40TcpUnit, slew_rate: float = 1000.0, electronics: type[Edac40Tcp] = Edac40Tcp, **arguments: Any
+) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
+    told: list[tuple[WriterState, bool]] = []
+    writer = ActuatorWriter(
+        electronics("127.0.0.1", unit.port, timeout_s=0.5),
+        OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
+        SafetyLimiter(Limits(37, -1, 1, 1.0, A, B, step=0.1, slew_rate=slew_rate)),
+        np.full(37, -1.0),
+        listener=lambda state, edge: told.append((state, edge)),
+        **arguments,
+    )
+    writer.start()
+    try:
+        assert writer.wait_for_link(5)
+        assert writer.enable(5)
+        yield writer, told
+    finally:
+        assert writer.stop()
+
+
+def signals_of(frames: list[Frame]) -> np.ndarray:
+    """(frames, 37) signals on the wire: code 0 is -6 V, full scale +6 V, gain 80, 0..300 V."""
+    codes = np.array([[frame[channel] for channel in TABLES["trihex"]] for frame in frames], dtype=float)
+    return (codes / 65535 * 12 - 6) * 80 / 150 - 1
+
+
+def shape(value: float) -> np.ndarray:
+    return np.full(37, value)
+
+
+def refused(action: Callable[[], Any]) -> Reason:
+    with pytest.raises(Refusal) as caught:
+        action()
+    return caught.value.reason
+
+
+def test_nothing_is_written_before_enable_and_then_the_safe_shape_first(unit: Edac40TcpUnit) -> None:
+    writer = ActuatorWriter(
+        Edac40Tcp("127.0.0.1", unit.port),
+        OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
+        SafetyLimiter(Limits(37)),
+        shape(-0.25),
+    )
+    writer.start()
+    assert writer.wait_for_link(5)
+    assert refused(lambda: writer.command(shape(0))) is Reason.DRIVER_INACTIVE
+    assert unit.raw == b""
+    assert writer.state().applied is None
+    assert writer.enable(5)
+    wait_until(lambda: unit.frames)
+    assert signals_of(unit.frames) == pytest.approx(-0.25, abs=CODE)
+    assert writer.state().sequence == 1
+    assert writer.stop()
+
+
+def test_a_small_command_is_one_frame_and_a_large_one_a_ramp(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit) as (writer, told):
+        assert writer.command(shape(-0.95)).wait(5) is Outcome.REACHED
+        wait_until(lambda: len(unit.frames) == 2)
+        move = writer.command(shape(0.9))
+        assert move.wait(5) is Outcome.REACHED
+        wait_until(lambda: len(unit.frames) == 2 + 19)
+    on_wire = signals_of(unit.frames)
+    assert on_wire[1] == pytest.approx(-0.95, abs=CODE)
+    assert on_wire[-1] == pytest.approx(0.9, abs=CODE)
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+    state, edge = told[-1]
+    assert not state.link_up or (edge and state.moving is None)
+    ramp = [edge for state, edge in told if 2 < state.sequence <= 21]
+    assert ramp == [True, *[False] * 17, True]  # first and last are edges
+
+
+def test_the_slew_rate_holds(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=20.0) as (writer, _told):
+        begun = time.monotonic()
+        writer.command(shape(0.0)).wait(5)
+        writer.command(shape(-0.5)).wait(5)
+        assert time.monotonic() - begun >= (1.5 - 0.1) / 20.0
+
+
+def test_a_newer_command_takes_over_in_the_middle_of_a_ramp(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=10.0) as (writer, _told):
+        first = writer.command(shape(1.0))
+        wait_until(lambda: len(unit.frames) > 4)
+        second = writer.command(shape(-1.0))
+        assert first.wait(5) is Outcome.SUPERSEDED
+        assert second.wait(5) is Outcome.REACHED
+        frames = writer.state().sequence
+        wait_until(lambda: len(unit.frames) == frames)
+    on_wire = signals_of(unit.frames)
+    assert on_wire.max() < 0.9
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+    assert on_wire[-1] == pytest.approx(-1.0, abs=CODE)
+
+
+def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=10.0) as (writer, _told):
+        assert writer.command(shape(-0.5)).wait(5) is Outcome.REACHED
+        turns = writer.state().turns
+        correction = writer.correct(shape(-0.49), turns)
+        assert correction is not None and correction.wait(5) is Outcome.REACHED
+        assert writer.correct(shape(-0.48), turns) is None  # decided before the last one stood
+
+        move = writer.command(shape(0.5))
+        assert writer.correct(shape(-0.48), turns + 1) is None  # decided before the move began
+        assert move.wait(5) is Outcome.REACHED
+        degauss = writer.degauss(0.0, 6, shape(0.0))
+        assert writer.correct(shape(0.49), turns + 2) is None
+        assert degauss.wait(20) is Outcome.REACHED
+        assert writer.counters.overtaken == 3
+        assert writer.state().requested == pytest.approx(shape(0.0))
+
+
+def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac40TcpUnit) -> None:
+    generator = np.random.default_rng(7)
+    limiter = SafetyLimiter(Limits(37, -1, 1, 1.0, A, B))
+    with running_writer(unit, slew_rate=200.0) as (writer, _told):
+        last = None
+        for number in range(60):
+            try:
+                last = writer.command(limiter.check_shape(generator.uniform(-0.6, 0.6, 37)))
+            except Refusal as refusal:
+                assert refusal.reason is Reason.NEIGHBOUR_DIFFERENCE
+            if number == 30:
+                writer.degauss(0.0, 6, shape(0.0))
+            time.sleep(generator.uniform(0, 0.01))
+        assert last is not None and last.wait(5) is Outcome.REACHED
+        wait_until(lambda: len(unit.frames) == writer.state().sequence)
+        requested = writer.state().requested
+    on_wire = signals_of(unit.frames)
+    assert len(on_wire) > 60
+    assert np.abs(on_wire).max() <= 1.0
+    assert np.abs(on_wire[:, A] - on_wire[:, B]).max() <= 1.0 + CODE
+    assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+    assert on_wire[-1] == pytest.approx(requested, abs=CODE)
+
+
+def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit) as (writer, _told):
+        assert not writer.state().history_known
+        move = writer.degauss(0.5, 10, shape(0.2))
+        assert move.wait(10) is Outcome.REACHED
+        assert not writer.state().history_known  # wider swings than 0.5 are still remembered
+        wait_until(lambda: len(unit.frames) == writer.state().sequence)
+        for bad in (lambda: writer.degauss(1.01, 10, shape(0)), lambda: writer.degauss(0.5, 0, shape(0))):
+            assert refused(bad) is Reason.OUT_OF_RANGE
+    one = signals_of(unit.frames)
+    assert np.ptp(one, axis=1).max() <= CODE  # all together
+    level = one[1:-1, 0]
+    turns = level[1:-1][np.sign(np.diff(level))[1:] != np.sign(np.diff(level))[:-1]]
+    # The first point, -0.5, is no turn: the mirror comes up from -1.
+    expected = [(-1) ** (k + 1) * 0.5 * (1 - k / 10) for k in range(1, 10)]
+    assert turns[:9] == pytest.approx(expected, abs=CODE)
+
+
+def test_a_full_degauss_makes_the_history_known_while_every_write_goes_through(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=1e4) as (writer, _told):
+        assert writer.degauss(0.0, 10, shape(0.2)).wait(10) is Outcome.REACHED
+        assert writer.state().history_known and writer.state().degausses == 1
+        assert writer.command(shape(0.25)).wait(5) is Outcome.REACHED
+        assert writer.state().history_known
+
+
+def test_every_turn_is_counted_and_told_with_its_place(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=20.0) as (writer, told):
+        assert writer.command(shape(0.5)).wait(5) is Outcome.REACHED
+        assert writer.state().turns == 1 and writer.state().turned_at == pytest.approx(0.5, abs=CODE)
+        left = writer.command(shape(-0.9))
+        wait_until(lambda: writer.state().applied is not None and writer.state().applied[0] < 0.2)
+        assert writer.command(shape(0.9)).wait(5) is Outcome.REACHED
+        assert left.wait(5) is Outcome.SUPERSEDED
+        assert writer.state().turns == 3
+    lowest = min(state.applied[0] for state, _ in told if state.applied is not None and state.turns >= 1)
+    places = {state.turns: state.turned_at[0] for state, _ in told if state.turned_at is not None}
+    assert places[2] == pytest.approx(lowest, abs=CODE) and places[3] == pytest.approx(0.9, abs=CODE)
+
+
+def test_a_command_cancels_a_degauss_and_leaves_the_history_unknown(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=40.0) as (writer, _told):
+        assert writer.degauss(0.1, 2, shape(0.0)).wait(5) is Outcome.REACHED
+        move = writer.degauss(0.0, 100, shape(0.0))
+        wait_until(lambda: writer.state().moving is Kind.DEGAUSS and not writer.state().history_known)
+        command = writer.command(shape(0.3))
+        assert move.wait(5) is Outcome.SUPERSEDED
+        assert command.wait(5) is Outcome.REACHED
+        assert not writer.state().history_known
+
+
+def test_watchdog_goes_to_the_safe_shape_once(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, watchdog_s=0.6) as (writer, _told):
+        assert writer.command(shape(0.0)).wait(5) is Outcome.REACHED
+        wait_until(lambda: signals_of(unit.frames[-1:])[0] == pytest.approx(-1.0, abs=CODE), what="safe shape")
+        frames = len(unit.frames)
+        time.sleep(0.9)
+        assert len(unit.frames) == frames
+        assert writer.command(shape(-0.9)).wait(5) is Outcome.REACHED
+
+
+def test_a_degauss_longer_than_the_watchdog_is_finished(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=40.0, watchdog_s=0.1) as (writer, _told):
+        assert writer.degauss(0.5, 20, shape(0.0)).wait(10) is Outcome.REACHED
+
+
+def test_link_loss_in_a_ramp_and_return(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=4.0) as (writer, told):
+        writer.degauss(0.05, 1, shape(-0.9)).wait(5)
+        move = writer.command(shape(0.6))
+        wait_until(lambda: writer.state().sequence > 15)
+        unit.unplug()
+        assert move.wait(5) is Outcome.LINK_LOST
+        lost = writer.state()
+        assert not lost.link_up and not lost.history_known and lost.moving is None
+        assert "EDAC40 at 127.0.0.1" in lost.fault
+        assert refused(lambda: writer.command(shape(0.0))) is Reason.ELECTRONICS_UNREACHABLE
+        assert lost.applied is not None and lost.applied.max() < 0.6
+        before = len(unit.frames)
+        unit.plug()
+        wait_until(lambda: writer.state().link_up)
+        wait_until(lambda: len(unit.frames) > before)
+        assert signals_of(unit.frames[before : before + 1])[0] == pytest.approx(lost.applied, abs=1e-9)
+        assert writer.state().fault == ""
+        assert (writer.counters.link_losses, writer.counters.reconnects) == (1, 1)
+        assert writer.command(shape(-1.0)).wait(10) is Outcome.REACHED
+    assert [state.link_up for state, _edge in told].count(False) >= 1
+
+
+def test_a_unit_that_restarts_while_idle_gets_the_shape_again(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit) as (writer, _told):
+        assert writer.command(shape(-0.92)).wait(5) is Outcome.REACHED
+        wait_until(lambda: len(unit.frames) == 2)
+        unit.drop_client()
+        wait_until(lambda: len(unit.frames) == 3, what="the shape again")
+        assert signals_of(unit.frames)[2] == pytest.approx(-0.92, abs=CODE)
+
+
+def test_disable_ramps_to_the_safe_shape_and_refuses_commands(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit) as (writer, _told):
+        writer.command(shape(0.5)).wait(5)
+        moving = writer.command(shape(-0.5))
+        assert writer.disable(5) is Outcome.REACHED
+        assert moving.wait(0) in (Outcome.SUPERSEDED, Outcome.REACHED)
+        assert refused(lambda: writer.command(shape(0.0))) is Reason.DRIVER_INACTIVE
+        sequence = writer.state().sequence
+        wait_until(lambda: len(unit.frames) == sequence)
+        on_wire = signals_of(unit.frames)
+        assert on_wire[-1] == pytest.approx(-1.0, abs=CODE)
+        assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
+        assert writer.enable(5)
+
+
+def test_disable_without_a_link_says_so(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit) as (writer, _told):
+        unit.unplug()
+        wait_until(lambda: not writer.state().link_up)
+        assert writer.disable(5) is Outcome.LINK_LOST
+
+
+def test_stop_ends_a_move_that_somebody_waits_for(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=1.0) as (writer, _told):
+        move = writer.command(shape(1.0))
+        wait_until(lambda: len(unit.frames) > 1)
+    assert move.wait(5) is Outcome.STOPPED
+
+
+def test_a_defect_in_a_back_end_does_not_end_the_thread(unit: Edac40TcpUnit) -> None:
+    class Faulty(Edac40Tcp):
+        calls = 0
+
+        def _do_write(self, codes: np.ndarray, wired: np.ndarray) -> None:
+            Faulty.calls += 1
+            if Faulty.calls == 2:
+                raise ZeroDivisionError("injected")
+            super()._do_write(codes, wired)
+
+    with running_writer(unit, electronics=Faulty) as (writer, told):
+        move = writer.command(shape(-0.9))
+        assert move.wait(5) is Outcome.LINK_LOST
+        wait_until(lambda: writer.state().link_up, what="reconnection")
+        assert any("ZeroDivisionError: injected" in state.fault for state, _edge in told)
+        assert writer.command(shape(-0.9)).wait(5) is Outcome.REACHED

@@ -1,0 +1,77 @@
+"""The order in which a calibration measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dm_calibration.influence.surfaces import MODEL_NAMES, TABLE_1
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan
+from dm_common.names import UnknownNameError
+from linear_mirror import make_mirror
+
+
+def test_full_plan_has_pokes_then_surfaces_then_solved_shapes() -> None:
+    plan = make_plan(PlanKind.FULL, make_mirror())
+    assert plan.steps[0].kind is StepKind.DEGAUSS
+    assert plan.steps[1].kind is plan.steps[-1].kind is StepKind.REFERENCE
+    states = [step for step in plan.steps if step.kind in (StepKind.POKE, StepKind.SURFACE)]
+    assert len(states) == 2 * 37 + 69
+    assert [step.label for step in states[74:]] == list(TABLE_1)
+    assert [step.label for step in states if step.needs_model] == list(MODEL_NAMES)
+    assert len({step.label for step in plan.steps}) == len(plan.steps)
+    assert plan.remarks == ()
+
+
+def test_reference_frames_come_every_so_many_steps() -> None:
+    plan = make_plan(PlanKind.POKES, make_mirror(), PlanOptions(reference_every=7, degauss=False))
+    kinds = [step.kind for step in plan.steps]
+    gaps = np.diff(np.flatnonzero([kind is StepKind.REFERENCE for kind in kinds])) - 1
+    assert kinds[0] is StepKind.REFERENCE
+    assert (gaps[:-1] == 7).all() and 0 < gaps[-1] <= 7
+    for step in plan.steps:
+        if step.kind is StepKind.REFERENCE:
+            assert step.signals is not None and (step.signals == 0.0).all()
+
+
+def test_pokes_push_and_pull_one_actuator() -> None:
+    pokes = [s for s in make_plan(PlanKind.POKE_CHECK, make_mirror()).steps if s.kind is StepKind.POKE]
+    for k in range(37):
+        unit = np.eye(37)[k]
+        assert pokes[2 * k].label == f"poke+{k + 1:02d}"
+        for step, expected in ((pokes[2 * k], 0.5 * unit), (pokes[2 * k + 1], -0.5 * unit)):
+            assert step.signals is not None and np.array_equal(step.signals, expected)
+
+
+def test_pokes_shrink_to_the_neighbour_limit() -> None:
+    plan = make_plan(PlanKind.POKES, make_mirror(neighbour_difference_max=0.2))
+    poke = next(step for step in plan.steps if step.kind is StepKind.POKE)
+    assert poke.signals is not None
+    assert poke.signals[0] == pytest.approx(0.2) and poke.signals[0] <= 0.2
+    assert (poke.signals[1:] == 0.0).all()
+    assert "pokes reduced to 40%" in plan.remarks[0]
+
+
+def test_chosen_surfaces_only() -> None:
+    plan = make_plan(PlanKind.SURFACES, make_mirror(), PlanOptions(surfaces=("p55", "p03")))
+    assert [step.label for step in plan.steps if step.kind is StepKind.SURFACE] == ["p03", "p55"]
+    assert plan.needs_model
+    with pytest.raises(UnknownNameError, match="did you mean"):
+        make_plan(PlanKind.SURFACES, make_mirror(), PlanOptions(surfaces=("p59",)))
+
+
+def test_a_small_mirror_leaves_surfaces_out_or_refuses_them_by_name() -> None:
+    small = make_mirror(rings=2)
+    plan = make_plan(PlanKind.SURFACES, small)
+    assert any("p25 moves actuator 20" in remark for remark in plan.remarks)
+    with pytest.raises(ValueError, match="p25 moves actuator 20"):
+        make_plan(PlanKind.SURFACES, small, PlanOptions(surfaces=("p25",)))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"poke_amplitude": 0.0}, "poke_amplitude = 0.0"), ({"reference_every": 0}, "reference_every = 0")],
+)
+def test_options_out_of_range(options: dict[str, float], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        PlanOptions(**options)  # type: ignore[arg-type]

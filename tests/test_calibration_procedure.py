@@ -1,0 +1,227 @@
+"""The procedure on a bench without ROS: retries, drops, cancelling, failures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
+from dm_common.measurement import BenchError, Cancelled, Measurement, MeasurementError
+from dm_common.mirror import Mirror
+from linear_mirror import RADIUS, LinearMirror, make_mirror
+
+
+class Bench:
+    """A linear mirror and an interferometer that fails when told to."""
+
+    def __init__(self, mirror: Mirror) -> None:
+        self.plant = LinearMirror(mirror.x, mirror.y)
+        self.signals = mirror.rest
+        self.applied: list[np.ndarray] = []
+        self.degaussed = 0
+        self.clock_ns = 0
+        self.failing: dict[str, int] = {}  # label: measurements that still fail
+        self.changes: dict[str, dict[str, object]] = {}  # label: fields of the measurement to replace
+        self.tries: list[str] = []
+        self.stop_at = ""
+        self.stopped = False
+
+    def degauss(self) -> None:
+        self.degaussed += 1
+
+    def apply(self, signals: np.ndarray) -> np.ndarray:
+        self.signals = np.round(signals * 32768) / 32768  # a 16-bit converter
+        self.applied.append(self.signals)
+        return self.signals
+
+    def settle(self, dwell: float = 0.0) -> bool:
+        self.clock_ns += 10**9
+        return not self.stopped
+
+    def measure(self, label: str) -> Measurement:
+        self.tries.append(label)
+        if label == self.stop_at:
+            self.stopped = True
+        if self.failing.get(label, 0) > 0:
+            self.failing[label] -= 1
+            raise MeasurementError(302, "no map within 5 s")
+        sag = self.plant.sag(self.signals)
+        measured = Measurement(
+            points=self.plant.points,
+            sag=sag,
+            coefficients=self.plant.fit_terms(sag),
+            sigma=np.full(21, 1e-10),
+            stamp_ns=self.clock_ns,
+            residual_rms=2e-9,
+            valid_fraction=0.98,
+            radius=RADIUS,
+            wavelength=632.8e-9,
+            file=f"{label}.dat",
+            sha256="00",
+        )
+        return replace(measured, **self.changes.get(label, {}))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def mirror() -> Mirror:
+    return make_mirror(rings=1)
+
+
+@pytest.fixture
+def bench(mirror: Mirror) -> Bench:
+    return Bench(mirror)
+
+
+def run(bench: Bench, mirror: Mirror, kind: PlanKind = PlanKind.POKES, **options: object) -> Procedure:
+    plan = make_plan(kind, mirror)
+    procedure = Procedure(
+        plan,
+        mirror,
+        bench,
+        ProcedureOptions(**options),  # type: ignore[arg-type]
+        cancelled=lambda: bench.stopped,
+    )
+    procedure.run()
+    return procedure
+
+
+def test_all_steps_are_measured_in_order(bench: Bench, mirror: Mirror) -> None:
+    outcome = run(bench, mirror).outcome
+    plan = make_plan(PlanKind.POKES, mirror)
+    assert bench.degaussed == 1
+    assert [record.label for record in outcome.records] == [step.label for step in plan.steps[1:]]
+    assert outcome.dropped == []
+    assert outcome.wavelength == 632.8e-9
+    record = outcome.records[1]
+    assert (record.label, record.kind, record.file) == ("poke+01", "poke", "poke+01.dat")
+    assert record.signals[0] == 0.5
+    assert record.applied == pytest.approx(bench.applied[1])
+    assert record.stamp_ns == 2 * 10**9
+
+
+def test_a_failed_measurement_is_tried_again(bench: Bench, mirror: Mirror) -> None:
+    bench.failing = {"poke+03": 2}
+    outcome = run(bench, mirror, measure_retries=2).outcome
+    assert bench.tries.count("poke+03") == 3
+    assert outcome.dropped == []
+    assert "poke+03" in [record.label for record in outcome.records]
+
+
+def test_a_state_without_a_map_is_dropped_and_reported(bench: Bench, mirror: Mirror) -> None:
+    bench.failing = {"poke+03": 9}
+    outcome = run(bench, mirror, measure_retries=1).outcome
+    assert outcome.dropped == ["poke+03: no map within 5 s (2 tries)"]
+    assert len(outcome.records) == len(make_plan(PlanKind.POKES, mirror).steps) - 2
+
+
+def test_several_states_without_a_map_end_the_run(bench: Bench, mirror: Mirror) -> None:
+    bench.failing = {label: 99 for label in ("poke+02", "poke-02", "poke+03")}
+    with pytest.raises(BenchError, match="3 states in a row gave no map; the last: no map within 5 s") as caught:
+        run(bench, mirror)
+    assert caught.value.code == 302
+    assert "poke-03" not in bench.tries
+
+
+def test_failures_that_are_not_in_a_row_do_not_end_it(bench: Bench, mirror: Mirror) -> None:
+    bench.failing = {label: 99 for label in ("poke+01", "poke-02", "poke+04", "poke-05")}
+    assert len(run(bench, mirror).outcome.dropped) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"radius": 10e-3}, "aperture radius 10.000 mm, the mirror's is 11.000 mm +-2.0%: never mix"),
+        ({"wavelength": 1064e-9}, "wavelength 1064.000 nm, before it was 632.800 nm (0 = not told): never mix"),
+        ({"wavelength": 0.0}, "wavelength 0.000 nm"),
+        ({"system_error_subtracted": 1}, "never mix"),
+        ({"coefficients": np.zeros(15)}, "15 Zernike terms"),
+        ({"points": LinearMirror(np.zeros(1), np.zeros(1)).points.__class__(*np.zeros((3, 300)))}, "other points"),
+    ],
+)
+def test_maps_that_cannot_be_compared_are_dropped(
+    bench: Bench, mirror: Mirror, change: dict[str, object], words: str
+) -> None:
+    bench.changes = {"poke+02": change}
+    outcome = run(bench, mirror).outcome
+    assert len(outcome.dropped) == 1
+    assert outcome.dropped[0].startswith("poke+02: ") and words in outcome.dropped[0]
+    outcome.maps()
+
+
+def test_unknown_radius_is_remembered(bench: Bench, mirror: Mirror) -> None:
+    bench.changes = {"poke+02": {"radius": 0.0}}
+    assert not run(bench, mirror).outcome.radius_known
+
+
+def test_several_maps_per_state(bench: Bench, mirror: Mirror) -> None:
+    outcome = run(bench, mirror, maps_per_state=3).outcome
+    labels = [record.label for record in outcome.records]
+    assert labels[:4] == ["reference 1", "reference 1 (2)", "reference 1 (3)", "poke+01"]
+    assert len({record.step for record in outcome.records[:3]}) == 1
+    assert len(bench.applied) * 3 == len(labels)
+
+
+@pytest.mark.parametrize("label", ["reference 1", "poke+01", "poke-05", "reference 2"])
+def test_cancel_is_noticed_within_one_step(bench: Bench, mirror: Mirror, label: str) -> None:
+    bench.stop_at = label
+    with pytest.raises(Cancelled):
+        run(bench, mirror)
+    assert bench.tries[-1] == label
+
+
+def test_a_failing_driver_ends_the_run_and_keeps_the_maps(bench: Bench, mirror: Mirror) -> None:
+    plan = make_plan(PlanKind.POKES, mirror)
+    procedure = Procedure(plan, mirror, bench)
+    good = bench.apply
+
+    def apply(signals: np.ndarray) -> np.ndarray:
+        if len(bench.applied) == 5:
+            raise BenchError(201, "set_signals: the link broke")
+        return good(signals)
+
+    bench.apply = apply  # type: ignore[method-assign]
+    with pytest.raises(BenchError, match="the link broke"):
+        procedure.run()
+    assert len(procedure.outcome.records) == 5
+
+
+def test_shapes_are_solved_from_the_pokes_of_the_run() -> None:
+    mirror = make_mirror()
+    bench = Bench(mirror)
+    outcome = run(bench, mirror, PlanKind.FULL).outcome
+    assert outcome.dropped == []
+    sphere = next(record for record in outcome.records if record.label == "p57")
+    assert sphere.nominal is not None
+    assert sphere.coefficients[3:] == pytest.approx(sphere.nominal[3:], abs=10e-9)
+    assert any(target.startswith("p57: sphere of radius +100 m") for target in outcome.targets)
+    assert outcome.remarks == []
+    maps = outcome.maps()
+    assert np.isfinite(maps.nominal).all(axis=1).sum() == 15
+
+
+def test_shapes_without_a_model_are_dropped_in_words(bench: Bench, mirror: Mirror) -> None:
+    plan = make_plan(PlanKind.SURFACES, mirror, PlanOptions(surfaces=("p01", "p55")))
+    procedure = Procedure(plan, mirror, bench)
+    outcome = procedure.run()
+    assert len(outcome.dropped) == 1
+    assert outcome.dropped[0].startswith("p55: no influence function to solve its signals from")
+    assert [record.label for record in outcome.records] == ["reference 1", "p01", "reference 2"]
+
+
+def test_progress_counts_the_steps(bench: Bench, mirror: Mirror) -> None:
+    seen: list[Progress] = []
+    plan = make_plan(PlanKind.POKES, mirror)
+    Procedure(plan, mirror, bench, progress=seen.append).run()
+    assert [progress.done for progress in seen] == list(range(len(plan.steps) + 1))
+    assert all(progress.steps == len(plan.steps) for progress in seen)
+    assert seen[0].kind is StepKind.DEGAUSS
+    assert seen[-1].residual_rms == 2e-9
+
+
+def test_no_maps_at_all(bench: Bench, mirror: Mirror) -> None:
+    with pytest.raises(TooFewMapsError, match="no map was measured"):
+        Procedure(make_plan(PlanKind.POKES, mirror), mirror, bench).outcome.maps()

@@ -1,0 +1,157 @@
+"""The report of a calibration: what is in it, and that its figures are those of the calibration."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
+from dm_calibration.influence.fit import FitOptions
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
+from dm_calibration.report import content, content_hysteresis
+from dm_calibration.report.document import one_html
+from dm_calibration.report.figures import on_disc
+from dm_calibration.report.hysteresis_figures import loop_opening, step_response
+from dm_calibration.report.page import figures_of, write_report
+from dm_calibration.report.residuals import residuals
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.optics.sag import rms
+from dm_common.optics.sampling import edge_clustered_points
+from dm_common.recipes import Recipe, RecipeBook
+from hysteretic_mirror import MIRROR, RememberingBench
+from linear_mirror import LinearMirror, make_mirror
+from recorded_bench import recorded
+
+#: One play operator of half-width 0.2 and weight 1 beside the signal: the loop opens by 2 x 0.2 of a span of 2 + 1.6.
+PLAY = HysteresisModel(
+    np.array([0.0, 0.2]), np.array([[1.0], [1.0]]), np.zeros(0), 0.0, 0.01, np.geomspace(0.03, 3e5, 15)
+)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    _run, outcome = recorded(PlanKind.FULL, PlanOptions(), failing=frozenset({"poke+03"}))
+    provenance = Provenance("bench_3", 1_700_000_000 * 10**9, "cold <morning> & windy")
+    return evaluate(outcome, MIRROR, FitOptions(), provenance)[0]
+
+
+@pytest.fixture(scope="module")
+def page(calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("report")
+    file = CalibrationStore(folder).save(calibration)
+    written = write_report(calibration, folder / "out", file)
+    assert written.pdf.read_bytes().startswith(b"%PDF")
+    assert sorted(path.name for path in (folder / "out").iterdir()) == ["bench_3.html", "bench_3.pdf"]
+    text = written.html.read_text()
+    assert hashlib.sha256(file.read_bytes()).hexdigest() in text
+    return text
+
+
+class SmallBench(RememberingBench):
+    """A bench with 19 actuators."""
+
+    mirror = make_mirror(rings=2)
+
+    def __init__(self) -> None:
+        self.plant = LinearMirror(self.mirror.x, self.mirror.y, noise=0.5e-9, piston_tilt=1e-7)
+        self.signals, self.clock_ns = self.mirror.rest, 0
+        self.degauss()
+
+    def degauss(self) -> None:
+        self.lag = np.zeros(self.mirror.actuators)
+
+
+def test_a_mirror_of_nineteen_actuators_has_a_report(tmp_path: Path) -> None:
+    mirror = SmallBench.mirror
+    plan = make_plan(PlanKind.POKES, mirror, PlanOptions())
+    outcome = Procedure(plan, mirror, SmallBench(), ProcedureOptions()).run()
+    small = evaluate(outcome, mirror, FitOptions(), Provenance("small", 10**18))[0]
+    written = write_report(small, tmp_path)
+    text = written.html.read_text()
+    actuators = text[text.index("<caption>Actuators") :]
+    assert re.findall(r"<tr><td>(\d+)</td>", actuators[: actuators.index("</table>")]) == [
+        str(k + 1) for k in range(19)
+    ]
+    assert "<td>actuators</td><td>19 good</td>" in text
+    assert written.pdf.stat().st_size > 10_000
+
+
+def test_the_page_is_one_file(page: str) -> None:
+    images = re.findall(r'<img src="([^"]{30})', page)
+    assert len(images) == 5
+    assert all(source.startswith("data:image/png;base64,") for source in images)
+    assert not re.search(r"https?://|\bnan\b", page)
+
+
+def test_the_page_says_what_was_measured_and_how_well(page: str, calibration: Calibration) -> None:
+    for text in ("PDM30-37, serial", "22.000 mm", "632.80 nm", "cold &lt;morning&gt; &amp; windy", "2023-11-14"):
+        assert text in page
+    fit = calibration.fit
+    assert f"<td>{fit.in_sample_rms * 1e9:.2f} nm (λ/{calibration.wavelength / fit.in_sample_rms:.0f})</td>" in page
+    assert f"<td>{fit.held_out_rms * 1e9:.2f} nm (λ/{calibration.wavelength / fit.held_out_rms:.0f})</td>" in page
+
+
+def test_the_page_names_what_was_dropped_and_every_limitation(page: str, calibration: Calibration) -> None:
+    assert "<tr><td>poke+03</td><td>no new file within 5 s (2 tries)</td></tr>" in page
+    text = page.replace("&#x27;", "'")
+    for sentence in calibration.limitations:
+        assert sentence.removeprefix("Poke check: ") in text
+    assert "Not identified" in page
+
+
+def test_every_map_has_a_row(page: str, calibration: Calibration) -> None:
+    rows = page[page.index("<caption>Maps in the order measured") :]
+    for label in calibration.maps.label:
+        assert f"<td>{label}</td>" in rows
+
+
+def test_residuals_are_those_of_the_fit(calibration: Calibration) -> None:
+    left = residuals(calibration)
+    np.testing.assert_allclose(
+        rms(left.sag, left.maps.points.weight), calibration.fit.map_residual[calibration.fit.used], rtol=1e-6
+    )
+
+
+def test_hysteresis_and_recipes_are_shown(calibration: Calibration) -> None:
+    hysteresis = HysteresisFit("Prandtl-Ishlinskii", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ("Chosen of four.",))
+    recipe = Recipe(0.02, -1.0, np.zeros(37), np.full(37, 0.1), 0.6e-9, 1.2e-9, 4)
+    whole = replace(calibration, hysteresis=hysteresis, recipes=RecipeBook((recipe,), 100, 0.8e-9, 10**18))
+    made = [content.summary(whole), content_hysteresis.hysteresis(whole), content_hysteresis.recipes(whole)]
+    text = one_html("", made)
+    for expected in ("11.1% of the span", "1.00% of a step per decade", "Chosen of four.", "<td>+0.0200</td>", "0.60"):
+        assert expected in text
+    assert text.count("<img ") == 3
+    figures = figures_of(whole)
+    assert figures["hysteresis"]["law"] == "Prandtl-Ishlinskii"
+    assert figures["remeasured_max_zernike_nm"] == pytest.approx(0.6)
+
+
+def test_a_play_operator_opens_the_loop_by_its_width() -> None:
+    assert loop_opening(PLAY) == pytest.approx(0.4 / 3.6)
+    assert loop_opening(HysteresisModel.linear()) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_creep_grows_by_its_rate_in_a_decade() -> None:
+    # The sum over elements two to a decade follows the straight line within its ripple.
+    growth = np.diff(step_response(PLAY, np.array([1.0, 10.0, 100.0, 1000.0])))
+    np.testing.assert_allclose(growth, PLAY.creep_rate, rtol=0.1)
+
+
+def test_interpolation_on_the_disc_keeps_a_smooth_shape() -> None:
+    points = edge_clustered_points(500)
+    shape = points.x**2 - 0.5 * points.y
+    shown = on_disc(shape[None], points, 41)[0]
+    axis = np.linspace(-1.0, 1.0, 41)
+    x, y = np.meshgrid(axis, axis)
+    inside = np.hypot(x, y) <= 1.0
+    assert np.isnan(shown[~inside]).all()
+    np.testing.assert_allclose(shown[inside], (x**2 - 0.5 * y)[inside], atol=5e-3)

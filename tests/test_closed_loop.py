@@ -1,0 +1,202 @@
+"""The closed loop on small plants with known faults."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from dm_common.measurement import BenchError, Measurement
+from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
+from dm_controller.solvers.base import Shape, Solver
+from dm_controller.solvers.bounded import Limits
+from dm_controller.solvers.registry import make_solver
+from dm_controller.target import FocusTarget, TargetError
+from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
+
+LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().neighbours, dtype=np.intp), 2.0)
+MIRROR = LinearMirror(*hexagon())
+MODEL = MIRROR.model()
+
+
+class Plant:
+    """The linear mirror behind gains of its own, backlash, and a drift that follows the logarithm of time."""
+
+    def __init__(self, gain: float = 1.0, spread: float = 0.0, backlash: float = 0.0, drift: float = 0.0) -> None:
+        self.gains = gain * (1.0 + spread * np.random.default_rng(5).standard_normal(37))
+        self.backlash, self.drift = backlash, drift
+        self.position = np.zeros(37)
+        self.commands: list[np.ndarray] = []
+        self.time, self.began = 0.0, 0.0
+        self.first: np.ndarray = np.zeros(37)
+        self.disturb: dict[int, float] = {}  # map: added defocus, m
+        self.maps = 0
+
+    def apply(self, signals: np.ndarray) -> np.ndarray:
+        assert LIMITS.allow(signals)
+        if not self.commands:
+            self.began, self.first = self.time, signals
+        self.commands.append(signals)
+        self.position = np.clip(self.position, signals - self.backlash, signals + self.backlash)
+        return signals
+
+    def settle(self) -> bool:
+        self.time += 1.0
+        return True
+
+    def measure(self, label: str) -> Measurement:
+        self.maps += 1
+        moved = self.gains * (self.position + self.drift * math.log10(max(self.time - self.began, 0.1)) * self.first)
+        sag = MIRROR.sag(moved) + MIRROR.modes[:, 3] * self.disturb.get(self.maps, 0.0)
+        return Measurement(
+            points=MIRROR.points,
+            sag=sag,
+            coefficients=MIRROR.fit_terms(sag),
+            sigma=np.zeros(21),
+            stamp_ns=round(self.time * 1e9),
+            residual_rms=0.0,
+            valid_fraction=1.0,
+        )
+
+
+@pytest.fixture(scope="module")
+def solver() -> Solver:
+    return make_solver("bounded", MODEL, LIMITS)
+
+
+def test_an_exact_mirror_takes_one_map(solver: Solver) -> None:
+    plant = Plant()
+    result = converge(solver, FocusTarget(0.02), plant)
+    assert result.converged
+    assert result.maps == plant.maps == len(plant.commands) == 1
+    assert not result.restored
+
+
+@pytest.mark.parametrize("gain", [0.6, 0.85, 1.2, 1.5])
+def test_wrong_gains_are_corrected_within_five_maps(solver: Solver, gain: float) -> None:
+    result = converge(solver, FocusTarget(0.02), Plant(gain, spread=0.03), LoopOptions(1e-9, 5))
+    errors = [step.max_zernike for step in result.steps]
+    assert result.converged, errors
+    assert result.best.max_zernike == min(errors) < 1e-2 * errors[0]
+
+
+def test_backlash_does_not_make_it_diverge(solver: Solver) -> None:
+    result = converge(solver, FocusTarget(-0.03), Plant(0.9, 0.05, backlash=0.05), LoopOptions(1e-9, 8))
+    errors = [step.max_zernike for step in result.steps]
+    assert max(errors) == errors[0]
+    assert result.best.max_zernike < 0.1 * errors[0]
+
+
+def test_the_map_limit_is_kept_and_reported(solver: Solver) -> None:
+    plant = Plant(0.8)
+    seen: list[LoopStep] = []
+    result = converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 3), on_step=seen.append)
+    assert not result.converged
+    assert result.maps == plant.maps == 3
+    assert [step.map for step in seen] == [1, 2, 3]
+    assert tuple(seen) == result.steps
+
+
+def test_the_best_command_is_kept_and_written_again(solver: Solver) -> None:
+    plant = Plant(0.9)
+    plant.disturb = {3: 5e-7}
+    result = converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 3))
+    assert result.best.map == 2
+    assert result.restored
+    np.testing.assert_array_equal(plant.commands[-1], result.best.signals)
+    assert len(plant.commands) == 4
+
+
+def test_the_last_correction_may_stay_unmeasured(solver: Solver) -> None:
+    plant = Plant(0.8)
+    result = converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 2, correct_last=True))
+    assert result.maps == plant.maps == 2
+    assert len(plant.commands) == 3
+    np.testing.assert_array_equal(plant.commands[-1], result.signals)
+    wanted = FocusTarget(0.02).coefficients(RADIUS)
+    assert np.abs(plant.measure("").coefficients - wanted)[3:].max() < 0.3 * result.best.max_zernike
+
+
+def test_a_growing_error_halves_the_next_correction(solver: Solver) -> None:
+    grown = Plant()
+    grown.disturb = {2: 5e-6}
+    steps = converge(solver, FocusTarget(0.01), grown, LoopOptions(1e-15, 3)).steps
+    full = solver.correct(steps[1].signals, steps[1].error).signals - steps[1].signals
+    assert steps[1].max_zernike > steps[0].max_zernike
+    assert np.linalg.norm(steps[2].signals - steps[1].signals) <= 0.5 * 1.5 * np.linalg.norm(full) + 1e-9
+
+
+def test_foreseen_creep_leaves_less(solver: Solver) -> None:
+    left = {}
+    for share in (0.0, 0.02):
+        plant = Plant(drift=0.02)
+        creep = Creep(share, np.zeros(37), lambda plant=plant: plant.time)  # type: ignore[misc]
+        steps = converge(solver, FocusTarget(0.03), plant, LoopOptions(1e-15, 4), creep=creep).steps
+        left[share] = steps[-1].max_zernike
+    assert left[0.02] < 0.2 * left[0.0]
+
+
+def test_a_start_of_ones_own(solver: Solver) -> None:
+    plant = Plant()
+    start = np.full(37, 0.3)
+    result = converge(solver, FocusTarget(0.01), plant, start=start)
+    np.testing.assert_array_equal(plant.commands[0], start)
+    assert result.converged
+    assert result.maps >= 2
+
+
+def test_points_without_data_do_not_matter(solver: Solver) -> None:
+    class Holes(Plant):
+        def measure(self, label: str) -> Measurement:
+            measured = super().measure(label)
+            measured.sag[::9] = np.nan
+            return measured
+
+    assert converge(solver, FocusTarget(0.02), Holes(0.9), LoopOptions(2e-9, 4)).converged
+
+
+def test_cancelling_keeps_what_was_measured(solver: Solver) -> None:
+    plant = Plant(0.8)
+    with pytest.raises(StoppedLoop, match="cancelled after 2 maps") as caught:
+        converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 9), cancelled=lambda: plant.maps == 2)
+    assert len(caught.value.steps) == 2
+
+
+def test_failures_of_the_bench_pass_through(solver: Solver) -> None:
+    class Broken(Plant):
+        def measure(self, label: str) -> Measurement:
+            raise BenchError(302, "no map")
+
+    with pytest.raises(BenchError, match="no map"):
+        converge(solver, FocusTarget(0.02), Broken())
+
+
+def test_maps_of_another_kind_are_refused(solver: Solver) -> None:
+    class Other(Plant):
+        def measure(self, label: str) -> Measurement:
+            measured = super().measure(label)
+            object.__setattr__(measured, "sag", measured.sag[:100])
+            return measured
+
+    with pytest.raises(ValueError, match="21 terms and 100 sampling points, the calibration has 21 and 300"):
+        converge(solver, FocusTarget(0.02), Other())
+
+
+def test_the_response_ratio_counts_terms_by_their_rms() -> None:
+    asked = Shape(np.concatenate([np.ones(3), 1e-7 * np.arange(18)]), np.zeros(1))
+    seen = Shape(np.concatenate([np.full(3, 9.0), 0.8e-7 * np.arange(18)]), np.zeros(1))
+    assert response_ratio(asked, seen) == pytest.approx(0.8)
+    tiny = Shape(1e-4 * asked.coefficients[:] * np.concatenate([np.ones(3), np.full(18, 1e-1)]), np.zeros(1))
+    assert math.isnan(response_ratio(tiny, seen))
+
+
+def test_bad_options_are_refused(solver: Solver) -> None:
+    with pytest.raises(ValueError, match="tolerance = 0 m: must be above 0"):
+        LoopOptions(0.0)
+    with pytest.raises(ValueError, match="max_maps = 0: must be at least 1"):
+        LoopOptions(1e-9, 0)
+    with pytest.raises(ValueError, match=r"creep = 0\.5 per decade: must be 0 to 0\.2"):
+        Creep(0.5, np.zeros(37), lambda: 0.0)
+    with pytest.raises(TargetError):
+        converge(solver, FocusTarget(200.0), Plant())

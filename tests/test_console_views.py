@@ -1,0 +1,349 @@
+"""What the bench console draws, from messages alone."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from dm_msgs.msg import ActuatorState, Calibration, Capabilities, MirrorInfo, SurfaceMapInfo, ZernikeCoefficients
+
+from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.zernike import basis
+from dm_tools.console import status, view_models
+from dm_tools.console.console_node import Snapshot
+from dm_tools.console.drawing.charts import loop_chart, residual_chart, zernike_chart
+from dm_tools.console.drawing.command_map import command_map
+from dm_tools.console.drawing.heat_map import SAG_COLOURS, heat_map
+from dm_tools.console.drawing.hexagons import outlines, sizes
+from dm_tools.console.drawing.svg import nice_ticks
+from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
+from dm_tools.console.state_observer import Following
+from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
+from dm_tools.console.widgets.actuators import towards
+from dm_tools.console.widgets.recipes import evenly
+
+COUNT = 7
+RADIUS = 11e-3
+LAW = HysteresisModel(np.array([0.0, 0.1, 0.3]), np.array([[0.8], [0.1], [0.1]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
+
+
+def mirror_info() -> MirrorInfo:
+    x, y = hexagonal_positions(COUNT)
+    a, b = neighbour_pairs(x, y)
+    return MirrorInfo(
+        name="T", serial="1", actuators=COUNT, actuator_x=x.tolist(), actuator_y=y.tolist(),
+        neighbour_a=a.tolist(), neighbour_b=b.tolist(), working_aperture_diameter=2 * RADIUS,
+        signal_min=-1.0, signal_max=1.0, neighbour_difference_max=2.0,
+    )  # fmt: skip
+
+
+def state(applied: list[float], **fields: Any) -> ActuatorState:
+    return ActuatorState(
+        driver_state=ActuatorState.STATE_ACTIVE, applied=applied, requested=applied, flags=bytes(COUNT), **fields
+    )
+
+
+def calibration() -> tuple[Calibration, np.ndarray]:
+    """A calibration whose surfaces are sums of the 21 terms, and its (21, N) influence."""
+    points = edge_clustered_points(300)
+    influence = np.random.default_rng(5).normal(size=(21, COUNT)) * 1e-7
+    terms = basis(points.x, points.y)
+    message = Calibration(
+        id="c1", actuators=COUNT, terms=21, points=300, aperture_radius=RADIUS, quality=Calibration.CALIBRATED,
+        influence_zernike=influence.ravel().tolist(), zernike_offset=np.zeros(21).tolist(),
+        sample_x=points.x.tolist(), sample_y=points.y.tolist(), sample_weight=points.weight.tolist(),
+        influence_sag=(terms @ influence).ravel().tolist(), sag_offset=np.zeros(300).tolist(),
+    )  # fmt: skip
+    return message, influence
+
+
+def map_of_terms(coefficients: np.ndarray, pixels: int = 300) -> tuple[np.ndarray, SurfaceMapInfo]:
+    """A map over the aperture with these coefficients, off the middle of the frame."""
+    info = SurfaceMapInfo(
+        width=pixels, height=pixels, centre_x=pixels / 2 + 3, centre_y=pixels / 2 - 2,
+        aperture_radius_px=0.45 * pixels, aperture_radius=RADIUS,
+    )  # fmt: skip
+    x = (np.arange(pixels) - info.centre_x) / info.aperture_radius_px
+    y = (info.centre_y - np.arange(pixels)) / info.aperture_radius_px
+    grid_x, grid_y = np.meshgrid(x, y)
+    return np.where(np.hypot(grid_x, grid_y) <= 1.0, basis(grid_x, grid_y) @ coefficients, np.nan), info
+
+
+def test_cells_carry_signal_limit_and_grade() -> None:
+    message, _ = calibration()
+    message.actuator_grade = bytes([Calibration.GRADE_DEAD, *[Calibration.GRADE_GOOD] * (COUNT - 1)])
+    shape = state([0.0, 1.0, -0.5, 0.0, 0.0, 0.0, 0.0])
+    shape.flags = bytes([0, ActuatorState.FLAG_AT_LIMIT, ActuatorState.FLAG_REFUSED, 0, 0, 0, 0])
+    first, second, third, *_ = view_models.cells(mirror_info(), shape, message)
+    assert first.words == "actuator 1, signal +0.000, graded dead"
+    assert (second.mark, second.remarks) == ("▲", ("at its upper limit",))
+    assert third.mark == "!"
+    assert second.fill != third.fill
+
+
+def test_cells_without_a_command_have_no_signal() -> None:
+    assert [cell.signal for cell in view_models.cells(mirror_info(), None, None)] == [None] * COUNT
+
+
+def test_the_command_map_has_every_actuator_where_it_is() -> None:
+    found = view_models.cells(mirror_info(), state([0.0] * COUNT), None)
+    svg = command_map(found, 3, 11.0)
+    assert sorted(map(int, re.findall(r'data-actuator="(\d+)"', svg))) == list(range(1, COUNT + 1))
+    places = {
+        int(n): np.mean([[float(value) for value in corner.split(",")] for corner in corners.split()], axis=0)
+        for n, corners in re.findall(r'data-actuator="(\d+)".*?points="([^"]+)"', svg)
+    }
+    # Actuator 2 lies to the right of 1, and a larger y is further up.
+    assert places[2][0] > places[1][0]
+    up = max(found, key=lambda cell: cell.y).number
+    assert places[up][1] < places[1][1]
+
+
+@pytest.mark.parametrize(("direction", "axis", "sign"), [(0.0, "x", 1), (np.pi, "x", -1), (np.pi / 2, "y", 1)])
+def test_arrows_go_to_the_nearest_actuator_that_way(direction: float, axis: str, sign: int) -> None:
+    found = view_models.cells(mirror_info(), None, None)
+    target = found[towards(found, 1, direction) - 1]
+    assert sign * getattr(target, axis) > 0
+    assert np.hypot(target.x, target.y) == pytest.approx(4.3)
+
+
+def test_measured_and_predicted_surface_agree_on_terms() -> None:
+    message, influence = calibration()
+    effective = np.linspace(-0.8, 0.9, COUNT)
+    measured = measured_surface(*map_of_terms(influence @ effective))
+    predicted = SurfaceModel(message).surface(effective)
+    assert np.isfinite(measured.sag).sum() == np.isfinite(predicted.sag).sum()
+    assert difference(measured, predicted).peak_to_valley < 0.02 * predicted.peak_to_valley
+    assert SurfaceModel(message).coefficients(effective) == pytest.approx(influence @ effective)
+
+
+def test_a_coarse_map_has_no_holes() -> None:
+    surface = measured_surface(*map_of_terms(np.eye(21)[3] * 1e-7, pixels=60))
+    inner = np.hypot(*np.meshgrid(np.linspace(-1, 1, 101), np.linspace(-1, 1, 101))) < 0.9
+    assert np.isfinite(surface.sag[inner]).all()
+
+
+def test_maps_of_another_aperture_are_not_compared() -> None:
+    message, influence = calibration()
+    sag, info = map_of_terms(influence[:, 0])
+    info.aperture_radius = 10e-3
+    with pytest.raises(ValueError, match=r"10\.00 mm, that of the calibration 11\.00 mm"):
+        difference(measured_surface(sag, info), SurfaceModel(message).surface(np.zeros(COUNT)))
+
+
+def test_a_calibration_that_does_not_fit_together_names_the_field() -> None:
+    message, _ = calibration()
+    message.influence_sag = message.influence_sag[:-1]
+    with pytest.raises(ValueError, match="influence_sag"):
+        SurfaceModel(message)
+
+
+def test_bars_leave_out_tilt_and_hold_the_interval() -> None:
+    measured = np.arange(21) * 1e-9
+    message = ZernikeCoefficients(coefficients=measured.tolist(), sigma=np.full(21, 1e-9).tolist())
+    found = view_models.bars(message, measured - 2e-9, True)
+    assert len(found) == 18
+    assert {round(bar.value_nm, 6) for bar in found} == {2.0}
+    assert found[0].reach_nm == pytest.approx(1.96)
+    assert view_models.bars(message, None, True) == []
+    assert view_models.bars(message, measured, False)[0].predicted_nm == pytest.approx(3.0)
+
+
+def test_what_is_missing_is_told_with_its_effect() -> None:
+    assert "No node" in status.missing(frozenset(), False)[0]
+    (line,) = status.missing(frozenset({"pdm_driver", "calibration", "focus_controller"}), True)
+    assert line == "The node interferometer is not heard: no maps can be measured."
+
+
+def test_a_button_tells_why_it_cannot_be_pressed() -> None:
+    everything = frozenset(status.NODES)
+    active = Snapshot(actuator_state=state([0.0] * COUNT), present=everything)
+    assert status.why_not("move", active, "") == ""
+    assert status.why_not("move", active, "Calibration") == "Calibration is under way."
+    assert "not calibrated" in status.why_not("focus", active, "")
+    calibrated = Snapshot(
+        actuator_state=active.actuator_state, capabilities=Capabilities(calibration_id="c1"), present=everything
+    )
+    assert status.why_not("focus", calibrated, "") == ""
+    lost = ActuatorState(driver_state=ActuatorState.STATE_LINK_LOST, message="no route to 10.0.0.7")
+    assert status.why_not("move", Snapshot(actuator_state=lost, present=everything), "") == (
+        "The driver is link lost: no route to 10.0.0.7."
+    )
+    assert status.why_not("measure", Snapshot(present=frozenset({"pdm_driver"})), "") == (
+        "The node interferometer is not heard."
+    )
+
+
+def test_badges_warn_of_an_unknown_history() -> None:
+    message, _ = calibration()
+    message.hysteresis.play_radius = [0.0, 0.1]
+    snapshot = Snapshot(
+        mirror_info=mirror_info(), actuator_state=state([0.0] * COUNT), calibration=message,
+        present=frozenset({"pdm_driver"}),
+    )  # fmt: skip
+    assert status.Badge("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
+    assert status.Badge("history: known") in status.badges(snapshot, "")
+
+
+def test_the_worst_diagnostics_come_first() -> None:
+    good = DiagnosticStatus(level=DiagnosticStatus.OK, name="a", message="fine")
+    bad = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="b", message="no link")
+    rows = status.diagnostic_rows({"a": good, "b": bad})
+    assert [(row.level, row.node) for row in rows] == [("error", "b"), ("ok", "a")]
+
+
+def test_the_log_can_be_narrowed_to_what_went_wrong() -> None:
+    lines = [SimpleNamespace(level=level, node="n", message=level) for level in ("INFO", "ERROR")]
+    assert [row[0] for row in status.log_rows(lines, True)] == ["ERROR", "INFO"]
+    assert [row[0] for row in status.log_rows(lines, False)] == ["ERROR"]
+
+
+def test_the_reachable_range_needs_a_calibration() -> None:
+    range_known = Capabilities(calibration_id="c", curvature_min=-0.05, curvature_max=0.06)
+    assert view_models.reachable(range_known) == (-0.05, 0.06)
+    assert view_models.reachable(Capabilities(curvature_min=-0.05, curvature_max=0.06)) is None
+    nowhere = Capabilities(calibration_id="c", curvature_min=float("nan"), curvature_max=float("nan"))
+    assert view_models.reachable(nowhere) is None
+
+
+def test_a_poke_turns_back_where_the_range_ends() -> None:
+    assert view_models.poke_signals([0.0, 0.9], 1, 0.3, -1.0, 1.0) == [0.3, 0.9]
+    assert view_models.poke_signals([0.0, 0.9], 2, 0.3, -1.0, 1.0) == pytest.approx([0.0, 0.6])
+    with pytest.raises(ValueError, match="actuator = 3: must be 1 to 2"):
+        view_models.poke_signals([0.0, 0.0], 3, 0.3, -1.0, 1.0)
+
+
+def test_the_loop_opens_as_the_law_says() -> None:
+    loop = modelled_loop(LAW, 4, -1.0, 1.0)
+    # Half-widths 0.1 and 0.3 with weight 0.1 each lag by their half-width on both branches.
+    middle = len(loop.signals) // 2
+    assert loop.falling[middle] - loop.rising[middle] == pytest.approx(2 * (0.1 * 0.1 + 0.1 * 0.3))
+    assert "of the span apart" in loop.words
+    assert "hysteresis loop of actuator 4" in loop_chart(loop)
+
+
+def test_a_measured_way_comes_back_and_stays_inside() -> None:
+    signals = way(0.8, 0.5, -1.0, 1.0)
+    assert max(signals) == 1.0 and signals[-1] == pytest.approx(0.8)
+    values = modelled_way(LAW, LAW.demagnetised(COUNT, 0.0), 2, way(0.0, 1.0, -1.0, 1.0))
+    assert values[0] < values[2]  # the same signal, rising and falling
+
+
+def test_the_change_of_an_effective_signal_is_read_off_two_maps() -> None:
+    message, _ = calibration()
+    influence = np.array(message.influence_sag).reshape(300, COUNT)
+    x, y = np.array(message.sample_x), np.array(message.sample_y)
+    before = SimpleNamespace(x=x, y=y, sag=np.zeros(300))
+    after = SimpleNamespace(x=x, y=y, sag=0.37 * influence[:, 2] + 1e-6 + 3e-7 * x - 2e-7 * y)
+    after.sag[5] = np.nan
+    assert effective_change(before, after, message, 3) == pytest.approx(0.37)
+    with pytest.raises(ValueError, match="299 points"):
+        effective_change(before, SimpleNamespace(x=x[1:], y=y[1:], sag=x[1:]), message, 3)
+
+
+def test_following_tells_what_stood_when_a_map_was_taken() -> None:
+    following = Following()
+    for second, value in ((1, 0.0), (2, 0.5), (3, -0.5)):
+        shape = state([value] * COUNT, turns=second)
+        shape.header.stamp.sec = second
+        following.observe(shape)
+    assert not following.creep_before  # without a law there is no creep
+    assert following.at(2.4).effective == pytest.approx([0.5] * COUNT)
+    assert following.now(9.0).effective == pytest.approx([-0.5] * COUNT)
+    assert following.at(0.5).effective is None and following.at(0.5).doubt
+
+
+def test_a_calibration_that_is_published_again_loses_nothing() -> None:
+    message, _ = calibration()
+    message.hysteresis.law = "play"
+    following = Following()
+    following.use(message, 0.0)
+    shape = state([0.5] * COUNT, turns=1)
+    shape.header.stamp.sec = 1
+    following.observe(shape)
+    following.use(message, 0.0)
+    assert following.at(1.5).effective == pytest.approx([0.5] * COUNT)
+
+
+def test_pictures_are_described_and_keep_hostile_text_out() -> None:
+    surface = measured_surface(*map_of_terms(np.eye(21)[3] * 4e-7))
+    svg = heat_map(surface, surface.extent, SAG_COLOURS, '<script>"x"')
+    assert "<script>" not in svg and "aria-label" in svg
+    said = re.search(r"peak to valley (\d+) nm", svg)
+    assert said and float(said[1]) == pytest.approx(800.0 * SHOWN**2, rel=0.01)
+    assert "x, mm" in svg and "sag, nm" in svg
+    message = ZernikeCoefficients(coefficients=(np.arange(21) * 1e-9).tolist(), sigma=[])
+    assert "largest Z5,5 sin: 20.00 nm" in zernike_chart(view_models.bars(message, None, False), "Coefficient")
+    assert "residual of 2 maps, the last 3.0 nm" in residual_chart([2.0, 3.0])
+
+
+@pytest.mark.parametrize(("low", "high"), [(-11.0, 11.0), (-3.1e-4, 2.2e-4), (0.0, 7.3)])
+def test_ticks_are_round_and_inside(low: float, high: float) -> None:
+    ticks = nice_ticks(low, high)
+    assert 3 <= len(ticks) <= 8
+    assert low - 1e-12 <= ticks[0] and ticks[-1] <= high + 1e-12
+
+
+def areas(cells: list[np.ndarray]) -> np.ndarray:
+    """Areas of polygons, by the shoelace formula."""
+    after = [np.roll(cell, -1, axis=0) for cell in cells]
+    return np.array([abs(np.sum(c[:, 0] * a[:, 1] - c[:, 1] * a[:, 0])) / 2 for c, a in zip(cells, after, strict=True)])
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.3, np.pi / 6])
+def test_cells_of_a_hexagonal_grid_fill_it_however_it_is_turned(turned: float) -> None:
+    x, y = hexagonal_positions(19, pitch=4.0, start_angle=turned)
+    cells = outlines(tuple(zip(x.tolist(), y.tolist(), strict=True)))
+    assert [len(cell) for cell in cells] == [6] * 19
+    assert areas(cells) == pytest.approx(np.sqrt(3) / 2 * 4.0**2)
+
+
+def test_cells_of_scattered_actuators_do_not_cover_each_other() -> None:
+    places = np.random.default_rng(3).uniform(-10.0, 10.0, size=(40, 2))
+    cells = outlines(tuple(map(tuple, places.tolist())))
+    for number, cell in enumerate(cells):
+        middle = cell.mean(axis=0)
+        inside = middle + 0.99 * (cell - middle)
+        distance = np.hypot(*(inside[:, None, :] - places).transpose(2, 0, 1))
+        assert (distance.argmin(axis=1) == number).all()
+    assert min(sizes(cells, places.tolist())) > 0.0
+
+
+def test_a_lone_actuator_has_a_cell() -> None:
+    assert len(outlines(((1.0, 2.0),))[0]) == 6
+
+
+@pytest.mark.parametrize("grey", range(0, 256, 15))
+def test_the_ink_stands_out_from_every_colour(grey: int) -> None:
+    colour = f"#{grey:02x}{255 - grey:02x}{grey:02x}"
+    light, ink = view_models.luminance(colour), view_models.luminance(view_models.ink_on(colour))
+    assert (max(light, ink) + 0.05) / (min(light, ink) + 0.05) >= 4.5
+
+
+def test_paths_are_shortened_and_topics_are_not() -> None:
+    words = "map /home/lab/bench/maps/m_1.dat on /mirror_a/surface_map, see (/tmp/x/y.log)"
+    assert status.shortened(words) == "map …/m_1.dat on /mirror_a/surface_map, see (…/y.log)"
+
+
+def test_recipes_are_spread_evenly() -> None:
+    assert evenly(-0.02, 0.02, 5) == [-0.02, -0.01, 0.0, 0.01, 0.02]
+    assert evenly(0.01, 0.05, 1) == [0.01]
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "number", "words"),
+    [
+        (0.0, 0.1, 2.5, r"number = 2\.5: must be a whole number, 1 to 1000"),
+        (0.0, 0.1, None, "number: must be a number"),
+        (0.02, 0.02, 3, r"first = last = 0\.02 1/m: must differ"),
+    ],
+)
+def test_recipes_that_make_no_sense_are_refused(first: float, last: float, number: float | None, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        evenly(first, last, number)

@@ -1,0 +1,219 @@
+"""Maps that arrive later: followed when the mirror drifts, refused when they are bad, kept beside the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.procedure.applied_history import MapNotUsableError
+from dm_calibration.recalibration.drift_filter import DriftRates
+from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_calibration.store.calibration_store import CalibrationStore, StoreError
+from dm_common.measurement import Measurement
+from dm_common.optics.sampling import edge_clustered_points
+from steady_mirror import SteadyMirror
+
+Made = tuple[SteadyMirror, Calibration]
+
+#: Without a memory law the node allows for hysteresis; this mirror has none.
+EXACT = UpdateOptions(signal_sigma=1e-4)
+
+
+@pytest.fixture(scope="module")
+def made() -> Made:
+    bench = SteadyMirror()
+    return bench, bench.calibrate()
+
+
+@pytest.fixture
+def bench(made: Made) -> SteadyMirror:
+    bench = made[0]
+    bench.drift(0.0)
+    bench.clock_ns = made[1].stamp_ns
+    bench.apply(np.random.default_rng(4).uniform(-0.7, 0.7, bench.mirror.actuators))
+    return bench
+
+
+@pytest.fixture
+def updates(made: Made, tmp_path: Path) -> RecalibrationManager:
+    return begun(made, tmp_path)
+
+
+def begun(made: Made, folder: Path, options: UpdateOptions = EXACT, remark: str = "") -> RecalibrationManager:
+    updates = RecalibrationManager(folder, lambda: options)
+    assert remark in updates.begin(made[1])
+    return updates
+
+
+def error(bench: SteadyMirror, fit: InfluenceFit) -> float:
+    """Largest coefficient error (m) beyond tilt of `fit` at the present shape, without noise."""
+    plant = bench.plant
+    true = plant.figure_coefficients + plant.fit_terms(plant.influence.T).T @ bench.signals
+    return float(np.abs(fit.zernike_offset + fit.influence_zernike @ bench.signals - true)[3:].max())
+
+
+def test_a_map_that_agrees_is_taken(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    verdict = updates.take(bench.measure("check"), bench.standing())
+    assert verdict.accepted
+    assert 0.3 < verdict.comparison.surprise < 1.7
+    assert updates.updates.revision == 1
+    assert updates.updates.checked_ns == bench.clock_ns
+
+
+def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
+    updates = begun(made, tmp_path)
+    rng = np.random.default_rng(11)
+    gain = 0.01 * rng.uniform(0.3, 1.0, bench.mirror.actuators)
+    figure = np.zeros(21)
+    figure[4] = 20e-9 * np.sqrt(6.0)  # astigmatism of 20 nm rms
+    for night in range(100):
+        bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
+        bench.drift(gain * (night + 1) / 100, figure * (night + 1) / 100)
+        assert updates.take(bench.measure("night", days=1.0), bench.standing()).accepted, night
+    drift = updates.updates.drift
+    assert drift.offset_rms == pytest.approx(20e-9, rel=0.1)
+    assert np.abs(drift.gain - gain).max() < 0.25 * gain.max()
+    assert error(bench, updates.changed_fit()) < 0.1 * error(bench, made[1].fit)
+
+
+def test_one_bad_map_changes_nothing(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    updates.take(bench.measure("good"), bench.standing())
+    before = updates.changed_fit()
+    verdict = updates.take(bench.measure("bumped", bump=30e-9), bench.standing())
+    assert not verdict.accepted
+    assert verdict.comparison.surprise > 3.0
+    assert "bad map, or the mirror has changed" in verdict.reason
+    assert np.array_equal(updates.changed_fit().influence_sag, before.influence_sag)
+    assert np.array_equal(updates.changed_fit().sag_offset, before.sag_offset)
+    assert updates.updates.revision == 1
+    assert not updates.mirror_changed
+
+
+def test_a_map_of_another_shape_is_refused(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    claimed = bench.standing()
+    bench.apply(-bench.signals)
+    assert not updates.take(bench.measure("wrong"), claimed).accepted
+
+
+def test_several_bad_maps_in_a_row_tell_of_a_changed_mirror(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    reasons = [updates.take(bench.measure("bumped", bump=30e-9), bench.standing()).reason for _ in range(3)]
+    assert updates.mirror_changed
+    assert "calibrate again" not in reasons[1]
+    assert "3 maps in a row did: the mirror has changed: calibrate again" in reasons[2]
+    assert updates.take(bench.measure("good"), bench.standing()).accepted
+    assert not updates.mirror_changed
+
+
+def test_maps_of_one_unmoved_mirror_count_for_less_and_less(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    standing = bench.standing()
+    sizes = []
+    for _ in range(12):
+        updates.take(bench.measure("again"), standing)
+        sizes.append(np.trace(updates.updates.drift.covariance))
+    gained = -np.diff(sizes)
+    assert gained[-1] < 0.2 * gained[0]
+
+
+def test_a_dry_run_compares_only(bench: SteadyMirror, updates: RecalibrationManager, tmp_path: Path) -> None:
+    verdict = updates.take(bench.measure("check"), bench.standing(), dry_run=True)
+    assert verdict.accepted
+    assert updates.updates.revision == 0
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: replace(m, wavelength=635e-9), "wavelength 635.000 nm, the calibration's is 632.800 nm"),
+        (lambda m: replace(m, wavelength=float("nan")), "wavelength nan nm"),
+        (lambda m: replace(m, radius=10e-3), r"aperture radius 10.000 mm, the calibration's is 11.000 mm \+-2.0%"),
+        (lambda m: replace(m, points=edge_clustered_points(200)), "sampled at other points"),
+        (lambda m: replace(m, valid_fraction=0.4), "40.0% of the pixels are valid: must be at least 50.0%"),
+        (lambda m: replace(m, sag=np.where(m.points.x > -0.3, np.nan, m.sag)), "of the sampled area has data"),
+        (lambda m: replace(m, coefficients=m.coefficients[:15]), "15 Zernike terms, the calibration has 21"),
+        (lambda m: replace(m, coefficients=np.full(21, np.nan)), "coefficients: hold values that are not finite"),
+        (lambda m: replace(m, stamp_ns=1), "measured before the calibration was finished"),
+    ],
+)
+def test_maps_that_cannot_be_compared_are_refused(
+    change: Callable[[Measurement], Measurement], words: str, bench: SteadyMirror, updates: RecalibrationManager
+) -> None:
+    with pytest.raises(MapNotUsableError, match=words):
+        updates.take(change(bench.measure("check")), bench.standing())
+    assert updates.updates.revision == 0
+
+
+def test_points_without_data_do_no_harm(bench: SteadyMirror, updates: RecalibrationManager) -> None:
+    measured = bench.measure("check")
+    gaps = np.where(np.arange(measured.sag.size) % 10 == 0, np.nan, measured.sag)
+    whole = updates.take(measured, bench.standing(), dry_run=True).comparison
+    verdict = updates.take(replace(measured, sag=gaps), bench.standing())
+    assert verdict.accepted
+    assert verdict.comparison.surprise == pytest.approx(whole.surprise, rel=0.3)
+
+
+def test_updates_are_there_again_and_the_calibration_file_is_as_it_was(
+    bench: SteadyMirror, made: Made, tmp_path: Path
+) -> None:
+    file = CalibrationStore(tmp_path).save(made[1])
+    content = file.read_bytes()
+    updates = begun(made, tmp_path)
+    bench.drift(2e-4)
+    updates.take(bench.measure("check"), bench.standing())
+    again = begun(made, tmp_path)
+    assert again.updates.revision == 1
+    assert np.array_equal(again.changed_fit().influence_sag, updates.changed_fit().influence_sag)
+    assert file.read_bytes() == content
+    assert [entry.remark for entry in CalibrationStore(tmp_path).entries()] == [""]
+
+
+def test_forgotten_updates_are_gone(
+    bench: SteadyMirror, made: Made, updates: RecalibrationManager, tmp_path: Path
+) -> None:
+    updates.take(bench.measure("check"), bench.standing())
+    updates.forget()
+    assert updates.updates.revision == 0
+    assert np.array_equal(updates.changed_fit().influence_sag, made[1].fit.influence_sag)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_file_is_told_and_ignored(
+    bench: SteadyMirror, made: Made, updates: RecalibrationManager, tmp_path: Path
+) -> None:
+    updates.take(bench.measure("check"), bench.standing())
+    file = next(tmp_path.iterdir())
+    file.write_bytes(file.read_bytes()[:2000])
+    assert begun(made, tmp_path, remark="not a whole HDF5 file").updates.revision == 0
+
+
+def test_updates_of_another_content_are_ignored(
+    bench: SteadyMirror, made: Made, updates: RecalibrationManager, tmp_path: Path
+) -> None:
+    updates.take(bench.measure("check"), bench.standing())
+    fit = replace(made[1].fit, zernike_offset=made[1].fit.zernike_offset + 1e-9)
+    other = (made[0], replace(made[1], fit=fit))
+    assert begun(other, tmp_path, remark="basis_sha256").updates.revision == 0
+
+
+def test_an_update_that_cannot_be_stored_changes_nothing(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
+    nowhere = tmp_path / "file"
+    nowhere.write_text("no folder")
+    updates = begun(made, nowhere)
+    with pytest.raises(StoreError, match="was not stored"):
+        updates.take(bench.measure("check"), bench.standing())
+    assert updates.updates.revision == 0
+
+
+def test_a_rate_of_zero_keeps_the_gains(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
+    widths = []
+    for gain in (0.0, 1e-3):
+        updates = begun(made, tmp_path / str(gain), replace(EXACT, rates=DriftRates(gain=gain, figure=0.0)))
+        updates.take(bench.measure("later", days=100.0), bench.standing())
+        widths.append(np.diag(updates.updates.drift.covariance)[: bench.mirror.actuators].max())
+    assert widths[0] < 0.1 * widths[1]

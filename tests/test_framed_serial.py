@@ -1,0 +1,191 @@
+"""Frames of a serial unit described by parameters: check sums, words, what is refused, the pace, the answer."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dm_common.ros.parameters import REQUIRED
+from dm_driver.driver_configuration import build_configuration
+from dm_driver.driver_parameters import PARAMETERS
+from dm_driver.electronics.base import LinkError
+from dm_driver.electronics.check_sums import CHECK_SUMS
+from dm_driver.electronics.frame_format import FrameFormat
+from dm_driver.electronics.framed_serial import FramedSerial
+from support import wait_until
+
+ALL_ON = np.ones(4, dtype=np.bool_)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("none", 0),
+        ("sum8", 0xDD),
+        ("sum8_complement", 0x23),
+        ("xor8", 0x31),
+        ("crc16_modbus", 0x4B37),
+        ("crc16_arc", 0xBB3D),
+        ("crc16_ccitt_false", 0x29B1),
+        ("crc16_xmodem", 0x31C3),
+        ("crc16_kermit", 0x2189),
+    ],
+)
+def test_check_sums_have_the_published_check_values(name: str, value: int) -> None:
+    assert CHECK_SUMS[name].of(b"123456789") == value
+
+
+def frame(codes: list[int], **format: Any) -> str:
+    return FrameFormat(channels=len(codes), **format).encode(np.array(codes, dtype=np.uint16)).hex(" ")
+
+
+@pytest.mark.parametrize(
+    ("format", "expected"),
+    [
+        ({}, "12 34 ab cd"),
+        ({"byte_order": "little"}, "34 12 cd ab"),
+        ({"channel_order": (1, 0)}, "ab cd 12 34"),
+        ({"header": "AA", "terminator": "0D 0A"}, "aa 12 34 ab cd 0d 0a"),
+        ({"header": "AA", "checksum": "sum8"}, "aa 12 34 ab cd 68"),
+        ({"header": "AA", "checksum": "sum8", "checksum_covers_header": False}, "aa 12 34 ab cd be"),
+        ({"word_bits": 24}, "00 12 34 00 ab cd"),
+        ({"offset": -32768}, "92 34 2b cd"),
+        ({"offset": 65535, "scale": -1}, "ed cb 54 32"),
+    ],
+)
+def test_frames_of_two_channels(format: dict[str, Any], expected: str) -> None:
+    assert frame([0x1234, 0xABCD], **format) == expected
+
+
+@pytest.mark.parametrize(
+    ("format", "expected"),
+    [
+        ({}, "01 23 0a bc"),
+        ({"word_bits": 12}, "12 3a bc"),
+        ({"word_bits": 12, "byte_order": "little"}, "23 c1 ab"),
+        ({"scale": 16}, "12 30 ab c0"),
+    ],
+)
+def test_frames_of_twelve_bits(format: dict[str, Any], expected: str) -> None:
+    assert frame([0x123, 0xABC], bits=12, **format) == expected
+
+
+@settings(max_examples=50)
+@given(
+    st.lists(st.integers(0, 2**10 - 1), min_size=1, max_size=30),
+    st.integers(10, 32),
+    st.sampled_from(["big", "little"]),
+)
+def test_words_of_any_width_can_be_read_back(codes: list[int], width: int, order: Any) -> None:
+    sent = FrameFormat(channels=len(codes), bits=10, word_bits=width, byte_order=order).encode(
+        np.array(codes, dtype=np.uint16)
+    )
+    number = int.from_bytes(sent, order)
+    spare = 8 * len(sent) - width * len(codes)
+    shifts = [width * k if order == "little" else spare + width * (len(codes) - 1 - k) for k in range(len(codes))]
+    assert [number >> shift & (1 << width) - 1 for shift in shifts] == codes
+
+
+@pytest.mark.parametrize(
+    ("format", "words"),
+    [
+        ({"header": "A5 5"}, r"framed_serial.header = 'A5 5': must be bytes as pairs of hexadecimal digits"),
+        ({"channels": 0}, r"framed_serial.channels = 0: must be 1 to 4096"),
+        ({"bits": 17}, r"framed_serial.bits = 17: must be 1 to 16"),
+        ({"channels": 2, "channel_order": (0, 2)}, r"channel_order = \[0, 2\]: must hold each of 0 to 1"),
+        ({"word_bits": 12}, r"framed_serial.word_bits = 12: must be 16 \(framed_serial.bits\) to 32"),
+        ({"scale": 2}, r"words reach from 0 to 131070, must be 0 to 65535 in 16 bits"),
+        ({"offset": -40000}, r"words reach from -40000 to 25535, must be -32768 to 32767"),
+        ({"scale": 0}, r"framed_serial.scale = 0: must not be zero"),
+        ({"checksum": "crc8"}, r"framed_serial.checksum = 'crc8': must be one of none, sum8"),
+        ({"parity": "mark"}, r"framed_serial.parity = 'mark': must be one of none, even, odd"),
+        ({"frame_rate": 1000.0}, r"frame_rate = 1000 Hz: must be 0 to 144 Hz, what 115200 bit/s carry .* 80 bytes"),
+    ],
+)
+def test_what_cannot_be_is_refused(format: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        FrameFormat(**format)
+
+
+def test_the_driver_names_a_wrong_parameter() -> None:
+    values = {parameter.name: parameter.default for parameter in PARAMETERS if parameter.default is not REQUIRED}
+    values |= {"mirror.serial": "1", "electronics.kind": "framed_serial", "electronics.serial_port": "/dev/ttyUSB0"}
+    values |= {"volts.dac_at_zero": 0.0, "volts.dac_at_full": 5.0, "volts.amplifier_gain": 80.0}
+    values |= {"volts.min": 0.0, "volts.max": 300.0}
+    assert build_configuration(values).make_electronics().channels == 40
+    with pytest.raises(ValueError, match=r"framed_serial\.terminator = 'CR'"):
+        build_configuration(values | {"framed_serial.terminator": "CR"})
+    with pytest.raises(ValueError, match=r"actuator 3 on channel 38; must be 0 to 37"):
+        build_configuration(values | {"framed_serial.channels": 38})
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """A pseudo-terminal: the unit's end, and the name of the driver's."""
+    unit, terminal = os.openpty()
+    tty.setraw(terminal)
+    yield unit, os.ttyname(terminal)
+    os.close(unit)
+    os.close(terminal)
+
+
+def read(line: int, count: int) -> bytes:
+    """Just so many bytes; one read may return a part of what is there."""
+    content = b""
+    while len(content) < count:
+        content += os.read(line, count - len(content))
+    assert not select.select([line], [], [], 0.1)[0], "more than expected"
+    return content
+
+
+FOUR = FrameFormat(channels=4, bits=8)
+CODES = np.arange(4, dtype=np.uint16)
+
+
+def test_a_missing_answer_breaks_the_link(line: tuple[int, str]) -> None:
+    with FramedSerial(line[1], replace(FOUR, reply="06"), timeout_s=0.1) as electronics:
+        os.write(line[0], b"\x06")  # before the question: it must not count
+        wait_until(lambda: electronics._link is not None and electronics._link.in_waiting)
+        with pytest.raises(LinkError, match=r"answered nothing within 0\.1 s, not 06"):
+            electronics.write(CODES, ALL_ON)
+        assert not electronics.is_open
+
+
+def test_a_wrong_answer_breaks_the_link(line: tuple[int, str]) -> None:
+    def refuse() -> None:
+        os.read(line[0], 4)
+        os.write(line[0], b"\x15")
+
+    unit = threading.Thread(target=refuse)
+    with FramedSerial(line[1], replace(FOUR, reply="06"), timeout_s=10.0) as electronics:
+        unit.start()
+        with pytest.raises(LinkError, match="answered 15 "):
+            electronics.write(CODES, ALL_ON)
+    unit.join()
+
+
+def test_the_opening_comes_once(line: tuple[int, str]) -> None:
+    with FramedSerial(line[1], replace(FOUR, opening="01 02")) as electronics:
+        electronics.write(CODES, ALL_ON)
+        electronics.write(CODES, ALL_ON)
+    assert read(line[0], 10) == bytes([1, 2, 0, 1, 2, 3, 0, 1, 2, 3])
+
+
+def test_frames_keep_their_distance(line: tuple[int, str]) -> None:
+    """No faster than asked for; how much slower depends on the machine and is not judged."""
+    with FramedSerial(line[1], replace(FOUR, frame_rate=50.0)) as electronics:
+        begun = time.monotonic()
+        for _ in range(6):
+            electronics.write(CODES, ALL_ON)
+    assert time.monotonic() - begun >= 5 / 50

@@ -1,0 +1,72 @@
+"""The memory of a whole run on the twin, with maps that are missing or wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
+from dm_calibration.hysteresis.identify import CANDIDATES
+from dm_calibration.influence.maps import MapSet
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure.procedure import Procedure
+from dm_common.measurement import Measurement, MeasurementError
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
+
+MAPS = 100
+
+
+class Blinking(SimulatedBench):
+    """An interferometer that gives no map for some labels."""
+
+    blind: tuple[str, ...] = ()
+
+    def measure(self, label: str) -> Measurement:
+        if label in self.blind:
+            self.time += 5.0
+            raise MeasurementError(302, "no map within 5 s")
+        return super().measure(label)
+
+
+@cache
+def run(blind: tuple[str, ...] = ()) -> MapSet:
+    bench = Blinking(SimulationConfig(law="prandtl_ishlinskii", seed=23, pixels=120))
+    bench.blind = blind
+    procedure = Procedure(
+        make_plan(PlanKind.HYSTERESIS, bench.mirror, PlanOptions(hysteresis_maps=MAPS)), bench.mirror, bench
+    )
+    return procedure.run().maps()
+
+
+@cache
+def fitted() -> HysteresisFit:
+    return plays(run())
+
+
+def plays(maps: MapSet) -> HysteresisFit:
+    """By play operators alone, for speed."""
+    return fit_hysteresis(maps, candidates=CANDIDATES[:2])
+
+
+def test_commands_without_a_map_stay_in_the_history() -> None:
+    blind = ("excitation 30", "excitation 31", "check 95")
+    maps = run(blind)
+    assert maps.label == run().label
+    assert not np.isfinite(maps.coefficients[[maps.label.index(label) for label in blind]]).any()
+    whole, gappy = fitted(), plays(maps)
+    assert gappy.maps == whole.maps - len(blind)
+    assert gappy.held_out_max_zernike < 2.0 * whole.held_out_max_zernike
+    assert any("excitation 30" in remark for remark in gappy.remarks)
+
+
+def test_a_map_of_something_else_does_not_enter_the_law() -> None:
+    maps, spoilt = run(), np.array(run().coefficients)
+    row = maps.label.index("excitation 50")
+    spoilt[row, 3:9] += 2e-7
+    found = plays(replace(maps, coefficients=spoilt))
+    assert found.held_out_max_zernike < 1.5 * fitted().held_out_max_zernike
+    assert found.law.creep_rate == pytest.approx(fitted().law.creep_rate, rel=0.05)
+    assert any("excitation 50" in remark for remark in found.remarks)

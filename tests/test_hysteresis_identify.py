@@ -1,0 +1,102 @@
+"""Identification of the memory on the twin's own actuators, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dm_calibration.hysteresis.accuracy import expected_accuracy
+from dm_calibration.hysteresis.identify import CANDIDATES, ExcitationError, Identification, Run, identify
+from dm_calibration.hysteresis.responses import Responses
+from hysteresis_models import twin_run
+
+LINEAR = CANDIDATES[0]
+
+
+def held_out_rms(found: Identification) -> float:
+    return float(np.sqrt(np.nanmean(np.square(found.held_out))))
+
+
+@pytest.fixture(scope="module")
+def rising() -> Run:
+    """A run that can be spoilt."""
+    return twin_run("prandtl_ishlinskii", 80)[0]
+
+
+@pytest.mark.parametrize(
+    ("law", "factor"), [("prandtl_ishlinskii", 20.0), ("preisach", 20.0), ("bouc_wen", 20.0), ("mixed", 8.0)]
+)
+def test_held_out_moves_are_predicted_much_better_than_by_a_linear_law(law: str, factor: float) -> None:
+    run, check = twin_run(law)
+    found, linear = identify(run, check), identify(run, check, [LINEAR])
+    assert held_out_rms(linear) > factor * held_out_rms(found)
+    assert found.fit.law.slope_min() > 0.1
+
+
+def test_the_creep_rate_is_found() -> None:
+    run, check = twin_run("prandtl_ishlinskii", creep=0.015)
+    # Rates are per unit of the settled step; the twin's are too.
+    assert identify(run, check, CANDIDATES[:2]).fit.law.creep_rate == pytest.approx(0.015, rel=0.05)
+
+
+def test_a_mirror_without_hysteresis_is_found_linear() -> None:
+    run, check = twin_run("none", creep=0.0)
+    found = identify(run, check)
+    assert found.fit.candidate is LINEAR
+    assert held_out_rms(found) < 5e-10
+
+
+def test_maps_without_data_change_little() -> None:
+    run, check = twin_run("prandtl_ishlinskii")
+    usable = np.ones(len(run.time), dtype=bool)
+    usable[10:14] = False
+    values = np.where(usable[:, None], run.responses.values, 0.0)
+    spoilt = replace(run, responses=Responses(values, run.responses.coefficients, usable))
+    plays = CANDIDATES[:2]
+    assert held_out_rms(identify(spoilt, check, plays)) < 2.0 * held_out_rms(identify(run, check, plays))
+
+
+def test_too_few_maps_are_refused(rising: Run) -> None:
+    usable = np.arange(len(rising.time)) < 12
+    few = replace(rising, responses=replace(rising.responses, usable=usable))
+    with pytest.raises(ExcitationError, match="12 usable maps"):
+        identify(few)
+
+
+def test_actuators_that_hardly_turn_are_refused(rising: Run) -> None:
+    signals = rising.signals.copy()
+    signals[:, 4] = np.linspace(-1.0, 1.0, len(signals))
+    with pytest.raises(ExcitationError, match="actuator 5 turned 0 times"):
+        identify(replace(rising, signals=signals))
+
+
+def test_actuators_that_hardly_move_are_refused(rising: Run) -> None:
+    signals = rising.signals.copy()
+    signals[:, 2] *= 0.05
+    with pytest.raises(ExcitationError, match="actuator 3 turned"):
+        identify(replace(rising, signals=signals))
+
+
+def test_time_that_runs_backwards_is_refused(rising: Run) -> None:
+    time = rising.time.copy()
+    time[7] = time[5]
+    with pytest.raises(ValueError, match=r"map 8 is .* s before the map before it"):
+        replace(rising, time=time)
+
+
+def test_more_maps_promise_more() -> None:
+    promised = []
+    for maps in (80, 160, 320):
+        run, check = twin_run("none", maps)
+        promised.append(expected_accuracy(run.signals, run.time, check).max_zernike)
+    assert promised[0] > 1.2 * promised[1] > 1.44 * promised[2]
+
+
+def test_a_promise_needs_check_moves_and_enough_maps() -> None:
+    run, check = twin_run("none", 60)
+    with pytest.raises(ValueError, match="no moves that test"):
+        expected_accuracy(run.signals, run.time, np.zeros_like(check))
+    with pytest.raises(ValueError, match="must be more than"):
+        expected_accuracy(run.signals[-15:], run.time[-15:], check[-15:])

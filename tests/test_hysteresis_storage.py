@@ -1,0 +1,60 @@
+"""Memory and recipes in calibration files: what goes in comes out, and files without them are read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
+from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
+from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
+from hysteresis_models import rich
+
+HYSTERESIS = HysteresisFit("Preisach and Duhem", rich(), np.linspace(0.0, 1e-9, 21), 2e-9, 0.03, 312, ("One.", "Two."))
+
+
+def recipe(curvature: float) -> Recipe:
+    return Recipe(curvature, 0.0, np.array([0.1, 0.2]) * curvature, np.array([0.3, 0.4]), 5e-10, 4e-9, 16)
+
+
+BOOK = RecipeBook((recipe(-0.01), recipe(0.02)), 100, 3e-10, 1_700_000_000_000_000_000)
+
+
+def test_a_hysteresis_comes_back() -> None:
+    back = hysteresis_from(hysteresis_columns(HYSTERESIS))
+    assert back is not None
+    assert (back.name, back.maps, back.remarks) == (HYSTERESIS.name, HYSTERESIS.maps, HYSTERESIS.remarks)
+    assert (back.held_out_max_zernike, back.unknown_sigma) == (
+        HYSTERESIS.held_out_max_zernike,
+        HYSTERESIS.unknown_sigma,
+    )
+    np.testing.assert_array_equal(back.zernike_sigma, HYSTERESIS.zernike_sigma)
+    for name in ("play_radius", "play_weight", "duhem_slope", "duhem_weight", "creep_rate", "creep_time"):
+        np.testing.assert_array_equal(getattr(back.law, name), getattr(HYSTERESIS.law, name))
+
+
+def test_recipes_come_back() -> None:
+    back = recipes_from(recipe_columns(BOOK))
+    assert (back.degauss_steps, back.interpolation_error, back.stamp_ns) == (100, 3e-10, BOOK.stamp_ns)
+    for one, other in zip(back.recipes, BOOK.recipes, strict=True):
+        assert (one.curvature, one.max_zernike, one.maps) == (other.curvature, other.max_zernike, other.maps)
+        np.testing.assert_array_equal(one.effective, other.effective)
+
+
+def test_files_without_them_are_read() -> None:
+    assert hysteresis_from({}) is None
+    assert recipes_from({}) is NO_RECIPES
+    assert hysteresis_columns(None) == {} and recipe_columns(NO_RECIPES) == {}
+
+
+def test_figures_that_are_no_numbers_are_refused() -> None:
+    columns = hysteresis_columns(HYSTERESIS)
+    columns["memory/zernike_sigma"] = np.array([np.nan])
+    with pytest.raises(ValueError, match="must be finite"):
+        hysteresis_from(columns)
+
+
+def test_recipes_of_another_condition_are_not_merged() -> None:
+    with pytest.raises(RecipeError, match="degauss_steps = 50"):
+        BOOK.merged(RecipeBook((recipe(0.03),), 50, 0.0, 1))
+    assert [r.curvature for r in BOOK.merged(RecipeBook((recipe(0.03),), 100, 0.0, 1)).recipes] == [-0.01, 0.02, 0.03]

@@ -1,0 +1,100 @@
+"""The tracker: what the driver reports decides what is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dm_common.hysteresis.tracker import Applied, HysteresisTracker
+from hysteresis_models import rich
+
+LAW = rich()
+A, B, C = (np.array(signals) for signals in ([0.5, -0.2], [-0.3, 0.8], [0.1, 0.0]))
+REST = np.zeros(2)
+
+
+def report(
+    time: float, signals: np.ndarray, turns: int = 0, turned_at: np.ndarray | None = None, **changes: object
+) -> Applied:
+    return replace(Applied(time, signals, turns, turned_at, 1, True), **changes)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def tracker() -> HysteresisTracker:
+    """One that has seen a degauss."""
+    tracker = HysteresisTracker(LAW)
+    tracker.observe(report(0.0, REST, degausses=0, history_known=False))
+    tracker.observe(report(1.0, REST, turns=1, turned_at=REST))
+    assert tracker.known
+    return tracker
+
+
+def test_before_a_degauss_nothing_is_known() -> None:
+    tracker = HysteresisTracker(LAW)
+    assert not tracker.known
+    tracker.observe(report(0.0, A))
+    assert "before this node" in tracker.unknown
+
+
+def test_moves_are_followed(tracker: HysteresisTracker) -> None:
+    start = tracker.state
+    assert start is not None and tracker.state is not None
+    tracker.observe(report(2.0, A, 2, REST))
+    tracker.observe(report(3.0, B, 3, A))
+    expected = LAW.move(LAW.move(start, A, 2.0), B, 3.0)
+    np.testing.assert_allclose(tracker.state.position, expected.position, atol=1e-12)
+    assert tracker.known
+
+
+def test_one_turn_may_be_missed(tracker: HysteresisTracker) -> None:
+    start = tracker.state
+    assert start is not None and tracker.state is not None
+    tracker.observe(report(3.0, B, 2, A))
+    np.testing.assert_allclose(tracker.state.position, LAW.move(LAW.move(start, A, 3.0), B, 3.0).position, atol=1e-12)
+    assert tracker.known
+
+
+def test_two_missed_turns_are_noticed(tracker: HysteresisTracker) -> None:
+    tracker.observe(report(3.0, C, 4, B))
+    assert "2 turns were not seen" in tracker.unknown
+
+
+def test_a_degauss_cures(tracker: HysteresisTracker) -> None:
+    tracker.observe(report(3.0, C, 9, B))
+    assert not tracker.known
+    tracker.observe(report(9.0, REST, 10, REST, degausses=2))
+    assert tracker.known and tracker.state is not None
+    np.testing.assert_array_equal(tracker.state.play, LAW.demagnetised(2, 9.0).play)
+
+
+def test_lost_writes_are_noticed(tracker: HysteresisTracker) -> None:
+    tracker.observe(report(2.0, A, 2, REST, history_known=False))
+    assert "writes were lost" in tracker.unknown
+
+
+def test_another_activation_begins_anew(tracker: HysteresisTracker) -> None:
+    tracker.observe(report(2.0, A, 0, None, degausses=0, history_known=False))
+    assert "activated again" in tracker.unknown
+
+
+def test_a_clock_set_back_leaves_hysteresis_alone(tracker: HysteresisTracker) -> None:
+    tracker.observe(report(50.0, A, 2, REST))
+    before = tracker.state
+    assert before is not None
+    tracker.observe(report(4.0, A, 2, REST))
+    assert tracker.known and tracker.state is not None
+    assert tracker.state.time == 4.0
+    np.testing.assert_array_equal(tracker.state.position, before.position)
+    np.testing.assert_array_equal(tracker.state.crept, before.crept)
+
+
+def test_another_number_of_actuators_is_refused(tracker: HysteresisTracker) -> None:
+    with pytest.raises(ValueError, match="3 signals, before there were 2"):
+        tracker.observe(report(2.0, np.zeros(3)))
+
+
+def test_signals_that_are_no_numbers_are_refused(tracker: HysteresisTracker) -> None:
+    with pytest.raises(ValueError, match="not finite"):
+        tracker.observe(report(2.0, np.array([np.nan, 0.0])))

@@ -1,0 +1,120 @@
+"""From file to figures: aperture, orientation, pitch and refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings, MapRejectedError
+from dm_calibration.map_files import NoValidPixelsError
+from dm_calibration.optics.aperture import InsufficientDataError
+from dm_calibration.optics.orientation import Orientation
+from dm_common.optics.zernike import basis
+from map_fixtures import NO_DATA, WAVELENGTH, dat_bytes, disc_counts, write_datx
+
+SIZE, PITCH = 120, 2e-4
+COEFFICIENTS = np.zeros(21)
+COEFFICIENTS[[0, 1, 2, 3, 5, 9]] = [2e-7, 1e-7, -3e-7, 5e-7, 4e-8, -6e-8]
+
+
+@pytest.fixture
+def surface(tmp_path: Path) -> Path:
+    """A disc of 55 pixels radius around column 62, row 57, with known coefficients."""
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    x, y = (columns - 62) / 55, (57 - rows) / 55
+    path = tmp_path / "map.datx"
+    sag = basis(x, y) @ COEFFICIENTS
+    write_datx(path, np.where(x**2 + y**2 <= 1, sag * 1e9, 1.7976931348623157e308), "NanoMeters", pitch=PITCH)
+    return path
+
+
+def test_found_aperture_and_coefficients(surface: Path) -> None:
+    found = Ingest().read(surface, IngestSettings())
+    assert found.pitch == PITCH
+    assert found.aperture.radius_px == pytest.approx(55, abs=0.2)
+    assert found.aperture_radius == pytest.approx(0.011, rel=0.004)
+    assert found.aperture_centre == pytest.approx(((62 - 59.5) * PITCH, (59.5 - 57) * PITCH), abs=0.2 * PITCH)
+    np.testing.assert_allclose(found.fit.coefficients, COEFFICIENTS, atol=5e-9)
+    assert found.samples.shape == (500,)
+
+
+def test_configured_aperture_gives_the_coefficients_exactly(surface: Path) -> None:
+    settings = IngestSettings(aperture_radius=55 * PITCH, aperture_centre=(2.5 * PITCH, 2.5 * PITCH))
+    found = Ingest().read(surface, settings)
+    np.testing.assert_allclose(found.fit.coefficients, COEFFICIENTS, atol=1e-15)
+    assert found.fit.valid_fraction == 1
+    expected = basis(found.points.x, found.points.y) @ COEFFICIENTS
+    np.testing.assert_allclose(found.samples, expected, atol=4e-8)  # half a pixel of slope at the rim
+
+
+def test_orientation_turns_the_coefficients(surface: Path) -> None:
+    def fitted(orientation: Orientation, x: float, y: float) -> np.ndarray:
+        settings = IngestSettings(
+            orientation=orientation, aperture_radius=55 * PITCH, aperture_centre=(x * PITCH, y * PITCH)
+        )
+        return Ingest().read(surface, settings).fit.coefficients
+
+    mirrored = COEFFICIENTS.copy()
+    mirrored[[1, 5]] *= -1  # x, 2xy ; the cosine of three times the angle turns over as well
+    mirrored[8] *= -1
+    expected = mirrored.copy()
+    expected[9] = COEFFICIENTS[9]  # sin(3 theta) is even in x
+    np.testing.assert_allclose(fitted(Orientation(flip_x=True), -2.5, 2.5), expected, atol=1e-15)
+    turned = np.zeros(21)  # a quarter turn counter-clockwise: theta -> theta - 90 degrees
+    turned[[0, 3]] = COEFFICIENTS[[0, 3]]
+    turned[[1, 2]] = [-COEFFICIENTS[2], COEFFICIENTS[1]]
+    turned[5] = -COEFFICIENTS[5]
+    turned[8] = COEFFICIENTS[9]  # sin 3(theta - 90) = cos 3 theta
+    np.testing.assert_allclose(fitted(Orientation(rotate_deg=90), -2.5, 2.5), turned, atol=1e-15)
+
+
+def test_piston_and_tilt_go_from_the_map_only(surface: Path) -> None:
+    settings = IngestSettings(aperture_radius=55 * PITCH, aperture_centre=(2.5 * PITCH, 2.5 * PITCH))
+    kept = Ingest().read(surface, settings)
+    removed = Ingest().read(surface, dataclasses.replace(settings, remove_piston_tilt=True))
+    assert removed.piston_tilt_removed
+    np.testing.assert_array_equal(removed.fit.coefficients, kept.fit.coefficients)
+    np.testing.assert_array_equal(removed.samples, kept.samples)
+    bowl = COEFFICIENTS[[3, 5, 9]] * np.sqrt([1 / 3, 1 / 6, 1 / 8])
+    assert removed.rms == pytest.approx(np.sqrt((bowl**2).sum()), rel=0.01)
+    assert kept.rms == pytest.approx(np.sqrt((bowl**2).sum() + (1e-7**2 + 3e-7**2) / 4), rel=0.01)
+
+
+def test_refusals_name_what_is_wrong(tmp_path: Path) -> None:
+    path = tmp_path / "map.dat"
+    path.write_bytes(dat_bytes(disc_counts(60), pitch=0.0))
+    ingest = Ingest()
+    with pytest.raises(MapRejectedError, match=r"wavelength = 632\.800 nm: must be 1064\.000 nm within 1 nm"):
+        ingest.read(path, IngestSettings(wavelength=1064e-9))
+    assert ingest.read(path, IngestSettings(wavelength=WAVELENGTH)).pitch is None
+    with pytest.raises(MapRejectedError, match=r"aperture.radius = 0.011 m, but the file does not tell"):
+        ingest.read(path, IngestSettings(aperture_radius=0.011))
+    found = ingest.read(path, IngestSettings(aperture_radius=0.011, pitch=0.022 / 60))
+    assert found.aperture.radius_px == pytest.approx(30)
+    with pytest.raises(InsufficientDataError, match=r"valid fraction = 0\.\d+ of the aperture.*at least 0.7"):
+        ingest.read(path, IngestSettings(aperture_radius=0.02, pitch=0.022 / 60))
+
+
+def test_too_few_pixels_and_none(tmp_path: Path) -> None:
+    counts = np.full((30, 30), NO_DATA)
+    counts[10:14, 10:14] = 5
+    path = tmp_path / "map.dat"
+    path.write_bytes(dat_bytes(counts))
+    with pytest.raises(InsufficientDataError, match=f"{path}: .*21 terms"):
+        Ingest().read(path, IngestSettings())
+    path.write_bytes(dat_bytes(np.full((30, 30), NO_DATA)))
+    with pytest.raises(NoValidPixelsError):
+        Ingest().read(path, IngestSettings())
+
+
+def test_one_ingest_serves_changing_masks(tmp_path: Path) -> None:
+    ingest, path = Ingest(), tmp_path / "map.dat"
+    for seed in (1, 2, 1):
+        counts = disc_counts(50, seed=seed)
+        counts[np.random.default_rng(seed).random(counts.shape) < 0.05] = NO_DATA
+        path.write_bytes(dat_bytes(counts))
+        together, alone = ingest.read(path, IngestSettings()), Ingest().read(path, IngestSettings())
+        np.testing.assert_array_equal(together.fit.coefficients, alone.fit.coefficients)

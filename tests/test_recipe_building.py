@@ -1,0 +1,232 @@
+"""Building recipes on the twin: what is stored makes the shape again, from the same condition, at another creep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_common.hysteresis.model import HysteresisState
+from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.measurement import Cancelled, Measurement
+from dm_common.optics.zernike import TERM_RMS
+from dm_common.recipes import Recipe, RecipeError
+from dm_controller.converge.recipe_building import (
+    BuildOptions,
+    BuildStep,
+    RecipeBuilder,
+    recipe_book,
+)
+from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
+from dm_controller.mirror_model import CalibratedMirror
+from dm_controller.planner import HysteresisFigures, Planner
+from dm_controller.recipes import find
+from dm_controller.solvers.bounded import Limits
+from dm_controller.target import FocusTarget
+from linear_mirror import LinearMirror, hexagon, make_mirror
+from studies.comparison.compare import true_error
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
+
+LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().neighbours, dtype=np.intp), 2.0)
+WAVELENGTH = 632.8e-9
+
+
+class Stand:
+    """A calibrated twin with what its driver has reported since it was switched on."""
+
+    def __init__(self) -> None:
+        self.bench = SimulatedBench(SimulationConfig(law="preisach", seed=31, pixels=118, samples=200))
+        calibration = self.bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=200))
+        hysteresis = calibration.hysteresis
+        assert hysteresis is not None
+        mirror = CalibratedMirror(influence_model(calibration.fit, calibration.aperture_radius), self.bench.limits)
+        figures = HysteresisFigures(
+            hysteresis.law, hysteresis.zernike_sigma, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma
+        )  # fmt: skip
+        self.loop = Planner(mirror, figures)
+        tracker = HysteresisTracker(hysteresis.law)
+        for report in self.bench.reports:
+            tracker.observe(report)
+        assert tracker.state is not None
+        self.state: HysteresisState = tracker.state
+
+    def replay(
+        self, target: FocusTarget, effective: np.ndarray, state: HysteresisState
+    ) -> tuple[float, HysteresisState]:
+        """Condition, go, wait 0.5 s: the largest coefficient error of the true surface, and the memory then."""
+        bench, law = self.bench, self.loop.law
+        began = bench.time
+        bench.degauss()
+        state = law.advance(law.degaussed(state, began), bench.time)
+        move = self.loop.plan(target, state, bench.time, effective=effective, ahead=0.5)
+        state = law.move(state, bench.apply(move.plan.signals), bench.time)
+        bench.time += 0.5
+        return true_error(bench, target).max_zernike, state
+
+
+@pytest.fixture(scope="module")
+def stand() -> Stand:
+    return Stand()
+
+
+def test_what_was_built_makes_the_shape_again(stand: Stand) -> None:
+    steps: list[BuildStep] = []
+    bench = stand.bench
+    builder = RecipeBuilder(
+        stand.loop, bench, lambda: bench.time, BuildOptions(maps_max=24), state=stand.state, on_step=steps.append
+    )
+    targets = recipe_targets((0.04, -0.03, 0.0), 0.0, stand.loop, 2e-8)
+    recipes = [builder.build(target) for target in targets]
+    assert [recipe.curvature for recipe in recipes] == [-0.03, 0.0, 0.04]
+    assert all(recipe.maps <= 24 for recipe in recipes)
+    assert sum(recipe.maps for recipe in recipes) == builder.maps == len(steps)
+    book = recipe_book(recipes, stand.loop, bench.config.degauss_steps, 1)
+    errors, state = [], builder.state
+    for curvature, waited in ((0.04, 0.0), (-0.03, 200.0), (0.0, 50.0), (0.04, 5.0), (-0.03, 0.0)):
+        bench.time += waited  # creep that the next degauss does not wipe
+        target = FocusTarget(curvature)
+        error, state = stand.replay(target, find(book, target).effective, state)
+        errors.append(error)
+    assert np.median(errors) < WAVELENGTH / 1000.0
+    assert max(errors) < WAVELENGTH / 400.0
+
+
+class LinearPlant:
+    """A linear mirror without memory whose gains differ from its calibration; each map has its own low-order error."""
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.mirror = LinearMirror(*hexagon())
+        self.gains = 1.0 + 0.03 * np.random.default_rng(2).standard_normal(37)
+        self.random = np.random.default_rng(4)
+        self.noise = noise
+        self.signals = np.zeros(37)
+        self.time = 0.0
+        self.calls: list[str] = []
+
+    def degauss(self) -> None:
+        self.calls.append("degauss")
+        self.signals = np.zeros(37)
+
+    def apply(self, signals: np.ndarray) -> np.ndarray:
+        assert LIMITS.allow(signals)
+        self.calls.append("apply")
+        self.signals = signals
+        return signals
+
+    def settle(self) -> bool:
+        self.time += 0.5
+        return True
+
+    def measure(self, label: str) -> Measurement:
+        self.calls.append("measure")
+        self.time += 0.5
+        mirror = self.mirror
+        sag = mirror.sag(self.gains * self.signals) + mirror.modes @ (
+            self.noise * self.random.standard_normal(21) / TERM_RMS
+        )
+        return Measurement(
+            points=mirror.points, sag=sag, coefficients=mirror.fit_terms(sag), sigma=np.zeros(21),
+            stamp_ns=round(self.time * 1e9), residual_rms=0.0, valid_fraction=1.0,
+        )  # fmt: skip
+
+    def left(self, recipe: Recipe) -> float:
+        """Largest coefficient error that the recipe truly leaves, m."""
+        mirror = self.mirror
+        sag = mirror.sag(self.gains * recipe.effective)
+        wanted = FocusTarget(recipe.curvature).coefficients(LinearMirror.model(mirror).aperture_radius)
+        return float(np.abs(mirror.fit_terms(sag) - wanted)[3:].max())
+
+
+LOOP = Planner(CalibratedMirror(LinearMirror(*hexagon()).model(), LIMITS))
+
+
+def build(plant: LinearPlant, options: BuildOptions, curvature: float = 0.02) -> Recipe:
+    return RecipeBuilder(LOOP, plant, lambda: plant.time, options).build(FocusTarget(curvature))
+
+
+def test_without_a_hysteresis_effective_signals_are_signals() -> None:
+    plant = LinearPlant()
+    recipe = build(plant, BuildOptions(tolerance=1e-10))
+    assert plant.left(recipe) < 1e-10
+    assert recipe.max_zernike < 1e-10
+    np.testing.assert_allclose(recipe.effective, recipe.signals, atol=1e-4)
+
+
+def test_every_round_begins_with_a_degauss() -> None:
+    plant = LinearPlant(noise=1e-9)
+    recipe = build(plant, BuildOptions(tolerance=1e-12, maps_max=12, average=4))
+    assert plant.calls == 3 * ["degauss", "apply", *4 * ["measure"]]
+    assert recipe.maps == 12
+    assert recipe.max_zernike > 1e-12  # told as it was measured
+
+
+def test_averaging_takes_the_noise_down() -> None:
+    noise = 0.3e-9
+    few, many = (
+        np.median([plant.left(build(plant, BuildOptions(1e-12, maps, maps // 2))) for plant in plants])
+        for maps, plants in (
+            (4, [seeded(noise, k) for k in range(6)]),
+            (64, [seeded(noise, k) for k in range(6)]),
+        )
+    )
+    assert many < 0.5 * few
+
+
+def seeded(noise: float, seed: int) -> LinearPlant:
+    plant = LinearPlant(noise)
+    plant.random = np.random.default_rng(100 + seed)
+    return plant
+
+
+def test_cancelling_stops_between_two_maps() -> None:
+    plant = LinearPlant()
+    builder = RecipeBuilder(
+        LOOP, plant, lambda: plant.time, cancelled=lambda: plant.calls.count("measure") == 3
+    )  # fmt: skip
+    with pytest.raises(Cancelled):
+        builder.build(FocusTarget(0.02))
+    assert plant.calls.count("measure") == builder.maps == 3
+
+
+@pytest.mark.parametrize(
+    ("curvatures", "error", "words"),
+    [
+        ((0.0, float("nan")), RecipeError, r"curvatures\[1\] = nan: must be a finite number"),
+        ((0.01, 0.02, 0.01), RecipeError, r"curvatures: \+0\.0100 1/m is there twice"),
+        ((0.0, 5.0), UnreachableError, r"curvature = \+5\.0000 1/m: the limits .* reachable: -0"),
+    ],
+)
+def test_bad_curvatures_are_refused_before_anything_moves(
+    curvatures: tuple[float, ...], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        recipe_targets(curvatures, 0.0, LOOP, 2e-8)
+
+
+def test_a_shape_that_only_the_law_denies_is_told(stand: Stand) -> None:
+    """The influence function allows effective signals that the conditioned mirror, at its limits, does not reach."""
+    weaker = Planner(LOOP.mirror, stand.loop.hysteresis)
+    assert weaker.hysteresis is not None
+    weaker.law = replace(weaker.hysteresis.law.scaled(0.05), creep_rate=0.0)
+    plant = LinearPlant()
+    with pytest.raises(UnreachableError, match=r"actuator \d+ stands at its limit"):
+        RecipeBuilder(weaker, plant, lambda: plant.time).build(FocusTarget(0.02))
+    assert "measure" not in plant.calls
+
+
+def test_bad_options_are_refused() -> None:
+    with pytest.raises(ValueError, match="tolerance = 0 m: must be above 0"):
+        BuildOptions(tolerance=0.0)
+    with pytest.raises(ValueError, match="average = 1 maps: must be at least 2"):
+        BuildOptions(average=1)
+    with pytest.raises(ValueError, match="maps_max = 15: must be at least 16"):
+        BuildOptions(maps_max=15)
+
+
+def test_added_terms_have_no_recipe() -> None:
+    plant = LinearPlant()
+    with pytest.raises(RecipeError, match="zernike"):
+        RecipeBuilder(LOOP, plant, lambda: plant.time).build(FocusTarget(0.0, 0.0, (1e-9,) * 21))
+    assert not plant.calls

@@ -1,0 +1,144 @@
+"""Recipes kept with a calibration: its file changes whole or not at all, the raw data never."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from dm_msgs.msg import ErrorCode
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_errors import Refused, error_code
+from dm_calibration.calibration_manager import CalibrationManager
+from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.influence.fit import FitOptions
+from dm_calibration.procedure.plan import PlanKind, make_plan
+from dm_calibration.procedure.procedure import Procedure
+from dm_calibration.store.calibration_store import CalibrationStore, StoreError, UnknownCalibrationError
+from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
+from hysteretic_mirror import MIRROR, RememberingBench
+from linear_mirror import make_mirror
+
+ACTUATORS = MIRROR.actuators
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    outcome = Procedure(make_plan(PlanKind.POKES, MIRROR), MIRROR, RememberingBench()).run()
+    return evaluate(outcome, MIRROR, FitOptions(), Provenance("known", 10**18))[0]
+
+
+class Stand:
+    """A desk with one stored calibration in use."""
+
+    def __init__(self, folder: Path, calibration: Calibration) -> None:
+        self.published: list[Calibration | None] = []
+        self.store = CalibrationStore(folder)
+        self.file = self.store.save(calibration)
+        self.desk = CalibrationManager(
+            self.store, lambda: 0.01, lambda: 0, lambda one, _file: self.published.append(one)
+        )
+        self.desk.set_mirror(MIRROR)
+        self.desk.load("known")
+
+
+@pytest.fixture
+def stand(tmp_path: Path, calibration: Calibration) -> Stand:
+    return Stand(tmp_path, calibration)
+
+
+def book(*curvatures: float, actuators: int = ACTUATORS, steps: int = 100, maps: int = 20) -> RecipeBook:
+    def recipe(curvature: float) -> Recipe:
+        values = np.linspace(-1.0, 1.0, actuators)
+        return Recipe(curvature, 0.0, values, values, 3e-10, 1e-9, maps)
+
+    return RecipeBook(tuple(recipe(curvature) for curvature in curvatures), steps, 1e-10, 5)
+
+
+def raw_data(file: Path) -> dict[str, bytes]:
+    """Datasets of what was measured, as they lie in the file."""
+    found: dict[str, bytes] = {}
+    with h5py.File(file) as content:
+        for group in ("maps", "points", "mirror"):
+            content[group].visititems(lambda name, item, group=group: found.update({f"{group}/{name}": item[()]}))
+    return {name: value.tobytes() if value.dtype != object else b"|".join(value) for name, value in found.items()}  # type: ignore[attr-defined]
+
+
+def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:
+    before = raw_data(stand.file)
+    stand.desk.add_recipes("known", book(-0.01, 0.02))
+    stand.desk.add_recipes("known", book(0.0, 0.02, maps=33))
+    loaded = stand.store.load("known")
+    assert [(r.curvature, r.maps) for r in loaded.recipes.recipes] == [(-0.01, 20), (0.0, 33), (0.02, 33)]
+    assert len(before) > 10
+    assert raw_data(stand.file) == before
+    assert list(stand.file.parent.iterdir()) == [stand.file]
+    assert stand.published[-1] is stand.desk.in_use
+    assert stand.published[-1] is not None
+    assert len(stand.published[-1].recipes.recipes) == 3
+
+
+def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, published = stand.file.read_bytes(), len(stand.published)
+
+    def full(*_arguments: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(StoreError, match=r"known was not stored in .*: No space left on device") as caught:
+        stand.desk.add_recipes("known", book(0.01))
+    monkeypatch.undo()
+    assert error_code(caught.value) == ErrorCode.STORAGE_FAILED
+    assert stand.file.read_bytes() == before
+    assert list(stand.file.parent.iterdir()) == [stand.file]
+    assert stand.desk.in_use is not None
+    assert stand.desk.in_use.recipes is NO_RECIPES
+    assert len(stand.published) == published
+
+
+@pytest.mark.parametrize(
+    ("calibration_id", "recipes", "code", "words"),
+    [
+        (
+            "other",
+            lambda: book(0.01),
+            ErrorCode.CALIBRATION_MISMATCH,
+            "calibration_id = 'other': the calibration in use",
+        ),
+        ("known", lambda: book(0.01, actuators=19), ErrorCode.CALIBRATION_MISMATCH, "19 effective signals each"),
+        ("known", lambda: NO_RECIPES, ErrorCode.INVALID_ARGUMENT, "must hold at least one"),
+        ("known", lambda: book(0.02, steps=50), ErrorCode.INVALID_ARGUMENT, "degauss_steps = 50: the recipes there"),
+        ("known", lambda: book(float("nan")), ErrorCode.NOT_FINITE, "curvature = nan"),
+    ],
+)
+def test_recipes_that_do_not_belong_are_refused(
+    stand: Stand, calibration_id: str, recipes: Callable[[], RecipeBook], code: int, words: str
+) -> None:
+    stand.desk.add_recipes("known", book(0.01))
+    before = stand.file.read_bytes()
+    with pytest.raises((Refused, RecipeError), match=words) as caught:
+        stand.desk.add_recipes(calibration_id, recipes())
+    assert error_code(caught.value) == code
+    assert stand.file.read_bytes() == before
+
+
+def test_without_a_calibration_in_use_there_is_nothing_to_join(stand: Stand) -> None:
+    stand.desk.set_mirror(make_mirror(serial="T-2"))
+    with pytest.raises(Refused, match="no calibration is in use") as caught:
+        stand.desk.add_recipes("known", book(0.01))
+    assert caught.value.code == ErrorCode.NOT_CALIBRATED
+
+
+def test_other_raw_data_never_replace_those_of_the_file(stand: Stand, calibration: Calibration) -> None:
+    before = stand.file.read_bytes()
+    other = replace(calibration, maps=replace(calibration.maps, sag=calibration.maps.sag + 1e-9))
+    with pytest.raises(StoreError, match="raw data differ"):
+        stand.store.replace(other)
+    with pytest.raises(UnknownCalibrationError):
+        stand.store.replace(replace(calibration, id="never-stored"))
+    assert stand.file.read_bytes() == before
