@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 
 from dm_common.names import UnknownNameError
 from dm_controller.converge.closed_loop import LoopOptions
-from dm_controller.solvers.registry import SOLVERS
 from studies.comparison.compare import (
     CLOSED,
     CURVATURES,
@@ -24,6 +23,7 @@ from studies.comparison.compare import (
     total_steps,
 )
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
+from studies.solvers.registry import SOLVERS
 from studies.verbs.compare import compare as command
 
 SMALL = SimulationConfig(pixels=120, degauss_steps=30)
