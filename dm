@@ -11,6 +11,7 @@ import fcntl
 import hashlib
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -301,11 +302,11 @@ def run_environment() -> dict[str, str]:
         environment[name] = os.pathsep.join([*added, *present])
     # Nodes of a bench talk on this machine only unless the user opens it.
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    profile = ROOT / "src" / "dm_bringup" / "config" / "fastdds.xml"
-    environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
     environment.setdefault("PYTHONUNBUFFERED", "1")
-    # Matrix products here take a millisecond; the threads of several nodes would fight over the cores for longer.
-    environment.setdefault("OPENBLAS_NUM_THREADS", "1")
+    bringup = ROOT / "src" / "dm_bringup"
+    nodes = runpy.run_path(str(bringup / "dm_bringup" / "nodes.py"))
+    for name, value in nodes["node_environment"](bringup / "config").items():
+        environment.setdefault(name, value)
     environment["DM_ROOT"] = str(ROOT)
     # Studies and fault injection are not installed: they are used from the checkout.
     present = environment.get("PYTHONPATH", "").split(os.pathsep)

@@ -27,7 +27,7 @@ from dm_calibration.map_files import read_map
 from dm_client.client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_controller.target import FocusTarget
-from dm_simulation.parameters import TABLE
+from dm_simulation.parameters import PARAMETERS
 from dm_tools.demo.demo import bench_config
 from dm_tools.verify import map_of, surface_error
 from support import bench_figures, wait_until
@@ -184,7 +184,7 @@ def test_the_electronics_never_saw_a_jump(mirror: DeformableMirrorClient, calibr
 
 def test_poke_check_tells_what_is_wired_wrongly(folder: Path) -> None:
     config = bench_config(folder / "miswired", "off", 0.0, SEED, speed=20.0)
-    wiring = list(next(parameter for parameter in TABLE if parameter.name == "wiring").default)
+    wiring = list(next(parameter for parameter in PARAMETERS if parameter.name == "wiring").default)
     wiring[2], wiring[6] = wiring[6], wiring[2]
     config["virtual_bench"]["wiring"] = wiring
     with (

@@ -17,17 +17,7 @@ from typing import IO, Any
 
 import yaml
 
-#: (node, module) in the order of their start; they stop in reverse, so that the bench outlives the driver's last ramp.
-NODES = (
-    ("virtual_bench", "dm_simulation.virtual_bench_node"),
-    ("pdm_driver", "dm_driver.pdm_driver_node"),
-    ("interferometer", "dm_calibration.interferometer_node"),
-    ("calibration", "dm_calibration.calibration_node"),
-    ("focus_controller", "dm_controller.focus_controller_node"),
-    ("autofocus", "dm_autofocus.autofocus_node"),
-)
-#: Those that run only when the configuration has a section for them.
-OPTIONAL = ("virtual_bench", "autofocus")
+from dm_bringup.nodes import NAMES, nodes_of
 
 Config = dict[str, dict[str, Any]]
 
@@ -50,12 +40,11 @@ def load_config(path: Path) -> Config:
         raise ConfigError(f"{path}: not a YAML file: {error}") from error
     if not isinstance(content, dict):
         raise ConfigError(f"{path}: a parameter file is a mapping of nodes, this is a {type(content).__name__}")
-    known = [name for name, _module in NODES]
     result: Config = {}
     for key, section in content.items():
         name = str(key).rsplit("/", 1)[-1]
-        if name not in known:
-            raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(known)}")
+        if name not in NAMES:
+            raise ConfigError(f"{path}: {key}: no node of that name; known: {', '.join(NAMES)}")
         if not isinstance(section, dict) or not isinstance(section.get("ros__parameters"), dict):
             raise ConfigError(f"{path}: {key}: must hold a mapping `ros__parameters`")
         result[name] = section["ros__parameters"]
@@ -129,7 +118,7 @@ class Suite:
         self._config = config
         self._namespace = namespace
         self._echo = echo
-        self._nodes = [name for name, _module in NODES] if nodes is None else nodes
+        self._nodes = NAMES if nodes is None else nodes
         self._environment = dict(os.environ)
         if domain is not None:
             self._environment["ROS_DOMAIN_ID"] = str(domain)
@@ -139,9 +128,9 @@ class Suite:
         self.folder.mkdir(parents=True, exist_ok=True)
         parameters = self.folder / "config.yaml"
         save_config(self._config, parameters)
-        for name, module in NODES:
-            if name in self._nodes and (name not in OPTIONAL or name in self._config):
-                self._start(name, module, parameters)
+        for node in nodes_of(self._config):
+            if node.name in self._nodes:
+                self._start(node.name, node.module, parameters)
         return self
 
     def _start(self, name: str, module: str, parameters: Path) -> None:

@@ -1,53 +1,42 @@
-"""Start the nodes against hardware: ros2 launch dm_bringup suite.launch.py config:=FILE [camera:=true]."""
+"""Start the nodes that a parameter file configures: ros2 launch dm_bringup suite.launch.py config:=FILE."""
 
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
-from launch.conditions import IfCondition
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 
+from dm_bringup.nodes import node_environment, nodes_of
+from dm_bringup.suite import load_config
 from launch import LaunchDescription
 
-NODES = (
-    ("dm_driver", "pdm_driver"),
-    ("dm_calibration", "interferometer"),
-    ("dm_calibration", "calibration"),
-    ("dm_controller", "focus_controller"),
-)
+
+def start_nodes(context):
+    """One action a node; the virtual bench and the autofocus only where the file has a section for them."""
+    config = Path(LaunchConfiguration("config").perform(context))
+    return [
+        Node(
+            package=node.package,
+            executable=node.name,
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[str(config)],
+            output="screen",
+        )
+        for node in nodes_of(load_config(config))
+    ]
 
 
 def generate_launch_description():
-    profile = Path(get_package_share_directory("dm_bringup")) / "config" / "fastdds.xml"
+    environment = node_environment(Path(get_package_share_directory("dm_bringup")) / "config")
     return LaunchDescription(
         [
             DeclareLaunchArgument("config", description="parameter file of all nodes, see config/hardware.yaml"),
             DeclareLaunchArgument("namespace", default_value="", description="namespace; one per mirror"),
-            DeclareLaunchArgument("camera", default_value="false", description="true: start the node autofocus too"),
-            SetEnvironmentVariable(
-                "FASTRTPS_DEFAULT_PROFILES_FILE",
-                EnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", default_value=str(profile)),
-            ),
-            # Matrix products here take a millisecond; threads of several nodes would fight over the cores for longer.
-            SetEnvironmentVariable("OPENBLAS_NUM_THREADS", "1"),
             *(
-                Node(
-                    package=package,
-                    executable=executable,
-                    namespace=LaunchConfiguration("namespace"),
-                    parameters=[LaunchConfiguration("config")],
-                    output="screen",
-                )
-                for package, executable in NODES
+                SetEnvironmentVariable(name, EnvironmentVariable(name, default_value=value))
+                for name, value in environment.items()
             ),
-            Node(
-                package="dm_autofocus",
-                executable="autofocus",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[LaunchConfiguration("config")],
-                output="screen",
-                condition=IfCondition(LaunchConfiguration("camera")),
-            ),
+            OpaqueFunction(function=start_nodes),
         ]
     )

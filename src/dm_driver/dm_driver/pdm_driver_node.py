@@ -46,7 +46,7 @@ _REASON_OF_OUTCOME = {
 }
 
 
-class PdmDriver(LifecycleNode):
+class PdmDriverNode(LifecycleNode):
     """The node; see the head of this module."""
 
     def __init__(self) -> None:
@@ -281,7 +281,7 @@ class PdmDriver(LifecycleNode):
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
-    return run_node(PdmDriver, args)
+    return run_node(PdmDriverNode, args)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ _DRIVE, _PORTS, _WATCH, _FILES = DriveConfig(), PortsConfig(), MonitorConfig(), 
 _FRAMED = FramedConfig()
 _PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
 
-TABLE = (
+PARAMETERS = (
     Parameter("seed", int, 1, "Fixes gains, initial figure and noise.", low=0, high=2**31),
     Parameter("mirror.name", str, _FILES.part_name, "Model of the mirror, as map files name it."),
     Parameter("plate.diameter", float, _PLATE.diameter, "Diameter of the faceplate.", "m", 1e-3, 1.0),
@@ -168,7 +168,7 @@ TABLE = (
 
 
 def bench_config(values: Mapping[str, Any]) -> BenchConfig:
-    """The configuration for the values of all parameters of TABLE."""
+    """The configuration for the values of all parameters of PARAMETERS."""
 
     def group(prefix: str) -> dict[str, Any]:
         return {name.partition(".")[2]: value for name, value in values.items() if name.startswith(prefix + ".")}

@@ -29,7 +29,7 @@ from dm_common.ros.parameters import declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
 from dm_simulation.clock import FastClock
-from dm_simulation.parameters import TABLE, bench_config
+from dm_simulation.parameters import PARAMETERS, bench_config
 
 
 class VirtualBenchNode(Node):
@@ -37,7 +37,7 @@ class VirtualBenchNode(Node):
 
     def __init__(self) -> None:
         super().__init__("virtual_bench")
-        values = declare(self, TABLE)
+        values = declare(self, PARAMETERS)
         speed = values["clock.speed"]
         self._fast_clock = FastClock(speed) if speed > 0 else None
         self._stop = threading.Event()

@@ -23,7 +23,7 @@ from dm_simulation.electronics.server import PortsConfig
 from dm_simulation.interferometer import trigger
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_simulation.mirror.piezo import PiezoConfig
-from dm_simulation.parameters import TABLE, bench_config
+from dm_simulation.parameters import PARAMETERS, bench_config
 
 FOLDER = Path(dm_simulation.__file__).parent
 
@@ -190,10 +190,10 @@ def test_ports_are_free_again_after_a_failed_start(make: Make) -> None:
 
 
 def test_parameter_table_builds_the_standard_bench() -> None:
-    config = bench_config({parameter.name: parameter.default for parameter in TABLE})
+    config = bench_config({parameter.name: parameter.default for parameter in PARAMETERS})
     standard = BenchConfig()
     assert replace(config, files=standard.files) == standard
-    for parameter in TABLE:
+    for parameter in PARAMETERS:
         parameter.check(parameter.default)
 
 

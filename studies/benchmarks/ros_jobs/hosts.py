@@ -14,13 +14,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from dm_bringup.nodes import MODULES
 from dm_bringup.suite import save_config, stop_processes
 from dm_tools.demo.demo import bench_config
 from studies.benchmarks.timing import Effort
 from studies.network_namespaces import NotPermittedError, command_on, one_host, received_bytes, two_hosts
 
-DRIVER_SIDE = ("dm_simulation.virtual_bench_node", "dm_driver.pdm_driver_node")
-CONTROLLER = "dm_controller.focus_controller_node"
+DRIVER_SIDE = (MODULES["virtual_bench"], MODULES["pdm_driver"])
+CONTROLLER = MODULES["focus_controller"]
 CLIENT = "studies.benchmarks.ros_jobs.hosts_client"
 NAMESPACE = "hosts"
 LONGEST_S = 200.0

@@ -18,6 +18,7 @@ from dm_msgs.msg import ZernikeCoefficients
 from dm_msgs.srv import IngestFile
 from std_msgs.msg import Header
 
+from dm_bringup.nodes import MODULES
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.interferometer_messages import image_message, zernike_message
 from dm_calibration.map_files import read_map
@@ -80,7 +81,7 @@ class _Interferometer:
         )
         self._ingest = room.node.create_client(IngestFile, "/maps/ingest_file")
         parameters = {"watch_folder": str(self._folder), "aperture.radius": RADIUS}
-        room.start("dm_calibration.interferometer_node", namespace="maps", parameters=parameters)
+        room.start(MODULES["interferometer"], namespace="maps", parameters=parameters)
         room.wait_for("the interferometer", lambda: room.node.count_publishers("/maps/zernike"))
         room.wait_for("its service", self._ingest.service_is_ready)
         room.serve(1.0)

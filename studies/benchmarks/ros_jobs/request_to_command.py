@@ -17,6 +17,7 @@ import numpy as np
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
 from numpy.typing import NDArray
 
+from dm_bringup.nodes import MODULES
 from dm_common.messages import doubles
 from dm_common.ros import qos
 from studies.benchmarks import stand_in_mirror
@@ -193,7 +194,7 @@ def _started(room: Laboratory, executor: str) -> Peer:
 
 
 def _controller(room: Laboratory) -> FocusPeer:
-    room.start("dm_controller.focus_controller_node", namespace="focus")
+    room.start(MODULES["focus_controller"], namespace="focus")
     peer = FocusPeer(room, "focus")
     room.wait_for("the focus controller", peer.connected)
     room.serve(0.5)

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.context import Context
 from rclpy.node import Node
 
+from dm_bringup.nodes import MODULES
 from dm_common.ros import qos
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import answers_arrive
@@ -127,7 +128,7 @@ class DriverRig:
     def start(self) -> None:
         """Start the driver."""
         assert self.process is None
-        self.process = self._start("dm_driver.pdm_driver_node", self._parameters, self.folder / "driver.log")
+        self.process = self._start(MODULES["pdm_driver"], self._parameters, self.folder / "driver.log")
 
     def _start(self, module: str, parameters: Path, log: Path) -> subprocess.Popen[bytes]:
         with log.open("ab") as output:

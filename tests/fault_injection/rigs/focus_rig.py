@@ -30,6 +30,7 @@ from dm_msgs.srv import Flatten, Measure, SetFocus
 from numpy.typing import ArrayLike
 from rclpy.qos import QoSProfile
 
+from dm_bringup.nodes import MODULES
 from dm_common.messages import doubles, recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
@@ -131,7 +132,7 @@ class FocusRig(DriverRig):
         """Start the controller."""
         assert self.controller is None
         self.controller = self._start(
-            "dm_controller.focus_controller_node", self._controller_parameters, self.folder / "controller.log"
+            MODULES["focus_controller"], self._controller_parameters, self.folder / "controller.log"
         )
 
     def kill_controller(self, number: int = signal.SIGKILL) -> None:

@@ -20,6 +20,7 @@ import yaml
 from dm_msgs.msg import Calibration
 from rclpy.serialization import serialize_message
 
+from dm_bringup.nodes import MODULES
 from fault_injection.rigs.driver_rig import end_process
 from fault_injection.rigs.focus_rig import FocusRig
 from fault_injection.rigs.netem import bad_cable
@@ -27,7 +28,7 @@ from studies.network_namespaces import command_on, inside
 
 #: Hosts find each other only where discovery is not kept to the loopback.
 _ENVIRONMENT = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
-_RIGHT_SIDE = "dm_controller.focus_controller_node"
+_RIGHT_SIDE = MODULES["focus_controller"]
 
 
 class NetworkRig(FocusRig):

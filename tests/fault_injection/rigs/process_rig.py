@@ -19,6 +19,7 @@ from dm_msgs.action import Calibrate, MoveFocus
 from dm_msgs.msg import ErrorCode, FocusRequest
 from dm_msgs.srv import IngestFile, ListCalibrations, Measure, SetFocus
 
+from dm_bringup.nodes import MODULES
 from dm_common.ros import qos
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.worker import answers_arrive
@@ -29,11 +30,7 @@ from dm_simulation.interferometer import trigger
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from fault_injection.rigs.driver_rig import DriverRig, RigError, end_process
 
-MODULES = {
-    "interferometer": "dm_calibration.interferometer_node",
-    "calibration": "dm_calibration.calibration_node",
-    "focus_controller": "dm_controller.focus_controller_node",
-}
+NODES = ("interferometer", "calibration", "focus_controller")
 #: Half-swings of the controller's degauss: few, so that a conditioned move takes a second or two.
 DEGAUSS_STEPS = 10
 #: Curvature that every calibrated rig reaches [1/m].
@@ -52,7 +49,7 @@ _CALIBRATING = threading.Lock()
 class ProcessRig(DriverRig):
     """Use as a context manager; all nodes run and work once it is entered."""
 
-    def __init__(self, folder: Path, domain: int, nodes: tuple[str, ...] = tuple(MODULES), **changes: Any) -> None:
+    def __init__(self, folder: Path, domain: int, nodes: tuple[str, ...] = NODES, **changes: Any) -> None:
         super().__init__(folder, domain, **changes)
         self._nodes = nodes
         self.processes: dict[str, subprocess.Popen[bytes]] = {}

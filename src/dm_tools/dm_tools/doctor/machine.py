@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from dm_bringup.suite import NODES
+from dm_bringup.nodes import NAMES
 from dm_tools.doctor.finding import Check, Finding
 
 MODULES = ("rclpy", "dm_msgs.msg", "dm_driver", "dm_calibration", "numpy", "scipy", "statsmodels", "h5py", "serial")
@@ -127,11 +127,10 @@ def running_nodes(namespace: str = "") -> Finding | None:
 
     with DeformableMirrorClient(namespace) as client:
         place = client.node.get_namespace()
-        ours = {name for name, _module in NODES}
 
         def seen() -> Counter[str]:
             found = client.node.get_node_names_and_namespaces()
-            return Counter(name for name, where in found if where == place and name in ours)
+            return Counter(name for name, where in found if where == place and name in NAMES)
 
         client.wait(lambda: max(seen().values(), default=0) > 1, DISCOVERY_S)
         count = seen()

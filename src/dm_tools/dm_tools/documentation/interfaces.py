@@ -105,11 +105,10 @@ def _actions(node: Any) -> list[tuple[str, str]]:
 
 def nodes_and_offers() -> dict[str, list[Offer]]:
     """{node: its offers}; initialises ROS for good, hence for a process of its own."""
-    import importlib
-
     import rclpy
 
-    from dm_bringup.suite import NODES, own_domain, save_config
+    from dm_bringup.nodes import NODES
+    from dm_bringup.suite import own_domain, save_config
     from dm_tools.demo.demo import bench_config
 
     result: dict[str, list[Offer]] = {}
@@ -119,26 +118,15 @@ def nodes_and_offers() -> dict[str, list[Offer]]:
         config["virtual_bench"] |= {"camera.rate": 1.0, "clock.speed": 1.0, "interferometer.pixels": 64}
         save_config(config, folder / "config.yaml")
         rclpy.init(args=["--ros-args", "--params-file", str(folder / "config.yaml")], domain_id=domain)
-        for name, module in NODES:
-            node = getattr(importlib.import_module(module), CLASSES[name])()
-            if name == "interferometer":
+        for entry in NODES:
+            node = entry.load_class()()
+            if entry.name == "interferometer":
                 node.trigger_configure()  # its publishers come with it
-            result[name] = offers_of(node)
+            result[entry.name] = offers_of(node)
             if hasattr(node, "make_safe"):
                 node.make_safe()
         rclpy.try_shutdown()
     return result
-
-
-#: The class of each node of `dm_bringup.suite.NODES`.
-CLASSES = {
-    "virtual_bench": "VirtualBenchNode",
-    "pdm_driver": "PdmDriver",
-    "interferometer": "InterferometerNode",
-    "calibration": "CalibrationNode",
-    "focus_controller": "FocusControllerNode",
-    "autofocus": "AutofocusNode",
-}
 
 
 def node_tables(nodes: dict[str, list[Offer]]) -> Iterator[str]:

@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-from dm_autofocus.autofocus_parameters import PARAMETERS as AUTOFOCUS
-from dm_calibration.calibration_parameters import PARAMETERS as CALIBRATION
-from dm_calibration.interferometer_parameters import PARAMETERS as INTERFEROMETER
+from dm_bringup.nodes import NODES
 from dm_common.ros.parameters import as_markdown
-from dm_controller.focus_parameters import PARAMETERS as FOCUS_CONTROLLER
-from dm_driver.driver_parameters import PARAMETERS as DRIVER
-from dm_simulation.parameters import TABLE as VIRTUAL_BENCH
 
-TABLES = {
-    "pdm_driver": DRIVER,
-    "interferometer": INTERFEROMETER,
-    "calibration": CALIBRATION,
-    "focus_controller": FOCUS_CONTROLLER,
-    "autofocus": AUTOFOCUS,
-    "virtual_bench": VIRTUAL_BENCH,
-}
+#: Table of parameters by the name of the node, the virtual bench last.
+TABLES = {node.name: node.load_parameters() for node in (*NODES[1:], NODES[0])}
 
 
 def parameters_page() -> str:

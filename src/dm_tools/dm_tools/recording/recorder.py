@@ -20,7 +20,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from dm_bringup.suite import NODES
+from dm_bringup.nodes import NAMES
 from dm_tools.recording.bag import BagWriter, Topic
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 
@@ -174,10 +174,9 @@ class Recorder:
 
     def _ask_parameters(self) -> None:
         """Ask nodes of the suite for their parameters, once each; answers arrive later."""
-        known = {node for node, _module in NODES}
         for name, namespace in self._node.get_node_names_and_namespaces():
             path = f"{namespace.rstrip('/')}/{name}"
-            if name not in known or path in self._clients or not path.startswith(self._namespace):
+            if name not in NAMES or path in self._clients or not path.startswith(self._namespace):
                 continue
             client = AsyncParameterClient(self._node, path)
             if not client.services_are_ready():

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from dm_bringup.nodes import NODES
+
 #: Of every node.
 PARAMETER_SERVICES = (
     "~/describe_parameters",
@@ -30,11 +32,12 @@ LOGS = ("/parameter_events", "/rosout")
 CLOCK = "/clock"
 _HEALTH = ("/diagnostics",)
 _TRANSITIONS = ("~/transition_event",)
+_LIFECYCLE = frozenset(node.name for node in NODES if node.lifecycle)
 #: What an operator's program calls.
 _OPERATION = ("degauss", "flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
 _LONG_OPERATION = ("calibrate", "converge", "move_focus")
 #: Enclaves of nodes that go by simulated time on a twin.
-_TIMED = frozenset({"pdm_driver", "interferometer", "calibration", "focus_controller", "autofocus"})
+_TIMED = frozenset(node.name for node in NODES) - {"virtual_bench"}
 
 
 @dataclass(frozen=True)
@@ -64,15 +67,15 @@ _DECLARED = (
     NodeInterface(
         "pdm_driver",
         "pdm_driver",
-        publish=(*_HEALTH, *_TRANSITIONS, "actuator_state", "mirror_info"),
+        publish=(*_HEALTH, "actuator_state", "mirror_info"),
         subscribe=("actuator_command",),
-        reply=(*LIFECYCLE_SERVICES, "degauss", "set_signals"),
+        reply=("degauss", "set_signals"),
     ),
     NodeInterface(
         "interferometer",
         "interferometer",
-        publish=(*_HEALTH, *_TRANSITIONS, "surface_map", "surface_map_info", "surface_samples", "zernike"),
-        reply=(*LIFECYCLE_SERVICES, "ingest_file", "measure"),
+        publish=(*_HEALTH, "surface_map", "surface_map_info", "surface_samples", "zernike"),
+        reply=("ingest_file", "measure"),
     ),
     NodeInterface(
         "calibration",
@@ -139,9 +142,11 @@ def interfaces(twin: bool = False) -> tuple[NodeInterface, ...]:
     return tuple(
         replace(
             node,
-            publish=tuple(sorted({*node.publish, *LOGS})),
+            publish=tuple(sorted({*node.publish, *LOGS, *(_TRANSITIONS if node.name in _LIFECYCLE else ())})),
             subscribe=tuple(sorted({*node.subscribe, *((CLOCK,) if twin and node.enclave in _TIMED else ())})),
-            reply=tuple(sorted({*node.reply, *PARAMETER_SERVICES})),
+            reply=tuple(
+                sorted({*node.reply, *PARAMETER_SERVICES, *(LIFECYCLE_SERVICES if node.name in _LIFECYCLE else ())})
+            ),
             request=tuple(sorted(node.request)),
         )
         for node in nodes

@@ -1,0 +1,79 @@
+"""The nodes of the suite: the one list that launch files, `./dm`, reference pages, security and recordings go by.
+
+Standard library only, for `./dm` takes the environment of the nodes from here before it has one.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class SuiteNode:
+    """One node.
+
+    Attributes:
+        name: of the node and of its executable; its module is `<package>.<name>_node`.
+        package: that holds it.
+        class_name: of the node, in its module.
+        parameter_module: of the package; its `PARAMETERS` is the table of the node's parameters.
+        lifecycle: whether it is a lifecycle node (it configures and activates itself).
+        optional: whether it runs only where a configuration has a section for it.
+    """
+
+    name: str
+    package: str
+    class_name: str
+    parameter_module: str
+    lifecycle: bool = False
+    optional: bool = False
+
+    @property
+    def module(self) -> str:
+        """What `python -m` starts."""
+        return f"{self.package}.{self.name}_node"
+
+    def load_class(self) -> Any:
+        """The class of the node; imports what the node needs."""
+        return getattr(importlib.import_module(self.module), self.class_name)
+
+    def load_parameters(self) -> tuple[Any, ...]:
+        """The table of the node's parameters, each a `dm_common.ros.parameters.Parameter`."""
+        table: tuple[Any, ...] = importlib.import_module(f"{self.package}.{self.parameter_module}").PARAMETERS
+        return table
+
+
+#: In the order of their start. They stop in reverse, so that the bench outlives the driver's last ramp.
+NODES = (
+    SuiteNode("virtual_bench", "dm_simulation", "VirtualBenchNode", "parameters", optional=True),
+    SuiteNode("pdm_driver", "dm_driver", "PdmDriverNode", "driver_parameters", lifecycle=True),
+    SuiteNode("interferometer", "dm_calibration", "InterferometerNode", "interferometer_parameters", lifecycle=True),
+    SuiteNode("calibration", "dm_calibration", "CalibrationNode", "calibration_parameters"),
+    SuiteNode("focus_controller", "dm_controller", "FocusControllerNode", "focus_parameters"),
+    SuiteNode("autofocus", "dm_autofocus", "AutofocusNode", "autofocus_parameters", optional=True),
+)
+NAMES = tuple(node.name for node in NODES)
+#: `python -m` by the name of the node.
+MODULES = {node.name: node.module for node in NODES}
+
+
+def nodes_of(configured: Collection[str]) -> tuple[SuiteNode, ...]:
+    """The nodes that run with a configuration which has sections for `configured`."""
+    return tuple(node for node in NODES if node.name in configured or not node.optional)
+
+
+def node_environment(config_folder: Path) -> dict[str, str]:
+    """Environment variables of every process of the suite, unless the user has set them.
+
+    Args:
+        config_folder: `config` of this package, in the checkout or in its share.
+    """
+    return {
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(config_folder / "fastdds.xml"),
+        # Matrix products here take a millisecond; threads of several nodes would fight over the cores for longer.
+        "OPENBLAS_NUM_THREADS": "1",
+    }
