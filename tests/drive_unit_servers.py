@@ -1,4 +1,4 @@
-"""Small drive units for tests: real sockets and a real pseudo-terminal, with decoders written from the protocol notes.
+"""Small drive units for tests: real sockets and a real pseudo-terminal, with decoders written from docs/protocols.md.
 
 A frame is recorded as a dictionary {connector channel: code}.
 """

@@ -1,7 +1,7 @@
 """A mirror with an exactly known linear response, for tests of the calibration.
 
 Each actuator raises the deflection of an infinite plate on an elastic foundation under a point load, -kei(r/l)
-(Timoshenko & Woinowsky-Krieger, Theory of Plates and Shells, section 57): a broad bump with a shallow ditch around it.
+([7], section 57): a broad bump with a shallow ditch around it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Table 1 of the paper, surface by surface."""
+"""Table 1 in [1], surface by surface."""
 
 from __future__ import annotations
 

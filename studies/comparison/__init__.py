@@ -1,1 +1,1 @@
-"""Experiments on the virtual bench, in process and without ROS: the methods side by side, the paper's tables."""
+"""Experiments on the virtual bench, in process and without ROS: the methods side by side, the tables of [1]."""

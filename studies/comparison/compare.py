@@ -34,11 +34,11 @@ from studies.comparison.simulated_bench import Floats, SimulatedBench, Simulatio
 from studies.solvers.registry import SOLVERS, MirrorFacts, check_method, make_solver
 from studies.solvers.steepest_descent import SteepestDescent
 
-#: Curvatures of the sweep, 1/m: the paper's range (section 3.2).
+#: Curvatures of the sweep, 1/m: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 #: Added to the name of a method where it runs in the closed loop.
 CLOSED = "_closed_loop"
-#: Methods from before the paper: their influence matrix is that of single pokes, without the surfaces of Table 1.
+#: Methods older than [1]: their influence matrix is that of single pokes, without the surfaces of Table 1.
 CLASSICAL = (PseudoInverse.name, SteepestDescent.name)
 
 

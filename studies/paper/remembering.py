@@ -1,11 +1,10 @@
 """Control that knows what the actuators remember: hysteresis and creep followed through the commands.
 
 An influence function knows signals only. Here each actuator follows a position, the sum of its signal and of play
-operators of it (Prandtl-Ishlinskii law, Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.4), with
-the weights that `dm_calibration.regression.sag_history` found on the maps of the calibration; and each change of position
-goes on creeping with the logarithm of time (Jung & Gweon, Creep characteristics of piezoelectric actuators, Review of
-Scientific Instruments 71, 2000). The creep rate is a property of the piezos, as `closed_loop.Creep` takes it: fitted to
-a calibration run, creep would take up what the play operators cannot follow.
+operators of it (Prandtl-Ishlinskii law, [16], section 2.4), with the weights that
+`dm_calibration.regression.sag_history` found on the maps of the calibration; and each change of position goes on
+creeping with the logarithm of time [18]. The creep rate is a property of the piezos, as `closed_loop.Creep` takes it:
+fitted to a calibration run, creep would take up what the play operators cannot follow.
 
 A solver asks for a linear change of signals. The command is then the signals that change the positions as much, from
 the state the actuators are in.

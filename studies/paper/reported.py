@@ -1,6 +1,6 @@
 """What the paper itself reports, as numbers with their place in it.
 
-Source: "Learning Approach for Flexible Spherical/Aspherical Reflective Surface Control". Lengths in nm, as printed.
+Source: [1]. Lengths in nm, as printed.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How far 21 coefficients depend on where a map is sampled: edge-clustered and uniform points against every pixel.
 
-The paper (section 2.2) fits 500 edge-clustered points instead of some 700 000 pixels and cites Kaya et al. for less
+The paper (section 2.2) fits 500 edge-clustered points instead of some 700 000 pixels and cites [5] for less
 ringing at the edge than with uniform points. Three errors tell the ways of sampling apart:
 
 * bias: content beyond the 21 terms leaks into them, since the terms are orthogonal over the disc but not over points;

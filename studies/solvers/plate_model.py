@@ -53,9 +53,9 @@ def _point_load(distance: Floats) -> Floats:
 def plate_influence(at: Floats, actuators: Floats, properties: PlateProperties) -> Floats:
     """Sag of an unbounded thin plate on springs per unit move of each spring's base.
 
-    Each spring presses with F_j = k (d_j - w(x_j)); the plate answers D ∇⁴w = Σ F_j δ(x - x_j), so w is a sum of
-    r² ln r / 8πD and a plane, with forces and moments in balance (a thin-plate spline on elastic supports; Menikoff,
-    Appl. Opt. 30, 1991, has it as the response of a continuous-faceplate mirror). The edge of a real plate is missing.
+    Each spring presses with F_j = k (d_j - w(x_j)); the plate answers D ∇⁴w = Σ F_j δ(x - x_j), so w is a sum of r² ln
+    r / 8πD and a plane, with forces and moments in balance (a thin-plate spline on elastic supports; [8] has it as the
+    response of a continuous-faceplate mirror). The edge of a real plate is missing.
 
     Args:
         at: (P, 2) points, m.
@@ -81,7 +81,7 @@ def plate_influence(at: Floats, actuators: Floats, properties: PlateProperties) 
 
 
 class PlateModel(Solver):
-    """Δs from the analytic solution of a simplified mechanical model (the paper's introduction, reference 22).
+    """Δs from the analytic solution of a simplified mechanical model ([1], introduction, its reference 22).
 
     Needs no influence function, only where the actuators are and one number, the stroke, taken from the calibration as
     the scale that fits best. The figure of the unpowered mirror is unknown to mechanics and stays in an open-loop
@@ -89,7 +89,7 @@ class PlateModel(Solver):
     """
 
     name = "plate_model"
-    source = "analytic plate model, the paper's reference 22"
+    source = "analytic plate model, reference 22 of [1]"
 
     def __init__(
         self,

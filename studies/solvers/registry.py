@@ -33,7 +33,7 @@ _ORDER = (
     "AZWreg",
     "bounded",
 )
-#: Makers by name, in the order of the paper.
+#: Makers by name, in the order of [1].
 SOLVERS = {name: _COMPARED[name] for name in sorted(_COMPARED, key=_ORDER.index)}
 
 

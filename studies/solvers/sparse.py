@@ -17,13 +17,13 @@ ERROR_PRICE = 1e4
 class SparseSampling(Solver):
     """Δs = φθ with θ sparse, s_{N+1} = s_N + φθ_N (Eqs. 4 and 5), by basis pursuit.
 
-    The paper leaves open what φ is. Two readings: the unit matrix (few actuators move) or patterns of all actuators
+    [1] leaves open what φ is. Two readings: the unit matrix (few actuators move) or patterns of all actuators
     (few patterns move). The first moves 18 single actuators, whose print-through ruins the surface; the second is
     taken. The patterns are the right singular vectors of the sag influence function, strongest first, each scaled to
     the same rms sag, so that the sparsest θ is also one of strong, smooth patterns.
 
-    θ minimises ‖θ‖₁ + price ‖Δc - Gφθ‖₁ inside the limits: a linear programme (basis pursuit, Chen, Donoho & Saunders,
-    SIAM J. Sci. Comput. 20, 1998) solved by HiGHS. It is always feasible, and meets Δc exactly where the limits permit.
+    θ minimises ‖θ‖₁ + price ‖Δc - Gφθ‖₁ inside the limits: a linear programme (basis pursuit [13]) solved by HiGHS. It
+    is always feasible, and meets Δc exactly where the limits permit.
     """
 
     name = "sparse_sampling"

@@ -14,7 +14,7 @@ MODEL_ITERATIONS = 200
 
 
 class SteepestDescent(Solver):
-    """s_{k+1} = s_k + g Gᵀ e_k (the paper's introduction, reference 19): the transposed influence matrix, a gain and
+    """s_{k+1} = s_k + g Gᵀ e_k ([1], introduction, its reference 19): the transposed influence matrix, a gain and
     the residual e.
 
     Robust, never far outside the range, and slow ("the iteration time is relatively long"): the gain is limited by the
@@ -23,7 +23,7 @@ class SteepestDescent(Solver):
     """
 
     name = "steepest_descent"
-    source = "steepest descent, the paper's reference 19"
+    source = "steepest descent, reference 19 of [1]"
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         super().__init__(model, limits)

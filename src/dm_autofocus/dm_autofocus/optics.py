@@ -14,8 +14,8 @@ focuses on the vergence -N with N = 1/f - 1/b at itself, and on V = N / (1 - d N
 v / (1 - d v) over the path d).
 
 Conventions: distances of objects in m from the camera's reference point; dioptre = 1 / distance, 0 = infinity, as in
-libcamera (`LensPosition`) and Android (`LENS_FOCUS_DISTANCE`); positive curvature = concave; mirror power = 2 x
-curvature. Source: Born & Wolf, Principles of Optics, 7th ed., sections 4.4 and 4.6 (oblique powers by Coddington).
+libcamera (`LensPosition` [26]) and Android (`LENS_FOCUS_DISTANCE` [27]); positive curvature = concave; mirror power = 2
+x curvature. Source: [2], sections 4.4 and 4.6 (oblique powers by Coddington).
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def rest_dioptre_of_lens(focal_length: float, sensor_distance: float, mirror_dis
 def depth_of_focus(aperture_radius: float, wavelength: float = 550e-9) -> float:
     """Curvature [1/m] off the best focus at which the wavefront is a quarter wave off at the edge: lambda / (4 a^2).
 
-    The wavefront of the curvature error e is e r^2 (twice the sag e r^2 / 2); Rayleigh's criterion (Born & Wolf,
+    The wavefront of the curvature error e is e r^2 (twice the sag e r^2 / 2); Rayleigh's criterion ([2],
     section 9.3) sets it to lambda / 4 at the edge a of the aperture.
 
     Args:

@@ -3,12 +3,11 @@
 It knows nothing of cameras, mirrors or time. Whoever drives it goes to `step.curvature`, takes an image there when
 `step.measured` says so, and calls `feed`.
 
-Coarse to fine (Krotkov 1987; He, Zhou and Hong, Comput. Graph. 27 (2003) 999): a sweep over the whole range finds the
-hill, sweeps over two steps of the one before climb it, a parabola through the best points of the last gives its top.
-Every sweep, and the final move to the top, first goes to the same turning point below: by default the low end of the
-range. Hysteresis forgets what lies between two turning points once it is passed again, so that all of them rise on the
-same branch. Without that the hill that a long sweep saw is not where a short one looks for it. A sweep that sees the
-hill rise beyond its own end is repeated around that end.
+Coarse to fine [23, 25]: a sweep over the whole range finds the hill, sweeps over two steps of the one before climb it,
+a parabola through the best points of the last gives its top. Every sweep, and the final move to the top, first goes to
+the same turning point below: by default the low end of the range. Hysteresis forgets what lies between two turning
+points once it is passed again, so that all of them rise on the same branch. Without that the hill that a long sweep saw
+is not where a short one looks for it. A sweep that sees the hill rise beyond its own end is repeated around that end.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Sharpness of an image: one number that is largest in focus.
 
-`tenengrad` is the mean squared Sobel gradient (Tenenbaum 1970; Krotkov 1987), `laplacian` the mean squared Laplacian
-(both compared by Pertuz, Puig and Garcia, Pattern Recognition 46 (2013) 1415). Both are divided by the squared mean
-grey level, so that exposure, gain and flicker drop out. The Laplacian answers to finer detail and to noise.
+`tenengrad` is the mean squared Sobel gradient [22, 23], `laplacian` the mean squared Laplacian (both compared in [24]).
+Both are divided by the squared mean grey level, so that exposure, gain and flicker drop out. The Laplacian answers to
+finer detail and to noise.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Recipes: what makes a shape from a defined condition (the paper's control-parameter database).
+"""Recipes: what makes a shape from a defined condition (the control-parameter database of [1]).
 
 The condition is a mirror degaussed over the full range about mid range. What a recipe keeps is the *effective* signals
 under which the surface was the wanted one: the command that brings them about follows from the memory law, at any later

@@ -22,8 +22,8 @@ class FocusTarget:
 
     Attributes:
         curvature: of the surface at the vertex [1/m], positive = concave. Optical power = 2 x curvature.
-        conic_constant: 0 = sphere, -1 = paraboloid (Eq. 2 of the paper).
-        zernike: added sag [m], Born & Wolf terms in the paper's order over the working aperture; empty = none.
+        conic_constant: 0 = sphere, -1 = paraboloid (Eq. 2 in [1]).
+        zernike: added sag [m], Born & Wolf terms in the order of [1] over the working aperture; empty = none.
     """
 
     curvature: float

@@ -1,4 +1,4 @@
-"""The decaying cycle that wipes a piezo's hysteresis memory (hardware notes, section 1)."""
+"""The decaying cycle that wipes a piezo's hysteresis (docs/protocols.md, degauss)."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 ``response = figure(t) + e H`` with the effective signal ``e = sum_f w_f x_f`` of features x (play operators, Duhem
 operator, each with its creep), one set of weights w for all actuators and the gains in H. It is bilinear: H and w are
 least-squares solutions in turn. The few numbers that enter otherwise (slope of the Duhem operator, creep rate) are
-found by Gauss-Newton around that (variable projection, Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973).
+found by Gauss-Newton around that (variable projection [14]).
 
 Which features a mirror needs is not known beforehand: candidates from none to all are fitted to parts of the run, and
 the one that predicts the other parts best is taken.

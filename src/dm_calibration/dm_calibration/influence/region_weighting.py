@@ -2,12 +2,12 @@
 
 See :mod:`~dm_calibration.influence.weights` for where weights act; this is its place (a).
 
-Epsilon. The paper calls it a prior parameter. As epsilon goes from 0 to infinity the weights go from w_i ~ 1/r_i (the
-common factor does not matter) to 1, so some candidates around the median of the r_i cover both limits. The one is
-chosen whose influence function predicts maps it has not seen best, in the measure the paper judges by: the rms surface
-error inside the ten concentric regions, each region counting alike. The figure at rest, which no weights can change, is
-part of the prediction. Weights of a fold come from the other folds alone. Where no weights predict better than equal
-ones, the mildest candidate is chosen and the result says so; a prior epsilon can be given instead.
+Epsilon. In [1] it is a prior parameter. As epsilon goes from 0 to infinity the weights go from w_i ~ 1/r_i (the common
+factor does not matter) to 1, so some candidates around the median of the r_i cover both limits. The one is chosen whose
+influence function predicts maps it has not seen best, in the measure by which [1] judges: the rms surface error inside
+the ten concentric regions, each region counting alike. The figure at rest, which no weights can change, is part of the
+prediction. Weights of a fold come from the other folds alone. Where no weights predict better than equal ones, the
+mildest candidate is chosen and the result says so; a prior epsilon can be given instead.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Eq. (6): the influence function as an ordinary least-squares problem, and the registry of methods.
 
-Both methods of the paper regress by Eq. (6). AZreg takes the coefficients fitted to every pixel of a map alike; AZWreg
+Both methods of [1] regress by Eq. (6). AZreg takes the coefficients fitted to every pixel of a map alike; AZWreg
 takes coefficients fitted to the sag with region weights (see :mod:`~dm_calibration.influence.weights` for why the
 weights of Eq. (7) act there and nowhere in the regression).
 """

@@ -1,4 +1,4 @@
-"""The 69 sample surfaces of Table 1 of the paper, by name.
+"""The 69 sample surfaces of Table 1 in [1], by name.
 
 p01-p54 prescribe signals and are exact. p55-p58 (spheres) and pz01-pz11 (Zernike terms) prescribe a shape; their
 signals come from an influence function by bounded least squares, and the shape aimed at travels with the surface.

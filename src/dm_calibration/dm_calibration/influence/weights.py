@@ -1,4 +1,4 @@
-"""Region weights, Eqs. (7) and (8) of the paper: how they follow from errors, why they cancel, and where they act.
+"""Region weights, Eqs. (7) and (8) in [1]: how they follow from errors, why they cancel, and where they act.
 
 Eq. (8) gives each concentric region a weight from the variance r_i, over the sample surfaces, of the rms surface
 control error inside it. Eq. (7) puts these weights, as a diagonal matrix W, on the rows of dC - G dS. With G free that
@@ -65,7 +65,7 @@ def check_epsilon(epsilon: float) -> None:
 
 
 def surface_control_error(sag: Floats, signals: Floats, influence_zernike: Floats, points: SamplePoints) -> Floats:
-    """Measured sag less its nominal surface, piston and tilt removed: the paper's surface control error (section 2.2).
+    """Measured sag less its nominal surface, piston and tilt removed: the surface control error of [1], section 2.2.
 
     The nominal surface is what the 21 terms of G predict for the signals, G s without offset. So the error holds the
     initial figure, the print-through beyond 21 terms and the hysteresis.

@@ -1,4 +1,4 @@
-"""ZYGO `.asc` maps ("Zygo ASCII Data File - Format 2")."""
+"""ZYGO `.asc` maps ("Zygo ASCII Data File - Format 2"; docs/map-files.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ZYGO binary `.dat` maps, as MetroPro and Mx write them (MetroPro reference guide, data format)."""
+"""ZYGO binary `.dat` maps, as MetroPro and Mx write them ([29]; docs/map-files.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ZYGO `.datx` maps (HDF5, written by Mx)."""
+"""ZYGO `.datx` maps (HDF5, written by Mx; docs/map-files.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ZYGO `.xyz` maps: the text header, then one line `column row value` per pixel."""
+"""ZYGO `.xyz` maps: the text header, then one line `column row value` per pixel (docs/map-files.md)."""
 
 from __future__ import annotations
 

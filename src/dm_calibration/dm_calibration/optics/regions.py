@@ -1,4 +1,4 @@
-"""Concentric circular regions of the aperture (the paper's Fig. 4) and the errors inside them (Fig. 5)."""
+"""Concentric circular regions of the aperture (Fig. 4 in [1]) and the errors inside them (Fig. 5)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from dm_calibration.optics.aperture import Aperture
 from dm_common.optics.sample_regions import AREA_FRACTIONS, check_regions, checked_fractions
 
-#: Surfaces that the paper leaves out of the mean of Fig. 5(b): Z_2^0 and Z_2^2.
+#: Surfaces that are left out of the mean of Fig. 5(b) in [1]: Z_2^0 and Z_2^2.
 OUTSIDE_MEAN = ("pz02", "pz03")
 
 

@@ -1,6 +1,6 @@
 """What F, the number of samples and the number of variables say together, to check published tables.
 
-The paper's Table 2 gives adjusted R^2, F and p(F) without n and k. Only n = 50, k = 6 fits its AZreg and n = 49, k = 17
+Table 2 in [1] gives adjusted R^2, F and p(F) without n and k. Only n = 50, k = 6 fits its AZreg and n = 49, k = 17
 its AZWreg.
 """
 

@@ -2,11 +2,10 @@
 
 An influence function fitted to signals errs by what the actuators remember. Here each actuator follows an effective
 signal, u = s + sum_k a_k p_k(s) + sum_j b_j q_j(s): p_k are play operators, which make up a Prandtl-Ishlinskii law
-(Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.4), q_j the signals low-pass filtered with
-different time constants, which make up creep. The weights a_k, b_j >= 0 are shared by all actuators, so some hundred
-maps determine them well; gains are in the influence function. Sag = figure + H u is bilinear, so figure and H, then
-the weights are least-squares solutions in turn. The figure follows the reference frames
-(:mod:`~dm_calibration.influence.drift`).
+([16], section 2.4), q_j the signals low-pass filtered with different time constants, which make up creep. The weights
+a_k, b_j >= 0 are shared by all actuators, so some hundred maps determine them well; gains are in the influence
+function. Sag = figure + H u is bilinear, so figure and H, then the weights are least-squares solutions in turn. The
+figure follows the reference frames (:mod:`~dm_calibration.influence.drift`).
 
 Without memory (no play, no creep) it is the influence function in sag with a constant figure.
 """

@@ -1,9 +1,9 @@
-"""Forward-backward stepwise selection for a linear regression, ordinary or weighted (the paper's section 3.1).
+"""Forward-backward stepwise selection for a linear regression, ordinary or weighted ([1], section 3.1).
 
 Each round enters the candidate with the smallest p value of its partial F test, if that is below `p_enter`, and then
-removes, one by one, those whose p value has risen above `p_remove`. The paper does not name its thresholds. 0.05 and
-0.10 are the defaults of the packages that made the method common (Draper & Smith, Applied Regression Analysis, section
-15.2); removal must be the milder of the two, or a candidate could come and go for ever.
+removes, one by one, those whose p value has risen above `p_remove`. [1] does not name its thresholds. 0.05 and 0.10 are
+the defaults of the packages that made the method common ([15], section 15.2); removal must be the milder of the two, or
+a candidate could come and go for ever.
 
 The statistics of the result are those of statsmodels for the selected model. They take the selection as if it had been
 known beforehand: the best of 58 candidates always looks better than chance, so R^2, F and p are optimistic. What counts

@@ -1,19 +1,19 @@
-"""Predict the surface control error of a surface: the paper's section 3.1 with its Tables 2 and 3.
+"""Predict the surface control error of a surface: section 3.1 of [1] with its Tables 2 and 3.
 
 The surface control error of a map is the map less its nominal surface G s, piston and tilt removed, and the response
 its rms over the whole aperture. Fifty of the surfaces p01-p58 train the regression, eight test it.
 
-What the paper leaves open, and the readings
+What [1] leaves open, and the readings
 
-*Candidates.* The paper gives 37 signals and 21 coefficients. The error is a norm, sqrt(|figure + print-through s + what
-the actuators remember|^2): almost no linear function of either, which is why the paper's own adjusted R^2 is 0.2. All
-of these readings are kept (:class:`Reading`):
+*Candidates.* There are 37 signals and 21 coefficients. The error is a norm, sqrt(|figure + print-through s + what the
+actuators remember|^2): almost no linear function of either, which is why the adjusted R^2 in [1] is 0.2. All of these
+readings are kept (:class:`Reading`):
 
-- LINEAR: the paper to the letter, the signals and the coefficients measured on the surface itself.
+- LINEAR: [1] to the letter, the signals and the coefficients measured on the surface itself.
 - COMMAND: the signals and one candidate more, `model`: the norm of the error that figure and influence function in sag
   predict. It needs no measurement and no history; it serves a controller that is about to move.
 - MEASURED: signals, measured coefficients, and `model` with the part inside the 21 terms from those, c - G s, and the
-  rest as COMMAND. It uses what the paper uses, but the surface must have been measured.
+  rest as COMMAND. It uses what [1] uses, but the surface must have been measured.
 - HISTORY: as COMMAND, but `model` follows the commands before this one too
   (:mod:`~dm_calibration.regression.sag_history`), so it knows what the actuators remember, and the figure drifts with the
   reference frames. Nothing measured on the surface itself enters, but the frames before and after it do. This is the
@@ -24,7 +24,7 @@ every training surface is predicted from a fit without its own fold. (G is: it d
 part of the question, not of the answer.)
 
 *Thresholds.* Of C candidates that mean nothing, the best passes 0.05 more often than not. LINEAR keeps the usual
-thresholds, as the paper seems to. The others divide them by C (Bonferroni): with `model` in, a signal that enters by
+thresholds, as [1] seems to. The others divide them by C (Bonferroni): with `model` in, a signal that enters by
 chance makes a poke of its actuator unpredictable.
 
 *AZWreg.* (a) Another G, from coefficients fitted with region weights; (b) the response a region-weighted norm; (c)
@@ -70,7 +70,7 @@ Floats = NDArray[np.float64]
 
 #: p01 to p58; the Zernike surfaces are not part of the regression.
 SURFACES = tuple(name for name in TABLE_1 if not name.startswith("pz"))
-#: The paper's test set.
+#: Test set of [1].
 TEST_SET = ("p04", "p09", "p16", "p34", "p44", "p47", "p51", "p55")
 #: Folds in which the training surfaces are left out of the fits that `model` comes from.
 FOLDS = 10

@@ -1,8 +1,7 @@
 """A rate-independent memory that fades with travel: a Duhem operator with a learned slope.
 
-``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 (Oh & Bernstein, Semilinear Duhem model
-for rate-independent and rate-dependent hysteresis, IEEE Trans. Automatic Control 50, 2005). Play operators never forget
-what was not wiped out by a larger swing; this one forgets exponentially, as some ceramics do. f is a polynomial whose
+``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 [21]. Play operators never forget what
+was not wiped out by a larger swing; this one forgets exponentially, as some ceramics do. f is a polynomial whose
 coefficients are fitted, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``; the law a mirror really has need not be one of them.
 
 The equation has no u in it, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.

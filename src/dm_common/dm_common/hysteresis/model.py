@@ -4,12 +4,12 @@ Every actuator follows an *effective signal*; sag and coefficients are linear in
 the gains. Signals are normalised, so is the effective signal: it spans 2 over a slow full cycle of -1 .. +1.
 
 * Hysteresis: a sum over play operators p_r of half-width r of polynomials in their values. With first powers it is the
-  Prandtl-Ishlinskii model (Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.4); higher powers make
+  Prandtl-Ishlinskii model ([16], section 2.4); higher powers make
   it a Preisach operator whose density over centre and half-width of the relays is learned: the relays
   of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
 * Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for memory that fades.
 * Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
-  grow by `creep_rate` of a step per decade (Krejci & Kuhnen, IEE Proc. Control Theory Appl. 148, 2001).
+  grow by `creep_rate` of a step per decade [17].
 
 Nothing here depends on how a straight way is cut into steps, so only turning points have to be known.
 """

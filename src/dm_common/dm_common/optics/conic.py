@@ -1,4 +1,4 @@
-"""Conic surfaces, Eq. (2) of the paper, and their Zernike coefficients."""
+"""Conic surfaces, Eq. (2) in [1], and their Zernike coefficients."""
 
 from __future__ import annotations
 

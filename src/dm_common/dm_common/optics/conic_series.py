@@ -2,7 +2,7 @@
 
     z = c r^2 / (1 + sqrt(1 - q)) = c r^2 sum_j C_j / (2 4^j) q^j,   q = (1 + K) (c r)^2,   C_j the Catalan numbers
 
-(generating function of the Catalan numbers, Graham, Knuth & Patashnik, Concrete Mathematics, section 7.5). A mirror of
+(generating function of the Catalan numbers, [6], section 7.5). A mirror of
 11 mm and 0.05 1/m has q = 3e-7, so four terms are exact to rounding.
 """
 

@@ -19,7 +19,7 @@ from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
 
-#: Shares of the aperture's area, 10 % to 100 % (the paper's Fig. 4).
+#: Shares of the aperture's area, 10 % to 100 % (Fig. 4 in [1]).
 AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))
 #: Squared radii that agree to so many decimals are one ring of points.
 _RADIUS_DECIMALS = 9
@@ -81,8 +81,8 @@ def regional_rms(
 ) -> Floats:
     """Root mean square of sag samples inside concentric discs, area-weighted.
 
-    The paper does not say whether a partial aperture is levelled on its own. Both readings are here: about zero, with
-    piston and tilt removed once over the whole aperture by the caller; or about each region's own best plane, as an
+    [1] does not say whether a partial aperture is levelled on its own. Both readings are here: about zero, with piston
+    and tilt removed once over the whole aperture by the caller; or about each region's own best plane, as an
     interferometer with that aperture would show it.
 
     Args:

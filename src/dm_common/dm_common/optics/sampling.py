@@ -1,4 +1,4 @@
-"""Sampling points on the unit disc and the paper's rule for reading a map at them (section 2.2)."""
+"""Sampling points on the unit disc and the rule of [1], section 2.2, for reading a map at them."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ def edge_clustered_points(count: int = 500) -> SamplePoints:
     """Points that crowd towards the rim as Chebyshev nodes do, which suppresses ringing of polynomial fits there.
 
     Rings at r = sin(pi/2 (k - 1/2)/K) lie between circles at sin(pi/2 k/K); each ring has points in proportion to its
-    circumference, and shares out the area between its two circles. Deterministic. After Kaya et al. (the paper's
-    reference 26).
+    circumference, and shares out the area between its two circles. Deterministic. After [5].
 
     Raises:
         ValueError: count below 8.

@@ -1,7 +1,7 @@
 """The 21 Zernike terms to order 5 in the convention of Born & Wolf, and converters to Noll and OSA/ANSI.
 
-Born & Wolf (Principles of Optics, section 9.2.1): peak-normalised, every term is 1 at most on the unit disc. The order
-is the paper's: n rising, m rising, cosine before sine. x points right, y up, the angle counts from x to y. Coefficients
+Born & Wolf ([2], section 9.2.1): peak-normalised, every term is 1 at most on the unit disc. The order
+is that of [1]: n rising, m rising, cosine before sine. x points right, y up, the angle counts from x to y. Coefficients
 have the unit of the sag they describe (m).
 """
 
@@ -39,7 +39,7 @@ class Term(NamedTuple):
 
     @property
     def noll_index(self) -> int:
-        """Noll's index j = 1, 2, 3, ... (J. Opt. Soc. Am. 66, 207, 1976): cosine terms are even, sine terms odd."""
+        """Noll's index j = 1, 2, 3, ... [3]: cosine terms are even, sine terms odd."""
         first = self.n * (self.n + 1) // 2 + self.m  # of the pair; the only one for m = 0
         if self.m == 0:
             return first + 1
@@ -47,7 +47,7 @@ class Term(NamedTuple):
 
     @property
     def ansi_index(self) -> int:
-        """OSA/ANSI index j = 0, 1, 2, ... (ANSI Z80.28): sine terms have negative azimuthal order."""
+        """OSA/ANSI index j = 0, 1, 2, ... [4]: sine terms have negative azimuthal order."""
         azimuthal = -self.m if self.kind == "sin" else self.m
         return (self.n * (self.n + 2) + azimuthal) // 2
 
@@ -123,7 +123,7 @@ _FROM_ANSI = np.array([term.ansi_index for term in TERMS])
 
 
 def born_wolf_to_noll(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """(..., 21) peak-normalised in the paper's order to (..., 21) rms-normalised, Noll index 1 to 21."""
+    """(..., 21) peak-normalised in Born & Wolf's order to (..., 21) rms-normalised, Noll index 1 to 21."""
     return _to_rms_normalised(coefficients, _FROM_NOLL)
 
 
@@ -133,7 +133,7 @@ def noll_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
 
 
 def born_wolf_to_ansi(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """(..., 21) peak-normalised in the paper's order to (..., 21) rms-normalised, OSA/ANSI index 0 to 20."""
+    """(..., 21) peak-normalised in Born & Wolf's order to (..., 21) rms-normalised, OSA/ANSI index 0 to 20."""
     return _to_rms_normalised(coefficients, _FROM_ANSI)
 
 

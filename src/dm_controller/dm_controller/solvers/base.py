@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 #: Terms that an interferometer does not know and focus does not need: they are free in every solve.
 FREE = len(PISTON_TILT)
-#: Share by which an actuator may miss a move: hysteresis of such piezos (the paper's section 1: about 10 %).
+#: Share by which an actuator may miss a move: hysteresis of such piezos ([1], section 1: about 10 %).
 MISS = 0.10
 
 

@@ -4,14 +4,14 @@
     subject to low <= s_i <= high,   |s_i - s_j| <= d for neighbours i, j
 
 M is factored once (M = Q R), so that a solve works on N x N numbers however many rows M has. The unconstrained solution
-is taken when it lies inside all limits. Else block principal pivoting (Portugal, Judice and Vicente 1994) guesses which
-signals stand at an end of their range, solves for the others, and changes all that are on the wrong side at once; a few
-rounds usually end at the optimum, where nothing is on the wrong side. Where they do not, and where differences between
-neighbours can bind, the problem becomes one of least distance, solved by non-negative least squares (Lawson and Hanson
-1974, chapter 23) and checked against the optimality conditions: one signal enters per round, which takes longer the
-more of them saturate. Bounded-variable least squares (BVLS, Stark and Parker 1995) steps in where that check fails,
-which takes condition numbers from 1e4 on; alone it takes many times longer, and at SciPy's default number of iterations
-it stops far from the optimum (measured on a PDM30-37: 13 nm rms instead of 6).
+is taken when it lies inside all limits. Else block principal pivoting [10] guesses which signals stand at an end of
+their range, solves for the others, and changes all that are on the wrong side at once; a few rounds usually end at the
+optimum, where nothing is on the wrong side. Where they do not, and where differences between neighbours can bind, the
+problem becomes one of least distance, solved by non-negative least squares ([9], chapter 23) and checked against the
+optimality conditions: one signal enters per round, which takes longer the more of them saturate. Bounded-variable least
+squares (BVLS [11]) steps in where that check fails, which takes condition numbers from 1e4 on; alone it takes many
+times longer, and at SciPy's default number of iterations it stops far from the optimum (measured on a PDM30-37: 13 nm
+rms instead of 6).
 
 Clipping the unconstrained solution instead can double the residual of a saturated sphere.
 """
@@ -226,7 +226,7 @@ class BoundedProgramme:
         return result if self.limits.allow(result) else signals
 
     def _least_distance(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Lawson and Hanson's problem LDP: the shortest y = R s - d that satisfies all constraints."""
+        """Problem LDP of [9]: the shortest y = R s - d that satisfies all constraints."""
         right = self._constraint_limits - self._constraints @ projected
         system = np.vstack([self._constraints.T, right])
         unit = np.zeros(len(system))

@@ -21,7 +21,7 @@ class Bounded(Solver):
     """
 
     name = "bounded"
-    source = "bounded quadratic programme (Lawson & Hanson 1974, ch. 23)"
+    source = "bounded quadratic programme ([9], chapter 23)"
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         super().__init__(model, limits)

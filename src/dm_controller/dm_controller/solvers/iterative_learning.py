@@ -13,17 +13,16 @@ BETA = 1e-3
 
 
 class IterativeLearning(Solver):
-    """s_{k+1} = s_k + L e_k, L = (GᵀG + β)⁻¹Gᵀ (iterative learning control, the paper's references 12 and 13).
+    """s_{k+1} = s_k + L e_k, L = (GᵀG + β)⁻¹Gᵀ (iterative learning control, references 12 and 13 of [1]).
 
-    The paper names the method, its about three iterations and what β does ("by decreasing β, we increase the
-    convergence speed", section 2.2), but no formula. Norm-optimal learning, min ‖e - GΔs‖² + β‖Δs‖² in each
-    repetition (Amann, Owens & Rogers, IEE Proc. Control Theory Appl. 143, 1996), is the form of it in which a β does
-    just that. Between steepest descent (large β) and the pseudo-inverse (β = 0): weak modes are learned over several
-    maps, so that noise and a wrong G disturb them less.
+    [1] names the method, its about three iterations and what β does ("by decreasing β, we increase the convergence
+    speed", section 2.2), but no formula. Norm-optimal learning, min ‖e - GΔs‖² + β‖Δs‖² in each repetition [12], is the
+    form of it in which a β does just that. Between steepest descent (large β) and the pseudo-inverse (β = 0): weak
+    modes are learned over several maps, so that noise and a wrong G disturb them less.
     """
 
     name = "iterative_learning"
-    source = "iterative learning control, the paper's references 12 and 13"
+    source = "iterative learning control, references 12 and 13 of [1]"
 
     def __init__(self, model: InfluenceModel, limits: Limits, beta: float = BETA) -> None:
         if not (np.isfinite(beta) and beta > 0.0):

@@ -1,4 +1,4 @@
-"""The SVD pseudo-inverse of the influence function, clipped; and AZreg, the same solve on the paper's own fit."""
+"""The SVD pseudo-inverse of the influence function, clipped; and AZreg, the same solve on the fit of [1]."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CUTOFF = 1e-3
 
 
 class PseudoInverse(Solver):
-    """Δs = G⁺ Δc by singular value decomposition (the paper's introduction, reference 18).
+    """Δs = G⁺ Δc by singular value decomposition ([1], introduction, its reference 18).
 
     The shortest of all signals that give the wanted coefficients beyond tilt. Nothing holds it inside the range
     ("severe overflow of the control voltage", section 1), so it is clipped and reports by how much; and nothing holds
@@ -21,7 +21,7 @@ class PseudoInverse(Solver):
     """
 
     name = "pseudo_inverse"
-    source = "SVD pseudo-inverse of the influence matrix, the paper's reference 18"
+    source = "SVD pseudo-inverse of the influence matrix, reference 18 of [1]"
 
     def __init__(self, model: InfluenceModel, limits: Limits) -> None:
         super().__init__(model, limits)
@@ -36,7 +36,7 @@ class PseudoInverse(Solver):
 class AZreg(PseudoInverse):
     """Eq. (6): the least-squares solution Δs of Δc = GΔs with G fitted to all sample surfaces.
 
-    The paper gives no other command solve than this equation, so it differs from the pseudo-inverse only in the
+    [1] gives no other command solve than this equation, so it differs from the pseudo-inverse only in the
     influence function it is given: the regression on all surfaces of Table 1 in place of single pokes. Its way of
     starting from a measured state (section 3.2: c_ini, s_ini of p55 or p56) is `correct(s_ini, c_ini - c)`.
     """

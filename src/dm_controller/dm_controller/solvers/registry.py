@@ -36,7 +36,7 @@ class MirrorFacts:
 
 Factory = Callable[[InfluenceModel, Limits, MirrorFacts], Solver]
 
-#: Makers by name, in the order of the paper.
+#: Makers by name, in the order of [1].
 SOLVERS: dict[str, Factory] = {
     PseudoInverse.name: lambda model, limits, facts: PseudoInverse(model, limits),
     IterativeLearning.name: lambda model, limits, facts: IterativeLearning(model, limits),

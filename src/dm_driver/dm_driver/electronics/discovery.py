@@ -1,4 +1,4 @@
-"""Discovery of EDAC40 units: one UDP question, one answer per unit (hardware notes, section 2)."""
+"""Discovery of EDAC40 units: one UDP question, one answer per unit (docs/protocols.md, discovery)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""EDAC40: 40 channels, 16 bit, over Ethernet (hardware notes, section 2).
+"""EDAC40: 40 channels, 16 bit, over Ethernet (docs/protocols.md, EDAC40).
 
 The unit acknowledges nothing and cannot be read back. Only command 0 (value) is ever sent: offset, gain and global
 offset live in its non-volatile memory and shift every voltage.

@@ -1,4 +1,4 @@
-"""USB DAC-40: 40 channels, 12 bit, behind an FTDI virtual serial port (hardware notes, section 3)."""
+"""USB DAC-40: 40 channels, 12 bit, behind an FTDI virtual serial port (docs/protocols.md, USB DAC-40)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which connector channel drives which actuator (hardware notes, section 2)."""
+"""Which connector channel drives which actuator (docs/protocols.md, wiring)."""
 
 from __future__ import annotations
 

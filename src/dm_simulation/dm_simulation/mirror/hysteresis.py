@@ -55,10 +55,10 @@ class PlayMemory(Memory):
 class PreisachMemory(Memory):
     """Preisach operator: relays switching up at v + r and down at v - r, with a density that is not symmetric in v.
 
-    The relays of half-width r that are up are those with v below the value of a play operator of that half-width
-    (Brokate & Sprekels, Hysteresis and Phase Transitions, 1996, section 2.4), so the density integrated over v up to
-    the play value is the output. That is continuous in u, where a grid of relays would climb in stairs.
-    Density: exp(-r/decay) (1 + skew v - bend v^2), positive over the whole range of the electronics.
+    The relays of half-width r that are up are those with v below the value of a play operator of that half-width ([16],
+    section 2.4), so the density integrated over v up to the play value is the output. That is continuous in u, where a
+    grid of relays would climb in stairs. Density: exp(-r/decay) (1 + skew v - bend v^2), positive over the whole range
+    of the electronics.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PreisachMemory(Memory):
 
 
 class BoucWenMemory(Memory):
-    """Bouc-Wen: dz = du - (beta |du| z + gamma du |z|), the lag -z (Low & Guo, IEEE Trans. Ultrason. 42, 1995, n = 1).
+    """Bouc-Wen: dz = du - (beta |du| z + gamma du |z|), the lag -z ([19] with n = 1).
 
     For n = 1 every monotone move has a closed form, so the result does not depend on how a move is cut into steps. The
     law has no return-point memory: a minor loop does not close exactly.
@@ -118,8 +118,7 @@ class AsymmetricBoucWenMemory(Memory):
     """Bouc-Wen of order 2 that saturates earlier on falling than on rising moves, the lag -z.
 
     Along the way, dz/d|u| = 1 - onward z^2 where z points along the way and 1 + back z^2 where it points against it
-    (the generalised law of Song & Der Kiureghian, J. Engineering Mechanics 132, 2006, with three constants).
-    Monotone moves have a closed form.
+    (the generalised law of [20] with three constants). Monotone moves have a closed form.
     """
 
     def __init__(self, count: int, onward: tuple[float, float] = (2.0, 3.2), back: float = 0.8) -> None:

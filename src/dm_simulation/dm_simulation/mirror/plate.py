@@ -1,7 +1,7 @@
 """The faceplate: a free-edge elastic circular plate on springs whose bases the piezo stacks move.
 
-Kirchhoff plate theory (Timoshenko & Woinowsky-Krieger, Theory of Plates and Shells, sections 10 and 21), solved by the
-Rayleigh-Ritz method: free edges are natural boundary conditions, so Zernike polynomials are admissible as they stand.
+Kirchhoff plate theory ([7], sections 10 and 21), solved by the Rayleigh-Ritz method: free edges are natural boundary
+conditions, so Zernike polynomials are admissible as they stand.
 """
 
 from __future__ import annotations

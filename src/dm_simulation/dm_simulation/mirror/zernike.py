@@ -1,8 +1,8 @@
 """Zernike polynomials, orthonormal over the unit disc (mean square 1), as the basis of the plate model.
 
 Z = N Re or Im[(x + iy)^m] P_k^(0,m)(2 r^2 - 1) with k = (n - m)/2, P the Jacobi polynomials, N = sqrt(n + 1) for m = 0
-and sqrt(2 (n + 1)) otherwise (Born & Wolf, Principles of Optics, 7th ed., section 9.2, with another norm). Jacobi
-polynomials keep their accuracy at order 36, where sums of powers of r lose digits.
+and sqrt(2 (n + 1)) otherwise ([2], section 9.2, with another norm). Jacobi polynomials keep their accuracy at order 36,
+where sums of powers of r lose digits.
 """
 
 from __future__ import annotations

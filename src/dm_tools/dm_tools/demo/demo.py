@@ -15,7 +15,7 @@ from dm_tools.demo.demo_bench import bench_config
 from dm_tools.demo.demo_bench import free_ports as free_ports
 from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
 
-#: Curvatures of the sweep [1/m]: the paper's range (section 3.2).
+#: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 
 

@@ -8,7 +8,7 @@ import typer
 
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
 
-#: The paper's range, section 3.2.
+#: Range of [1], section 3.2.
 DEFAULT = "-0.05:0.05:11"
 
 

@@ -14,7 +14,7 @@ from dm_tools.console.status import why_not
 from dm_tools.console.view_models import recipe_rows
 from dm_tools.console.widgets.components import ActionButton, Line, card
 
-#: The paper's range (section 3.2), 1/m, and the number of its curvatures.
+#: Range of [1], section 3.2, 1/m, and the number of its curvatures.
 FIRST, LAST, NUMBER = -0.05, 0.05, 11
 NUMBER_MAX = 1000
 HEADER = ("1/m", "conic", "largest coefficient, nm", "rms, nm", "maps")
