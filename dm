@@ -40,7 +40,7 @@ The two commands to begin with
 
 On the bench
   up         start the nodes (--config FILE: against hardware; without: with the virtual bench)
-  calibrate  measure and store a calibration (--plan memory: hysteresis and creep too)
+  calibrate  measure and store a calibration (--plan hysteresis: hysteresis and creep too)
   focus      ask for a curvature (or --dioptre): prediction first, then the move
   recipes    build conditioned recipes for a list of curvatures on the interferometer
   check      compare the calibration in use with a map, and let the map improve it
@@ -52,7 +52,7 @@ On the twin, with figures
   compare    all solvers, open and closed loop, beside the fitting limit (--history: hysteresis and creep)
   paper      the paper's tables and figures on one bench, as a page
   bench      how fast everything is, beside what one would use instead
-  torture    faults injected into real processes: harm, loss, time to recover
+  faults     faults injected into real processes: harm, loss, time to recover
 
   doctor     say what is missing or wrong, and how to cure it
   security   least-privilege policies of every node for SROS 2, written or checked

@@ -44,7 +44,7 @@ printf '%s\\n' "${COMPREPLY[@]}"
     [
         ("cal", {"calibrate"}),
         ("re", {"recipes", "report", "record", "replay"}),
-        ("calibrate --mem", {"--memory"}),
+        ("calibrate --hys", {"--hysteresis"}),
         ("demo --hysteresis pr", {"prandtl_ishlinskii", "preisach"}),
     ],
 )

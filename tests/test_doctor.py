@@ -220,7 +220,7 @@ def test_a_node_on_a_machine_with_another_clock(domain: int, monkeypatch: pytest
 
     monkeypatch.setattr("dm_client.client.DeformableMirrorClient.wait", lambda _self, *a: wait_and_publish(*a))
     try:
-        from dm_client.client import DeformableMirrorClient
+        from dm_client import DeformableMirrorClient
 
         with DeformableMirrorClient() as client:
             finding = doctor_machine._skew(client)

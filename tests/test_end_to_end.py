@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool
 
 from dm_bringup.suite import Suite, own_domain, save_config
 from dm_calibration.map_files import read_map
-from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_controller.target import FocusTarget
 from dm_simulation.parameters import PARAMETERS

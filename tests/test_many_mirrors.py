@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dm_bringup.suite import save_config
-from dm_client.client import DeformableMirrorClient
+from dm_client import DeformableMirrorClient
 from dm_tools.demo.demo import bench_config
 from dm_tools.verbs.up import configurations
 

@@ -14,7 +14,7 @@ from dm_msgs.msg import ErrorCode
 from scipy.optimize import lsq_linear
 
 from dm_bringup.suite import Suite, own_domain
-from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.optics.sag import remove_piston_tilt
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis

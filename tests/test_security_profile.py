@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dm_bringup.suite import Suite, own_domain
-from dm_client.client import DeformableMirrorClient
+from dm_client import DeformableMirrorClient
 from dm_tools.cli import app
 from dm_tools.console.console_node import ConsoleNode
 from dm_tools.demo.demo import bench_config

@@ -1,4 +1,4 @@
-"""`dm torture`: faults, damaged files and a long run against real nodes and readers, and what they cost."""
+"""`dm faults`: faults, damaged files and a long run against real nodes and readers, and what they cost."""
 
 from __future__ import annotations
 
@@ -71,15 +71,16 @@ def show_soak(figures: dict[str, Any]) -> None:
     )
 
 
-def torture(
+def faults(
     minutes: Annotated[
         float, typer.Option(min=0.0, help="Go on for so long, shared by faults, files and the long run; 0 = once.")
     ] = 0.0,
-    faults: Annotated[
+    only: Annotated[
         str,
         typer.Option(
+            "--faults",
             help="Only these, separated by commas: single faults or groups (driver, wire, controller, processes, "
-            "calibration, network; fuzz: the readers; soak: a long run)."
+            "calibration, network; fuzz: the readers; soak: a long run).",
         ),
     ] = "",
     seed: Annotated[int, typer.Option(min=0, help="Of the damage and of the moments at which faults come.")] = 1,
@@ -93,7 +94,7 @@ def torture(
     from fault_injection.fuzz.reference_files import FORMATS
     from fault_injection.soak import SoakResult, soak
 
-    names = [name.strip() for name in faults.split(",") if name.strip()]
+    names = [name.strip() for name in only.split(",") if name.strip()]
     single = [name for name in names if name not in OTHERS]
     chosen = select(single) if single or not names else []
     fuzzing, soaking = (not names or name in names for name in OTHERS)
@@ -105,7 +106,7 @@ def torture(
     records: list[Any] = []
     results: dict[str, Any] = {}
     long_run: SoakResult | None = None
-    with tempfile.TemporaryDirectory(prefix="dm-torture-") as name, own_domain() as domain, progress_bar() as bar:
+    with tempfile.TemporaryDirectory(prefix="dm-faults-") as name, own_domain() as domain, progress_bar() as bar:
         folder = Path(name)
         if chosen:
             task = bar.add_task("faults", total=len(chosen))

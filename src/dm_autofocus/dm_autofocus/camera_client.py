@@ -8,7 +8,7 @@ from typing import Any
 from dm_msgs.action import Autofocus
 from dm_msgs.srv import GetFocusRange, SetFocusDistance
 
-from dm_client.client import DeformableMirrorClient
+from dm_client import DeformableMirrorClient
 
 
 class CameraFocusClient(DeformableMirrorClient):

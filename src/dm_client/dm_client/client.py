@@ -1,6 +1,6 @@
 """A plain Python face of the suite, for vision stacks and scripts: no callbacks, no executors.
 
-from dm_client.client import DeformableMirrorClient
+from dm_client import DeformableMirrorClient
 
 with DeformableMirrorClient() as mirror:
     print(mirror.capabilities.message)
@@ -60,7 +60,7 @@ _NUMBERS = itertools.count(1)
 STARTING_S = 60.0
 
 
-class DeformableMirrorError(Exception):
+class DeformableMirrorError(RuntimeError):
     """The suite refused or could not carry out a request.
 
     Attributes:

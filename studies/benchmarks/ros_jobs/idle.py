@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from dm_bringup.suite import Suite, own_domain
-from dm_client.client import STARTING_S, DeformableMirrorClient
+from dm_client import STARTING_S, DeformableMirrorClient
 from dm_tools.demo.demo import bench_config
 from studies.benchmarks.timing import Effort
 

@@ -1,4 +1,4 @@
-"""Faults that are injected again and again, and what they cost: the registry of `./dm torture`."""
+"""Faults that are injected again and again, and what they cost: the registry of `./dm faults`."""
 
 from __future__ import annotations
 

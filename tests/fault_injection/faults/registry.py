@@ -1,4 +1,4 @@
-"""All faults of `./dm torture`, by group."""
+"""All faults of `./dm faults`, by group."""
 
 from __future__ import annotations
 

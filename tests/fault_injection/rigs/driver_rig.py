@@ -71,7 +71,7 @@ class DriverRig:
         self.port = int(endpoints.get("udp_port" if self._udp else "tcp_port", 1))
         self._parameters = folder / "driver.yaml"
         values = {
-            "mirror.serial": "torture",
+            "mirror.serial": "faults",
             "state_folder": str(folder / "state"),
             "electronics.kind": kind,
             "electronics.address": "127.0.0.1",
@@ -105,7 +105,7 @@ class DriverRig:
     def __enter__(self) -> Self:
         self._context = Context()
         rclpy.init(context=self._context, domain_id=self._domain)
-        self.node = Node("torture", context=self._context, enable_rosout=False, start_parameter_services=False)
+        self.node = Node("fault_injection", context=self._context, enable_rosout=False, start_parameter_services=False)
         self.node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
         self.publisher = self.node.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
         self._clients = {

@@ -44,7 +44,7 @@ from fault_injection.rigs.driver_rig import DriverRig, RigError, end_process
 from studies.benchmarks import stand_in_mirror
 
 LAW = "Prandtl-Ishlinskii"
-SERIAL = "torture"
+SERIAL = "faults"
 #: Curvatures asked for lie within ± this, 1/m; two in a row differ by at least the other.
 REACH, LEAST_CHANGE = 0.02, 0.004
 #: A held shape is corrected for creep: signals that differ less are the same shape.

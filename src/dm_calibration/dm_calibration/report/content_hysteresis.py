@@ -21,7 +21,7 @@ def hysteresis(calibration: Calibration) -> Section:
             title,
             [
                 "Not identified: the maps of this plan do not show the memory apart from the influence function. "
-                "A calibration with the plan “memory” does (./dm calibrate --plan memory)."
+                "A calibration with the plan “memory” does (./dm calibrate --plan hysteresis)."
             ],
         )
     law, wavelength = hysteresis.law, calibration.wavelength

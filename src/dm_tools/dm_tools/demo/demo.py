@@ -37,7 +37,7 @@ def sample_map() -> Path | None:
 def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
     """Read a real map through an interferometer node of its own; returns the figures for JSON."""
     from dm_bringup.suite import Suite
-    from dm_client.client import STARTING_S, DeformableMirrorClient
+    from dm_client import STARTING_S, DeformableMirrorClient
 
     nodes = ("interferometer",)
     with (
@@ -137,7 +137,9 @@ def remember(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str,
 
     from dm_tools.verbs.calibrate import run_calibration, show_result
 
-    goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=maps, activate=True, note="demo, memory")
+    goal = Calibrate.Goal(
+        plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=maps, activate=True, note="demo, hysteresis"
+    )
     result = run_calibration(client, goal)
     show_result(result)
     if not client.wait(lambda: client.capabilities.calibration_id == result.id):
@@ -192,7 +194,7 @@ def demo(
     from dm_msgs.action import Calibrate
 
     from dm_bringup.suite import Suite, own_domain
-    from dm_client.client import STARTING_S, DeformableMirrorClient
+    from dm_client import STARTING_S, DeformableMirrorClient
     from dm_tools.demo.figures import save_sweep_figure
     from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
 
@@ -237,7 +239,7 @@ def demo(
                     without_hysteresis = rows
                     remembering, rows = remember(client, hysteresis_maps, settle)
                     figures["hysteresis"] = figures_of(remembering)
-                    figures["focus_without_memory"] = rows_for_json(without_hysteresis)
+                    figures["focus_without_hysteresis"] = rows_for_json(without_hysteresis)
             except Exception:
                 suite.check()  # a node that died explains more than the request that failed
                 raise

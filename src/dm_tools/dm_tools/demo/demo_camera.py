@@ -184,7 +184,7 @@ def demo_camera(
 
     from dm_autofocus.camera_client import CameraFocusClient
     from dm_bringup.suite import Suite, own_domain
-    from dm_client.client import STARTING_S, DeformableMirrorClient
+    from dm_client import STARTING_S, DeformableMirrorClient
     from dm_tools.demo.demo import bench_config
     from dm_tools.demo.pictures import save_animation, save_contact_sheet
     from dm_tools.verbs.calibrate import figures_of as calibration_figures

@@ -58,7 +58,7 @@ def save_sweep_figure(
     """Command, measured map and residual of a sweep, and the residuals against curvature.
 
     Args:
-        without_memory: the same sweep by an influence function alone, for comparison.
+        without_hysteresis: the same sweep by an influence function alone, for comparison.
     """
     positions = _positions(mirror, len(rows[0]["signals"]))
     curvatures = np.array([row["curvature"] for row in rows])

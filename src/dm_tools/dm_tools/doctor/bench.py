@@ -145,8 +145,8 @@ def tcp(address: str, port: int) -> Finding | None:
     except OSError as error:
         return Finding(
             f"no EDAC40 answers at {address}:{port}: {error}",
-            "check power, cable and address (./dm exec python -m dm_driver.electronics.discover); it takes one client at a time:"
-            " close the vendor's program, or stop the nodes that hold it",
+            "check power, cable and address (./dm exec python -m dm_driver.electronics.discover); it takes one client "
+            "at a time: close the vendor's program, or stop the nodes that hold it",
         )
     return None
 

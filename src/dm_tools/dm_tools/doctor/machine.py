@@ -97,7 +97,7 @@ def domain() -> Finding | None:
 
 
 def messages() -> Finding | None:
-    from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+    from dm_client import DeformableMirrorClient, DeformableMirrorError
 
     with DeformableMirrorClient() as first, DeformableMirrorClient() as second:
         from std_msgs.msg import String
@@ -123,7 +123,7 @@ def messages() -> Finding | None:
 
 def running_nodes(namespace: str = "") -> Finding | None:
     """Nodes of the suite in this domain: twice is wrong, once is worth knowing; and how their clock differs."""
-    from dm_client.client import DeformableMirrorClient
+    from dm_client import DeformableMirrorClient
 
     with DeformableMirrorClient(namespace) as client:
         place = client.node.get_namespace()

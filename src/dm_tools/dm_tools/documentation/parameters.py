@@ -14,8 +14,8 @@ def parameters_page() -> str:
     parts = [
         "# Parameters",
         "",
-        "Written from the code by `./dm exec python -m dm_tools.documentation.parameters`; a test keeps it true. Numbers of type",
-        "double need a point in YAML (`300.0`, not `300`): ROS 2 does not convert integers.",
+        "Written from the code by `./dm exec python -m dm_tools.documentation.parameters`; a test keeps it true.",
+        "Numbers of type double need a point in YAML (`300.0`, not `300`): ROS 2 does not convert integers.",
         "",
     ]
     for node, table in TABLES.items():

@@ -50,7 +50,7 @@ def start_fresh(client: Any) -> None:
     from rclpy.parameter import Parameter
     from rclpy.parameter_client import AsyncParameterClient
 
-    from dm_client.client import DeformableMirrorError
+    from dm_client import DeformableMirrorError
     from dm_common.ros.worker import answers_arrive
 
     parameters = AsyncParameterClient(client.node, "calibration")
@@ -71,7 +71,8 @@ def show_result(result: Any) -> None:
         )
     if result.hysteresis_model:
         console.print(
-            f"hysteresis: {result.hysteresis_model}, moves right to {nanometres(result.hysteresis_held_out_max_zernike):.2f} nm "
+            f"hysteresis: {result.hysteresis_model}, moves right to "
+            f"{nanometres(result.hysteresis_held_out_max_zernike):.2f} nm "
             f"(largest coefficient, 95 %, on moves held out){_foretold(result)}"
         )
     for entry in result.dropped:
@@ -116,10 +117,7 @@ def calibrate(
     hysteresis: Annotated[
         int | None,
         typer.Option(
-            "--memory",
-            min=60,
-            max=2000,
-            help="Identify hysteresis and creep from so many maps: short for --plan memory.",
+            min=60, max=2000, help="Identify hysteresis and creep from so many maps: short for --plan hysteresis."
         ),
     ] = None,
     dry_run: Annotated[
@@ -140,7 +138,7 @@ def calibrate(
     """
     from dm_msgs.action import Calibrate
 
-    from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+    from dm_client import DeformableMirrorClient, DeformableMirrorError
 
     if hysteresis is not None:
         plan = CalibrationPlan.hysteresis

@@ -24,7 +24,7 @@ def focus(
 
     Negative numbers need two dashes before them: dm focus -- -0.02
     """
-    from dm_client.client import DeformableMirrorClient, DeformableMirrorError
+    from dm_client import DeformableMirrorClient, DeformableMirrorError
 
     wanted = curvature / 2.0 if dioptre else curvature
     with DeformableMirrorClient(namespace) as client:

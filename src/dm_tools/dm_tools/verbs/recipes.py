@@ -85,7 +85,7 @@ def recipes(
     Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps the recipes that are whole and leaves the mirror
     at mid range.
     """
-    from dm_client.client import DeformableMirrorClient
+    from dm_client import DeformableMirrorClient
 
     wanted = curvatures_of(curvatures or DEFAULT)
     with DeformableMirrorClient(namespace) as client:

@@ -14,7 +14,7 @@ import typer
 from dm_tools.output import JsonOption, console, write_json
 
 
-def check(
+def test(
     context: typer.Context,
     lint: Annotated[bool, typer.Option(help="Run ruff and mypy too.")] = True,
     json: JsonOption = None,

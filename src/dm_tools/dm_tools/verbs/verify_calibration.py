@@ -19,7 +19,7 @@ def check(
 
     Needs the running suite (`dm up`) with an interferometer. Nothing moves. Exit status 1 when the map disagrees.
     """
-    from dm_client.client import DeformableMirrorClient
+    from dm_client import DeformableMirrorClient
 
     if dry_run and forget:
         raise typer.BadParameter("--dry-run and --forget: only one of them")

@@ -9,7 +9,7 @@ from random import Random
 
 import pytest
 
-from fault_injection.faults import fault as torture_faults
+from fault_injection.faults import fault as faults
 from fault_injection.faults.fault import Fault, FaultRecord, run_faults
 from fault_injection.faults.registry import select
 from fault_injection.rigs.netem import Netem, bad_cable
@@ -82,7 +82,7 @@ def test_a_bad_network_harms_and_loses_nothing(name: str, tmp_path: Path, domain
 
 def test_what_is_not_permitted_is_left_out_with_the_reason(tmp_path: Path) -> None:
     def run(folder: Path, domain: int, random: Random, record: FaultRecord) -> None:
-        raise torture_faults.NotPermittedError("no namespaces here")
+        raise faults.NotPermittedError("no namespaces here")
 
     (record,) = run_faults([Fault("net", "", run)], tmp_path, 0)
     assert record.harmless

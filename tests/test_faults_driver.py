@@ -12,7 +12,7 @@ from fault_injection.faults.driver_faults import REGISTRY, select
 from fault_injection.faults.fault import Fault, FaultRecord, run_faults
 from fault_injection.rigs.driver_rig import DriverRig
 
-#: Those that nothing else in the tests shows; `./dm torture` runs all.
+#: Those that nothing else in the tests shows; `./dm faults` runs all.
 FAULTS = (
     "driver_killed_in_move",
     "driver_interrupted_in_move",

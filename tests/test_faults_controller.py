@@ -11,7 +11,7 @@ from fault_injection.faults.fault import FaultRecord, run_faults
 from fault_injection.faults.registry import GROUPS, OTHERS, select
 from fault_injection.rigs.focus_rig import FocusRig
 
-#: Those that nothing else in the tests shows; `./dm torture` runs all.
+#: Those that nothing else in the tests shows; `./dm faults` runs all.
 FAULTS = (
     "foreign_calibration",
     "calibration_vanishes",

@@ -1,4 +1,4 @@
-"""Signals to the nodes above the driver, and faults of the network between driver and unit; `./dm torture` runs all."""
+"""Signals to the nodes above the driver, and faults of the network between driver and unit; `./dm faults` runs all."""
 
 from __future__ import annotations
 
