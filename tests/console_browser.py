@@ -39,7 +39,7 @@ def served(domain: int, folder: Path) -> Iterator[str]:
     address = f"http://127.0.0.1:{port}/"
     with (folder / "console.log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "dm_tools.cli", "console", "--port", str(port)],
+            [sys.executable, "-m", "dm_tools", "console", "--port", str(port)],
             stdout=log,
             stderr=subprocess.STDOUT,
             env=outside_pytest() | {"ROS_DOMAIN_ID": str(domain)},

@@ -159,7 +159,7 @@ def test_maps_that_the_interferometer_publishes_are_taken_once(suite: Suite) -> 
 def test_the_command_checks_and_tells_by_its_exit_status(suite: Suite, tmp_path: Path) -> None:
     suite.shape()
     figures = tmp_path / "figures.json"
-    command = [sys.executable, "-m", "dm_tools.cli", "check", "--json", str(figures)]
+    command = [sys.executable, "-m", "dm_tools", "check", "--json", str(figures)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
     assert json.loads(figures.read_text())["check"]["revision"] == 1

@@ -206,7 +206,7 @@ def test_another_host_name_is_refused(domain: int, tmp_path: Path) -> None:
 def test_a_port_in_use_is_named(domain: int) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        command = [sys.executable, "-m", "dm_tools.cli", "console", "--port", str(port)]
+        command = [sys.executable, "-m", "dm_tools", "console", "--port", str(port)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert f"--port {port}" in done.stderr

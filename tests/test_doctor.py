@@ -236,7 +236,7 @@ def test_the_command_tells_everything_and_fails_for_what_is_wrong(tmp_path: Path
     file, figures = tmp_path / "my_bench.yaml", tmp_path / "doctor.json"
     file.write_text(yaml.safe_dump({f"/**/{node}": {"ros__parameters": values} for node, values in config.items()}))
     done = subprocess.run(
-        [sys.executable, "-m", "dm_tools.cli", "doctor", "--config", str(file), "--json", str(figures)],
+        [sys.executable, "-m", "dm_tools", "doctor", "--config", str(file), "--json", str(figures)],
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         capture_output=True,
         text=True,

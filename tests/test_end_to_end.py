@@ -217,7 +217,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
     ):
         log = (tmp_path / "up.log").open("w+")
         process = subprocess.Popen(
-            [sys.executable, "-m", "dm_tools.cli", "up", "--config", str(tmp_path / "my_bench.yaml")],
+            [sys.executable, "-m", "dm_tools", "up", "--config", str(tmp_path / "my_bench.yaml")],
             env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
             stdout=log,
             stderr=subprocess.STDOUT,
@@ -250,7 +250,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
 def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
     """The demo as a user runs it, with a folder and figures of the test's."""
     figures = tmp_path / "demo.json"
-    command = [sys.executable, "-m", "dm_tools.cli", "demo", "--hysteresis", "off", "--seed", "2012"]
+    command = [sys.executable, "-m", "dm_tools", "demo", "--hysteresis", "off", "--seed", "2012"]
     done = subprocess.run(
         [*command, "--out", str(tmp_path / "run"), "--json", str(figures)], capture_output=True, text=True, timeout=400
     )

@@ -50,7 +50,7 @@ def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:
         save_config(bench_config(tmp_path / name, "preisach", 0.01, 1, 0.0), tmp_path / f"{name}.yaml")
         arguments += ["--config", str(tmp_path / f"{name}.yaml"), "--namespace", name]
     process = subprocess.Popen(
-        [sys.executable, "-m", "dm_tools.cli", "up", *arguments, "--logs", str(tmp_path / "logs")],
+        [sys.executable, "-m", "dm_tools", "up", *arguments, "--logs", str(tmp_path / "logs")],
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stdout=subprocess.DEVNULL,
     )

@@ -147,7 +147,7 @@ def test_a_difference_of_one_bit_is_found(run_and_bag: tuple[RecordedRun, Any, B
 
 def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path) -> None:
     bag, figures = run_and_bag[2], tmp_path / "figures.json"
-    command = [sys.executable, "-m", "dm_tools.cli", "replay", str(bag.file.parent), "--recalibrate"]
+    command = [sys.executable, "-m", "dm_tools", "replay", str(bag.file.parent), "--recalibrate"]
     done = subprocess.run(
         [*command, "--store", str(tmp_path / "store"), "--json", str(figures)], capture_output=True, text=True
     )

@@ -1,4 +1,4 @@
-"""python -m dm_tools.cli."""
+"""python -m dm_tools."""
 
 from dm_tools.cli import main
 
