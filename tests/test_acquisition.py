@@ -67,7 +67,7 @@ def test_command_that_is_told_its_output(tmp_path: Path, bench: Any) -> None:
     one = bench(tmp_path, python(code, str(tmp_path / "source"), "{path}"))
     before = time.time_ns()
     acquired = one.acquisition.acquire(20)
-    assert Path(acquired.measurement.source.file).parent == tmp_path
+    assert Path(acquired.surface.file).parent == tmp_path
     assert before <= acquired.began_ns < acquired.ended_ns <= time.time_ns()
     (tmp_path / "marker.dat").write_bytes(MAP)
     wait_until(lambda: one.files, what="the marker, which stands still later than the triggered file")
@@ -82,7 +82,7 @@ def test_output_that_grows_after_the_command_has_ended(tmp_path: Path, bench: An
     )
     code = f"import subprocess, sys; subprocess.Popen([sys.executable, '-S', '-c', {child!r}, *sys.argv[1:]])"
     one = bench(tmp_path, python(code, str(tmp_path / "source"), "{path}"))
-    assert one.acquisition.acquire(20).measurement.sag.shape == (40, 40)
+    assert one.acquisition.acquire(20).surface.sag.shape == (40, 40)
 
 
 def test_no_shell_ever_sees_the_arguments(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_command_whose_file_is_found_in_the_folder(tmp_path: Path, bench: Any) -
     code = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
     one = bench(tmp_path, python(code, str(tmp_path / "source"), str(tmp_path / "from_instrument.dat")))
     acquired = one.acquisition.acquire(20)
-    assert acquired.measurement.source.file == str(tmp_path / "from_instrument.dat")
+    assert acquired.surface.file == str(tmp_path / "from_instrument.dat")
     assert acquired.began_ns is not None
     assert one.files == []
 
@@ -151,7 +151,7 @@ def test_without_a_command_the_next_new_file_is_the_measurement(tmp_path: Path, 
     time.sleep(0.05)
     (tmp_path / "by_hand.dat").write_bytes(MAP)
     thread.join(20)
-    assert results[0].measurement.source.file == str(tmp_path / "by_hand.dat")
+    assert results[0].surface.file == str(tmp_path / "by_hand.dat")
     assert results[0].began_ns is None
     (tmp_path / "next.dat").write_bytes(MAP)
     wait_until(lambda: one.files, what="the next file")

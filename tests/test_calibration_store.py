@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from dm_calibration.calibration import Calibration, CalibrationFileError, to_columns
 from dm_calibration.calibrator import Provenance, evaluate, mismatch, refit
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.influence.maps import MapRecord
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Outcome
 from dm_calibration.store.calibration_store import CalibrationStore, StoreError, UnknownCalibrationError, check_id
 from dm_calibration.store.hdf5_image import content_hash, read_image, write_image
+from dm_common.measurement import Measurement
 from dm_common.names import UnknownNameError
 from linear_mirror import LinearMirror, make_mirror
 
@@ -36,20 +36,21 @@ def make_calibration(identifier: str = "PDM_1", created_ns: int = 10**18) -> Cal
         assert step.signals is not None
         sag = plant.sag(step.signals)
         outcome.records.append(
-            MapRecord(
-                step.label,
-                step.kind.value,
-                number,
-                step.signals,
-                step.signals,
-                number * 10**9,
-                plant.fit_terms(sag),
-                np.full(21, 1e-10),
-                sag,
-                1e-9,
-                0.99,
-                f"/maps/{number}.dat",
-                "ab" * 32,
+            Measurement(
+                points=plant.points,
+                sag=sag,
+                coefficients=plant.fit_terms(sag),
+                sigma=np.full(21, 1e-10),
+                stamp_ns=number * 10**9,
+                residual_rms=1e-9,
+                valid_fraction=0.99,
+                file=f"/maps/{number}.dat",
+                sha256="ab" * 32,
+                label=step.label,
+                kind=step.kind.value,
+                step=number,
+                signals=step.signals,
+                applied=step.signals,
             )
         )
     calibration, check = evaluate(outcome, MIRROR, FitOptions(), Provenance(identifier, created_ns, "bench 3, cold"))

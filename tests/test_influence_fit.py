@@ -10,9 +10,10 @@ import pytest
 from dm_calibration.influence import quality
 from dm_calibration.influence.drift import drift_columns
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
-from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import METHODS, TooFewMapsError, make_design
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.names import UnknownNameError
 from dm_common.optics.sag import remove_piston_tilt, rms, weighted_fit
@@ -36,7 +37,8 @@ def measure(
             continue
         sag = plant.sag(step.signals, drift_per_step * number)
         records.append(
-            MapRecord(
+            Measurement(
+                points=plant.points,
                 label=step.label,
                 kind=step.kind.value,
                 step=number,
@@ -50,7 +52,7 @@ def measure(
                 valid_fraction=1.0,
             )
         )
-    return MapSet.from_records(records, plant.points)
+    return MapSet.of(records)
 
 
 def _azimuthal_orders(n: int) -> list[int]:

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from std_msgs.msg import Header
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings, MapRejectedError
+from dm_calibration.acquisition.interferometer_messages import zernike_message
 from dm_calibration.map_files import NoValidPixelsError
 from dm_calibration.optics.aperture import InsufficientDataError
 from dm_calibration.optics.orientation import Orientation
@@ -32,22 +34,25 @@ def surface(tmp_path: Path) -> Path:
 
 
 def test_found_aperture_and_coefficients(surface: Path) -> None:
-    found = Ingest().read(surface, IngestSettings())
+    _, found = Ingest().read(surface, IngestSettings())
     assert found.pitch == PITCH
-    assert found.aperture.radius_px == pytest.approx(55, abs=0.2)
-    assert found.aperture_radius == pytest.approx(0.011, rel=0.004)
-    assert found.aperture_centre == pytest.approx(((62 - 59.5) * PITCH, (59.5 - 57) * PITCH), abs=0.2 * PITCH)
-    np.testing.assert_allclose(found.fit.coefficients, COEFFICIENTS, atol=5e-9)
-    assert found.samples.shape == (500,)
+    assert found.radius_px == pytest.approx(55, abs=0.2)
+    assert found.radius == pytest.approx(0.011, rel=0.004)
+    assert found.centre == pytest.approx((62, 57), abs=0.2)
+    message = zernike_message(found, Header())
+    middle = (message.centre_x, message.centre_y)
+    assert middle == pytest.approx(((62 - 59.5) * PITCH, (59.5 - 57) * PITCH), abs=0.2 * PITCH)
+    np.testing.assert_allclose(found.coefficients, COEFFICIENTS, atol=5e-9)
+    assert found.sag.shape == (500,)
 
 
 def test_configured_aperture_gives_the_coefficients_exactly(surface: Path) -> None:
     settings = IngestSettings(aperture_radius=55 * PITCH, aperture_centre=(2.5 * PITCH, 2.5 * PITCH))
-    found = Ingest().read(surface, settings)
-    np.testing.assert_allclose(found.fit.coefficients, COEFFICIENTS, atol=1e-15)
-    assert found.fit.valid_fraction == 1
+    _, found = Ingest().read(surface, settings)
+    np.testing.assert_allclose(found.coefficients, COEFFICIENTS, atol=1e-15)
+    assert found.valid_fraction == 1
     expected = basis(found.points.x, found.points.y) @ COEFFICIENTS
-    np.testing.assert_allclose(found.samples, expected, atol=4e-8)  # half a pixel of slope at the rim
+    np.testing.assert_allclose(found.sag, expected, atol=4e-8)  # half a pixel of slope at the rim
 
 
 def test_orientation_turns_the_coefficients(surface: Path) -> None:
@@ -55,7 +60,7 @@ def test_orientation_turns_the_coefficients(surface: Path) -> None:
         settings = IngestSettings(
             orientation=orientation, aperture_radius=55 * PITCH, aperture_centre=(x * PITCH, y * PITCH)
         )
-        return Ingest().read(surface, settings).fit.coefficients
+        return Ingest().read(surface, settings)[1].coefficients
 
     mirrored = COEFFICIENTS.copy()
     mirrored[[1, 5]] *= -1  # x, 2xy ; the cosine of three times the angle turns over as well
@@ -73,14 +78,14 @@ def test_orientation_turns_the_coefficients(surface: Path) -> None:
 
 def test_piston_and_tilt_go_from_the_map_only(surface: Path) -> None:
     settings = IngestSettings(aperture_radius=55 * PITCH, aperture_centre=(2.5 * PITCH, 2.5 * PITCH))
-    kept = Ingest().read(surface, settings)
-    removed = Ingest().read(surface, dataclasses.replace(settings, remove_piston_tilt=True))
-    assert removed.piston_tilt_removed
-    np.testing.assert_array_equal(removed.fit.coefficients, kept.fit.coefficients)
-    np.testing.assert_array_equal(removed.samples, kept.samples)
+    surface_kept, kept = Ingest().read(surface, settings)
+    surface_removed, removed = Ingest().read(surface, dataclasses.replace(settings, remove_piston_tilt=True))
+    assert surface_removed.piston_tilt_removed
+    np.testing.assert_array_equal(removed.coefficients, kept.coefficients)
+    np.testing.assert_array_equal(removed.sag, kept.sag)
     bowl = COEFFICIENTS[[3, 5, 9]] * np.sqrt([1 / 3, 1 / 6, 1 / 8])
-    assert removed.rms == pytest.approx(np.sqrt((bowl**2).sum()), rel=0.01)
-    assert kept.rms == pytest.approx(np.sqrt((bowl**2).sum() + (1e-7**2 + 3e-7**2) / 4), rel=0.01)
+    assert surface_removed.rms == pytest.approx(np.sqrt((bowl**2).sum()), rel=0.01)
+    assert surface_kept.rms == pytest.approx(np.sqrt((bowl**2).sum() + (1e-7**2 + 3e-7**2) / 4), rel=0.01)
 
 
 def test_refusals_name_what_is_wrong(tmp_path: Path) -> None:
@@ -89,11 +94,11 @@ def test_refusals_name_what_is_wrong(tmp_path: Path) -> None:
     ingest = Ingest()
     with pytest.raises(MapRejectedError, match=r"wavelength = 632\.800 nm: must be 1064\.000 nm within 1 nm"):
         ingest.read(path, IngestSettings(wavelength=1064e-9))
-    assert ingest.read(path, IngestSettings(wavelength=WAVELENGTH)).pitch is None
+    assert ingest.read(path, IngestSettings(wavelength=WAVELENGTH))[0].pitch is None
     with pytest.raises(MapRejectedError, match=r"aperture.radius = 0.011 m, but the file does not tell"):
         ingest.read(path, IngestSettings(aperture_radius=0.011))
-    found = ingest.read(path, IngestSettings(aperture_radius=0.011, pitch=0.022 / 60))
-    assert found.aperture.radius_px == pytest.approx(30)
+    _, found = ingest.read(path, IngestSettings(aperture_radius=0.011, pitch=0.022 / 60))
+    assert found.radius_px == pytest.approx(30)
     with pytest.raises(InsufficientDataError, match=r"valid fraction = 0\.\d+ of the aperture.*at least 0.7"):
         ingest.read(path, IngestSettings(aperture_radius=0.02, pitch=0.022 / 60))
 
@@ -116,5 +121,5 @@ def test_one_ingest_serves_changing_masks(tmp_path: Path) -> None:
         counts = disc_counts(50, seed=seed)
         counts[np.random.default_rng(seed).random(counts.shape) < 0.05] = NO_DATA
         path.write_bytes(dat_bytes(counts))
-        together, alone = ingest.read(path, IngestSettings()), Ingest().read(path, IngestSettings())
-        np.testing.assert_array_equal(together.fit.coefficients, alone.fit.coefficients)
+        (_, together), (_, alone) = ingest.read(path, IngestSettings()), Ingest().read(path, IngestSettings())
+        np.testing.assert_array_equal(together.coefficients, alone.coefficients)

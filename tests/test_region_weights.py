@@ -10,7 +10,7 @@ import pytest
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, evaluate, refit
 from dm_calibration.influence.fit import FitOptions, fit_influence
-from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.region_weighting import (
     EPSILON_CANDIDATES,
     RegionWeighting,
@@ -27,6 +27,7 @@ from dm_calibration.influence.weights import (
 )
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Outcome
+from dm_common.measurement import Measurement
 from dm_common.names import UnknownNameError
 from dm_common.optics.sag import remove_piston_tilt, weighted_fit
 from dm_common.optics.sample_regions import EmptyRegionError, command_row_weights, point_weights, regional_rms
@@ -42,9 +43,10 @@ FALLING = np.linspace(1.0, 0.1, 10)
 def make_maps(signals: np.ndarray, sag: np.ndarray, points: SamplePoints = POINTS) -> MapSet:
     coefficients = weighted_fit(sag, basis(points.x, points.y), points.weight)
     rest = [k for k in range(len(signals)) if not signals[k].any()]
-    return MapSet.from_records(
+    return MapSet.of(
         [
-            MapRecord(
+            Measurement(
+                points=points,
                 label=f"reference {k}" if k in rest else f"p{k:02d}",
                 kind="reference" if k in rest else "surface",
                 step=k,
@@ -58,8 +60,7 @@ def make_maps(signals: np.ndarray, sag: np.ndarray, points: SamplePoints = POINT
                 valid_fraction=1.0,
             )
             for k in range(len(signals))
-        ],
-        points,
+        ]
     )
 
 
@@ -336,18 +337,19 @@ def make_calibration(identifier: str = "one") -> Calibration:
     for number, (step, s) in enumerate(zip(plan, signals, strict=True)):
         sag = plant.sag(s)
         outcome.records.append(
-            MapRecord(
-                step.label,
-                step.kind.value,
-                number,
-                s,
-                s,
-                number * 10**9,
-                plant.fit_terms(sag),
-                np.full(21, np.nan),
-                sag,
-                1 * NM,
-                1.0,
+            Measurement(
+                points=plant.points,
+                sag=sag,
+                coefficients=plant.fit_terms(sag),
+                sigma=np.full(21, np.nan),
+                stamp_ns=number * 10**9,
+                residual_rms=1 * NM,
+                valid_fraction=1.0,
+                label=step.label,
+                kind=step.kind.value,
+                step=number,
+                signals=s,
+                applied=s,
             )
         )
     return evaluate(outcome, mirror, FitOptions(), Provenance(identifier, 1))[0]

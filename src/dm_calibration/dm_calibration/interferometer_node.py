@@ -29,11 +29,12 @@ from dm_calibration.acquisition.acquisition import (
     MapTimeoutError,
     NothingToAcquireError,
 )
-from dm_calibration.acquisition.ingest import Ingest, MapRejectedError, Measurement
+from dm_calibration.acquisition.ingest import Ingest, MapRejectedError
 from dm_calibration.acquisition.trigger import TriggerError
 from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
-from dm_calibration.map_files import MapFileError, NoValidPixelsError
+from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
 from dm_calibration.optics.aperture import InsufficientDataError
+from dm_common.measurement import Measurement
 from dm_common.ros import diagnostics, parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.worker import WorkerService
@@ -144,11 +145,11 @@ class InterferometerNode(LifecycleNode):
         if not self._configured:
             return self._refuse(response, ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
         try:
-            measurement = self._read(self._expanded(request.path))
+            surface, measured = self._read(self._expanded(request.path))
         except _REFUSALS as error:
             return self._refuse_for(response, error)
-        header = self._header(self._file_time(measurement, believe_header=True))
-        return self._accept(response, measurement, header, "ingested")
+        header = self._header(self._file_time(surface, believe_header=True))
+        return self._accept(response, surface, measured, header, "ingested")
 
     @staticmethod
     def _expanded(path: str) -> Path:
@@ -173,12 +174,13 @@ class InterferometerNode(LifecycleNode):
         except _REFUSALS as error:
             return self._refuse_for(response, error)
         header = self._header(self._measurement_time(acquired))
-        return self._accept(response, acquired.measurement, header, f"measured {request.label}".strip())
+        what = f"measured {request.label}".strip()
+        return self._accept(response, acquired.surface, acquired.measurement, header, what)
 
     def _on_new_file(self, path: Path) -> None:
         """A new file in the watched folder that nobody waits for; runs in the watching thread."""
         try:
-            measurement = self._read(path)
+            surface, measured = self._read(path)
         except _REFUSALS as error:
             self._warn_of_file(str(error))
             return
@@ -187,25 +189,25 @@ class InterferometerNode(LifecycleNode):
             return
         # The digest takes longer than the fit: coefficients wait for it only where it may say that nothing is new.
         before = self._published.pop(str(path), None)
-        known = before is not None and before == measurement.source.sha256
+        known = before is not None and before == surface.sha256
         if self._active and not known:
-            self._publish(measurement, self._header(self._file_time(measurement, believe_header=False)))
-            self._log_taken(measurement, "new file")
-        self._published[str(path)] = measurement.source.sha256
+            self._publish(surface, measured, self._header(self._file_time(surface, believe_header=False)))
+            self._log_taken(surface, measured, "new file")
+        self._published[str(path)] = surface.sha256
         while len(self._published) > 1000:
             self._published.pop(next(iter(self._published)))
 
-    def _read(self, path: Path) -> Measurement:
+    def _read(self, path: Path) -> tuple[SurfaceMap, Measurement]:
         return self._ingest.read(path, ingest_settings(self._values))
 
-    def _accept(self, response: Any, measurement: Measurement, header: Header, what: str) -> Any:
+    def _accept(self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str) -> Any:
         if self._active:
-            self._publish(measurement, header)
-        self._log_taken(measurement, what)
+            self._publish(surface, measured, header)
+        self._log_taken(surface, measured, what)
         response.error_code = ErrorCode.OK
-        response.info = messages.info_message(measurement, header)
-        response.zernike = messages.zernike_message(measurement, header)
-        response.samples = messages.samples_message(measurement, header)
+        response.info = messages.info_message(surface, measured, header)
+        response.zernike = messages.zernike_message(measured, header)
+        response.samples = messages.samples_message(measured, header)
         return response
 
     def _refuse_for(self, response: Any, error: Exception) -> Any:
@@ -218,28 +220,28 @@ class InterferometerNode(LifecycleNode):
         response.message = message
         return response
 
-    def _publish(self, measurement: Measurement, header: Header) -> None:
+    def _publish(self, surface: SurfaceMap, measured: Measurement, header: Header) -> None:
         with self._publishing:
             if not self._configured:
                 return
             # What is waited for most comes first; map and digest take longer than all before.
-            self._zernike_publisher.publish(messages.zernike_message(measurement, header))
-            self._samples_publisher.publish(messages.samples_message(measurement, header))
-            self._info_publisher.publish(messages.info_message(measurement, header))
+            self._zernike_publisher.publish(messages.zernike_message(measured, header))
+            self._samples_publisher.publish(messages.samples_message(measured, header))
+            self._info_publisher.publish(messages.info_message(surface, measured, header))
             if self._values["publish_map"]:
-                self._map_publisher.publish(messages.image_message(measurement, header))
+                self._map_publisher.publish(messages.image_message(surface, header))
 
-    def _log_taken(self, measurement: Measurement, what: str) -> None:
+    def _log_taken(self, surface: SurfaceMap, measured: Measurement, what: str) -> None:
         self._taken += 1
-        self._last_file, self._last_refusal = measurement.source.file, ""
+        self._last_file, self._last_refusal = surface.file, ""
         self.get_logger().info(
-            f"{what}: {measurement.source.file}: PV {measurement.pv * 1e9:.1f} nm, rms {measurement.rms * 1e9:.1f} nm, "
-            f"{100 * measurement.fit.valid_fraction:.1f} % valid"
+            f"{what}: {surface.file}: PV {surface.pv * 1e9:.1f} nm, rms {surface.rms * 1e9:.1f} nm, "
+            f"{100 * measured.valid_fraction:.1f} % valid"
         )
-        if measurement.pitch is None and not self._warned_of_pitch:
+        if surface.pitch is None and not self._warned_of_pitch:
             self._warned_of_pitch = True
             self.get_logger().warning(
-                f"{measurement.source.file}: the file does not tell its lateral resolution, so coefficients carry "
+                f"{surface.file}: the file does not tell its lateral resolution, so coefficients carry "
                 "radius 0 (unknown); set the parameter `pitch` [m per pixel]"
             )
 
@@ -256,18 +258,17 @@ class InterferometerNode(LifecycleNode):
 
     def _measurement_time(self, acquired: Acquired) -> int:
         if acquired.began_ns is None or acquired.ended_ns is None:
-            return self._file_time(acquired.measurement, believe_header=False)
+            return self._file_time(acquired.surface, believe_header=False)
         return (acquired.began_ns + acquired.ended_ns) // 2
 
-    def _file_time(self, measurement: Measurement, believe_header: bool) -> int:
+    def _file_time(self, surface: SurfaceMap, believe_header: bool) -> int:
         now = self._now_ns()
         if self.get_clock().ros_time_is_active:
             return now
-        source = measurement.source
-        if believe_header and source.time_stamp is not None and 0 < source.time_stamp * 1e9 <= now:
-            return round(source.time_stamp * 1e9)
+        if believe_header and surface.time_stamp is not None and 0 < surface.time_stamp * 1e9 <= now:
+            return round(surface.time_stamp * 1e9)
         try:
-            modified = Path(source.file).stat().st_mtime_ns
+            modified = Path(surface.file).stat().st_mtime_ns
         except OSError:
             return now
         oldest = 0 if believe_header else now - _RECENT_NS

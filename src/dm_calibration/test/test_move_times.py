@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from dm_calibration.hysteresis.features import crept, play_features
-from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.influence.maps import MapSet
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, certain_reach, follow
+from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
 
 RATE = 0.02
@@ -36,8 +37,8 @@ def test_a_later_move_has_crept_less() -> None:
 
 def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
     points = edge_clustered_points(30)
-    record = MapRecord(
-        "a", "excitation", 0, np.zeros(2), np.zeros(2), 10**9, np.zeros(21), np.zeros(21), np.zeros(30), 0.0, 1.0
+    record = Measurement(
+        points, np.zeros(30), np.zeros(21), np.zeros(21), 10**9, 0.0, 1.0, signals=np.zeros(2), applied=np.zeros(2)
     )
     times = [
         (1, 0),
@@ -50,7 +51,7 @@ def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
         replace(record, label=str(k), stamp_ns=stamp * 10**9, moved_ns=moved * 10**9)
         for k, (stamp, moved) in enumerate(times)
     ]
-    assert MapSet.from_records(records, points).moved_s() == pytest.approx([0.0, 1.0, 2.0, 4.0, 6.0])
+    assert MapSet.of(records).moved_s() == pytest.approx([0.0, 1.0, 2.0, 4.0, 6.0])
 
 
 def test_what_is_certainly_within_reach_leaves_room_for_hysteresis_and_creep() -> None:

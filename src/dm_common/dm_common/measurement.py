@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -16,20 +16,34 @@ Floats = NDArray[np.float64]
 MAP_REJECTED = 305
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measurement:
-    """One map as the interferometer gives it; fields as in :class:`~dm_calibration.influence.maps.MapRecord`.
+    """One measured map: what the interferometer saw, and, in a run or a calibration, what had been commanded.
 
     Attributes:
+        points: where the map was sampled.
+        sag: (P,) at these points, m; NaN = no data.
+        coefficients, sigma: (K,) Zernike coefficients and their standard deviations (NaN = unknown), m.
+        stamp_ns: time of the measurement, ns; 0 = not known.
+        residual_rms: what the K terms leave unexplained, m.
+        valid_fraction: valid pixels of the aperture, 0..1.
         radius: of the aperture the coefficients and points are normalised to, m; 0 = unknown.
         wavelength: m; 0 = unknown.
-        system_error_subtracted: 1 yes, 0 no, -1 not told.
-        moved_ns: when the mirror took the shape, ns; 0 = not told.
-        instrument: what took the map, with its serial number; "" = not told.
+        system_error_subtracted: 1 yes, 0 no, -1 not known.
+        file, sha256: the map file it came from; "" = none.
+        moved_ns: when the mirror took the shape, ns; 0 = not known.
+        instrument: what took the map, with its serial number; "" = not known.
         pitch: m per pixel; 0 = unknown.
-        camera: width and height of the map, pixels; zeros = not told.
-        centre: of the aperture from the left and top edge of the map, pixels; NaN = not told.
-        radius_px: of the aperture, pixels; 0 = not told.
+        camera: width and height of the map, pixels; zeros = not known.
+        centre: of the aperture from the left and top edge of the map, pixels; NaN = not known.
+        radius_px: of the aperture, pixels; 0 = not known.
+        label: unique in a calibration, e.g. ``poke+07``, ``p55``, ``reference 3``; "" = not commanded by a run.
+        kind: reference, poke, surface, excitation (shows hysteresis) or check (a move as in use, tests its model).
+        step: index of the commanded state; maps repeated in one state share it.
+        signals, applied: (N,) normalised signals as requested and as written to the electronics.
+        nominal: (K,) coefficients of the surface that was aimed at, m; None when signals were prescribed.
+        segment: number of the degauss, or of the resumption, from which the history of the actuators is known; 0 for a
+            run that was not interrupted.
     """
 
     points: SamplePoints
@@ -50,6 +64,13 @@ class Measurement:
     camera: tuple[int, int] = (0, 0)
     centre: tuple[float, float] = (float("nan"), float("nan"))
     radius_px: float = 0.0
+    label: str = ""
+    kind: str = ""
+    step: int = 0
+    signals: Floats = field(default_factory=lambda: np.zeros(0))
+    applied: Floats = field(default_factory=lambda: np.zeros(0))
+    nominal: Floats | None = None
+    segment: int = 0
 
 
 class BenchError(Exception):

@@ -135,8 +135,8 @@ def _parts(contents: dict[str, list[bytes]], effort: Effort) -> dict[str, float]
             return paths[suffix][next(turn) % len(paths[suffix])]
 
         ingest, settings, header = Ingest(), IngestSettings(aperture_radius=RADIUS), Header()
-        measurement = ingest.read(path("dat"), settings)
-        sag, aperture, points = measurement.sag, full_aperture(CAMERA), edge_clustered_points(500)
+        surface, measurement = ingest.read(path("dat"), settings)
+        sag, aperture, points = surface.sag, full_aperture(CAMERA), edge_clustered_points(500)
         circle = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
         valid = np.isfinite(sag)
         fitter = MapFitter(valid, *circle)
@@ -148,6 +148,6 @@ def _parts(contents: dict[str, list[bytes]], effort: Effort) -> dict[str, float]
             "sample": lambda: sample_map(sag, *circle, points),
             "ingest_dat": lambda: ingest.read(path("dat"), settings),
             "coefficients_message": lambda: zernike_message(measurement, header),
-            "map_message": lambda: image_message(measurement, header),
+            "map_message": lambda: image_message(surface, header),
         }
         return {f"{name}_ms": 1e3 * seconds for name, seconds in medians(jobs, max(effort.rounds // 3, 4)).items()}

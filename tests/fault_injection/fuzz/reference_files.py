@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.influence.maps import MapRecord
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Outcome
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.measurement import Measurement
 from dm_common.mirror import NEIGHBOUR_REACH, Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
@@ -196,10 +196,22 @@ def _calibration() -> ReferenceFile:
         assert step.signals is not None
         sag = influence @ step.signals
         terms = np.asarray(np.linalg.lstsq(modes, sag, rcond=None)[0], dtype=np.float64)
-        record = MapRecord(
-            step.label, step.kind.value, number, step.signals, step.signals, number * 10**9, terms,
-            np.full(21, 1e-10), sag, 1e-9, 0.99, f"/maps/{number}.dat", "ab" * 32,
-        )  # fmt: skip
+        record = Measurement(
+            points=points,
+            sag=sag,
+            coefficients=terms,
+            sigma=np.full(21, 1e-10),
+            stamp_ns=number * 10**9,
+            residual_rms=1e-9,
+            valid_fraction=0.99,
+            file=f"/maps/{number}.dat",
+            sha256="ab" * 32,
+            label=step.label,
+            kind=step.kind.value,
+            step=number,
+            signals=step.signals,
+            applied=step.signals,
+        )
         outcome.records.append(record)
     calibration, _check = evaluate(outcome, mirror, FitOptions(), Provenance(CALIBRATION_ID, 10**18))
     with tempfile.TemporaryDirectory() as folder:

@@ -12,10 +12,10 @@ from itertools import count
 from pathlib import Path
 
 from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch
-from dm_calibration.acquisition.ingest import Measurement
 from dm_calibration.acquisition.inotify import ClosedFiles
 from dm_calibration.acquisition.trigger import PLACEHOLDER, TriggerError, run_trigger
-from dm_calibration.map_files import MapFileError, NoValidPixelsError
+from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
+from dm_common.measurement import Measurement
 
 _POLL_OUTPUT_S = 0.01
 
@@ -74,10 +74,12 @@ class Acquired:
     """A measurement that was asked for.
 
     Attributes:
+        surface, measurement: the oriented map and what was found in it.
         began_ns, ended_ns: when the trigger command started and ended, on the clock given to Acquisition; None when
             the file came without a trigger.
     """
 
+    surface: SurfaceMap
     measurement: Measurement
     began_ns: int | None = None
     ended_ns: int | None = None
@@ -92,7 +94,7 @@ class Acquisition:
     def __init__(
         self,
         settings: AcquisitionSettings,
-        read: Callable[[Path], Measurement],
+        read: Callable[[Path], tuple[SurfaceMap, Measurement]],
         now_ns: Callable[[], int],
         on_file: Callable[[Path], None],
         on_trouble: Callable[[str], None],
@@ -151,22 +153,22 @@ class Acquisition:
             raise NothingToAcquireError("neither trigger_command nor watch_folder is configured: use ingest_file")
         deadline = time.monotonic() + timeout_s
         if not self.settings.trigger_command:
-            return Acquired(self._next_file(watch, deadline, None))
+            return Acquired(*self._next_file(watch, deadline, None))
         trigger_s = min(self.settings.trigger_timeout, timeout_s)
         began = self._now_ns()
         if self.settings.names_output:
             output = self._new_name(watch)
             self._trigger(output, trigger_s)
             ended = self._now_ns()
-            return Acquired(self._expected_file(output, deadline), began, ended)
+            return Acquired(*self._expected_file(output, deadline), began, ended)
         times: list[int] = []
 
         def trigger() -> None:
             self._trigger(None, trigger_s)
             times.append(self._now_ns())
 
-        measurement = self._next_file(watch, deadline, trigger)
-        return Acquired(measurement, began, times[0])
+        surface, measurement = self._next_file(watch, deadline, trigger)
+        return Acquired(surface, measurement, began, times[0])
 
     def _trigger(self, output: Path | None, timeout_s: float) -> None:
         try:
@@ -187,7 +189,7 @@ class Acquisition:
         watch.ignore(output)
         return output
 
-    def _expected_file(self, path: Path, deadline: float) -> Measurement:
+    def _expected_file(self, path: Path, deadline: float) -> tuple[SurfaceMap, Measurement]:
         """Read the file the trigger was told to write, which may still be growing."""
         seen: tuple[int, int] | None = None
         since = time.monotonic()
@@ -213,7 +215,9 @@ class Acquisition:
                 raise trouble or MapTimeoutError(f"the trigger command ended, but {path} did not appear in time")
             time.sleep(_POLL_OUTPUT_S)
 
-    def _next_file(self, watch: FolderWatch, deadline: float, trigger: Callable[[], None] | None) -> Measurement:
+    def _next_file(
+        self, watch: FolderWatch, deadline: float, trigger: Callable[[], None] | None
+    ) -> tuple[SurfaceMap, Measurement]:
         """Read the next file in the folder that is written from now on, after `trigger()` if there is one."""
         arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
         with self._handover:

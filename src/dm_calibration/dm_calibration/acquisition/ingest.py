@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,11 @@ from numpy.typing import NDArray
 
 from dm_calibration.map_files import SurfaceMap, read_map
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError, configured_aperture, find_aperture
-from dm_calibration.optics.map_fit import MapFit, MapFitter
+from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
+from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_piston_tilt
-from dm_common.optics.sampling import SamplePoints, edge_clustered_points, sample_map
+from dm_common.optics.sampling import edge_clustered_points, sample_map
 
 
 class MapRejectedError(Exception):
@@ -49,67 +49,6 @@ class IngestSettings:
     remove_piston_tilt: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """One map and what was made of it.
-
-    Attributes:
-        source: the map as read; its sag is in the instrument's orientation.
-        sag: (height, width), m, oriented; NaN = no data.
-        pitch: m per pixel; None = unknown.
-        aperture: on the oriented map.
-        fit: coefficients in m, piston and tilt included.
-        points: where `samples` were taken.
-        samples: (P,), m, piston and tilt included; NaN = no valid pixel.
-        piston_tilt_removed: whether `sag` has its plane subtracted.
-        valid: (height, width), pixels with data.
-    """
-
-    source: SurfaceMap
-    sag: NDArray[np.float64]
-    pitch: float | None
-    aperture: Aperture
-    fit: MapFit
-    points: SamplePoints
-    samples: NDArray[np.float64]
-    piston_tilt_removed: bool
-    valid: NDArray[np.bool_]
-
-    @property
-    def pv(self) -> float:
-        """m, peak to valley of `sag` over all its valid pixels."""
-        return self._spread[0]
-
-    @property
-    def rms(self) -> float:
-        """m, standard deviation of the same."""
-        return self._spread[1]
-
-    @cached_property
-    def _spread(self) -> tuple[float, float]:
-        """Found when first asked for: coefficients need not wait for it."""
-        heights = self.sag[self.valid]
-        extent = float(np.ptp(heights))
-        heights -= heights.mean()
-        return extent, float(np.sqrt(heights @ heights / heights.size))
-
-    @property
-    def aperture_radius(self) -> float | None:
-        """m; None without a pitch."""
-        return None if self.pitch is None else self.aperture.radius_px * self.pitch
-
-    @property
-    def aperture_centre(self) -> tuple[float, float]:
-        """(x, y) of the aperture in m from the map's centre, y up; zeros without a pitch."""
-        if self.pitch is None:
-            return (0.0, 0.0)
-        height, width = self.sag.shape
-        return (
-            (self.aperture.centre_x_px - (width - 1) / 2) * self.pitch,
-            ((height - 1) / 2 - self.aperture.centre_y_px) * self.pitch,
-        )
-
-
 class Ingest:
     """Reads and fits map files, one at a time however many threads ask, so that memory stays flat."""
 
@@ -118,8 +57,11 @@ class Ingest:
         self._turn = threading.Lock()
         self._fitter: MapFitter | None = None  # of the last mask: dropouts often stay where they are
 
-    def read(self, path: Path, settings: IngestSettings) -> Measurement:
-        """Read, orient and fit one file.
+    def read(self, path: Path, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
+        """Read, orient and fit one file: the oriented map, and what was found in it.
+
+        Piston and tilt stay in coefficients and samples. The digest of the file is left to
+        :attr:`SurfaceMap.sha256`, the time to whoever knows the clock.
 
         Raises:
             MapFileError: the file is not a whole, readable map.
@@ -133,7 +75,7 @@ class Ingest:
             except (InsufficientDataError, MapRejectedError) as error:
                 raise type(error)(f"{path}: {error}") from error
 
-    def _measure(self, source: SurfaceMap, settings: IngestSettings) -> Measurement:
+    def _measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
         difference = abs(source.wavelength - settings.wavelength)
         if settings.wavelength and difference > settings.wavelength_tolerance:
             raise MapRejectedError(
@@ -142,11 +84,12 @@ class Ingest:
             )
         pitch = source.pitch or settings.pitch or None
         sag = settings.orientation.apply(source.sag)
-        valid = np.isfinite(sag)
-        aperture = self._aperture(valid, pitch, settings)
-        if self._fitter is None or not self._fitter.fits(valid, aperture):
+        surface = replace(source, sag=sag, pitch=pitch)
+        aperture = self._aperture(surface.valid, pitch, settings)
+        circle = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
+        if self._fitter is None or not self._fitter.fits(surface.valid, aperture):
             self._fitter = None  # not two workspaces at a time
-            self._fitter = MapFitter(valid, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
+            self._fitter = MapFitter(surface.valid, *circle)
         if self._fitter.valid_fraction < settings.minimum_valid_fraction:
             raise InsufficientDataError(
                 f"valid fraction = {self._fitter.valid_fraction:.3f} of the aperture (radius {aperture.radius_px:.1f} "
@@ -154,20 +97,28 @@ class Ingest:
                 "(parameter aperture.minimum_valid_fraction)"
             )
         fit = self._fitter.fit(sag)
-        samples = sample_map(sag, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px, self.points)
-        if settings.remove_piston_tilt:
-            sag = remove_piston_tilt(sag)
-        return Measurement(
-            source=source,
-            sag=sag,
-            pitch=pitch,
-            aperture=aperture,
-            fit=fit,
+        subtracted = source.system_error_subtracted
+        measured = Measurement(
             points=self.points,
-            samples=samples,
-            piston_tilt_removed=settings.remove_piston_tilt,
-            valid=valid,
+            sag=sample_map(sag, *circle, self.points),
+            coefficients=fit.coefficients,
+            sigma=fit.sigma,
+            stamp_ns=0,
+            residual_rms=fit.residual_rms,
+            valid_fraction=fit.valid_fraction,
+            radius=aperture.radius_px * (pitch or 0.0),
+            wavelength=source.wavelength,
+            system_error_subtracted=-1 if subtracted is None else int(subtracted),
+            file=source.file,
+            instrument=f"{source.instrument}, serial {source.serial}" if source.serial else source.instrument,
+            pitch=pitch or 0.0,
+            camera=(sag.shape[1], sag.shape[0]),
+            centre=circle[:2],
+            radius_px=aperture.radius_px,
         )
+        if settings.remove_piston_tilt:
+            surface = replace(surface, sag=remove_piston_tilt(sag), piston_tilt_removed=True)
+        return surface, measured
 
     @staticmethod
     def _aperture(valid: NDArray[np.bool_], pitch: float | None, settings: IngestSettings) -> Aperture:
@@ -178,9 +129,4 @@ class Ingest:
                 f"aperture.radius = {settings.aperture_radius:g} m, but the file does not tell its lateral resolution: "
                 "set the parameter pitch, or aperture.radius to 0"
             )
-        return configured_aperture(
-            valid.shape,
-            pitch,
-            settings.aperture_radius,
-            *settings.aperture_centre,
-        )
+        return configured_aperture(valid.shape, pitch, settings.aperture_radius, *settings.aperture_centre)

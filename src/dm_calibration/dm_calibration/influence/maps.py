@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
@@ -29,47 +30,8 @@ def same_points(a: SamplePoints, b: SamplePoints) -> bool:
 
 
 @dataclass(frozen=True)
-class MapRecord:
-    """One measured map.
-
-    Attributes:
-        label: unique in a calibration, e.g. ``poke+07``, ``p55``, ``reference 3``.
-        kind: REFERENCE, POKE, SURFACE, EXCITATION (shows the memory) or CHECK (a move as in use, tests the law of it).
-        step: index of the commanded state; maps repeated in one state share it.
-        signals, applied: (N,) normalised signals as requested and as written to the electronics.
-        stamp_ns: time of the measurement, ns.
-        coefficients, sigma: (K,) Zernike coefficients and their standard deviations (NaN = unknown), m.
-        sag: (P,) at the sampling points, m; NaN = no data.
-        residual_rms: what the K terms leave unexplained, m.
-        valid_fraction: valid pixels of the aperture, 0..1.
-        file, sha256: the map file it came from; "" = none.
-        nominal: (K,) coefficients of the surface that was aimed at, m; None when signals were prescribed.
-        moved_ns: when the mirror took this shape, ns; 0 = not told.
-        segment: number of the degauss, or of the resumption, from which the history of the actuators is known; 0 for a
-            run that was not interrupted.
-    """
-
-    label: str
-    kind: str
-    step: int
-    signals: Floats
-    applied: Floats
-    stamp_ns: int
-    coefficients: Floats
-    sigma: Floats
-    sag: Floats
-    residual_rms: float
-    valid_fraction: float
-    file: str = ""
-    sha256: str = ""
-    nominal: Floats | None = None
-    moved_ns: int = 0
-    segment: int = 0
-
-
-@dataclass(frozen=True)
 class MapSet:
-    """M maps column by column; see :class:`MapRecord` for the meaning and unit of each column."""
+    """M maps column by column; see :class:`~dm_common.measurement.Measurement` for their meaning and unit."""
 
     points: SamplePoints
     label: tuple[str, ...]
@@ -142,43 +104,44 @@ class MapSet:
         return np.asarray(1e-9 * (np.where(told, self.moved_ns, before) - self.stamp_ns[0]))
 
     @classmethod
-    def from_records(cls, records: Sequence[MapRecord], points: SamplePoints) -> MapSet:
-        """Stack `records`, in the order measured.
+    def columns(cls) -> tuple[str, ...]:
+        """Names of the fields with one entry a map."""
+        return tuple(field.name for field in fields(cls) if field.name != "points")
+
+    @classmethod
+    def of(cls, measured: Sequence[Measurement]) -> MapSet:
+        """Stack maps of the same points, in the order measured.
 
         Raises:
-            ValueError: when there is none, or lengths differ between records.
+            ValueError: when there is none, or lengths differ between maps.
         """
-        if not records:
+        if not measured:
             raise ValueError("no maps were measured")
-        unknown = np.full(records[0].coefficients.shape, np.nan)
-        return cls(
-            points=points,
-            label=tuple(record.label for record in records),
-            kind=tuple(record.kind for record in records),
-            step=np.array([record.step for record in records], dtype=np.int64),
-            signals=np.stack([record.signals for record in records]),
-            applied=np.stack([record.applied for record in records]),
-            stamp_ns=np.array([record.stamp_ns for record in records], dtype=np.int64),
-            coefficients=np.stack([record.coefficients for record in records]),
-            sigma=np.stack([record.sigma for record in records]),
-            sag=np.stack([record.sag for record in records]),
-            residual_rms=np.array([record.residual_rms for record in records]),
-            valid_fraction=np.array([record.valid_fraction for record in records]),
-            file=tuple(record.file for record in records),
-            sha256=tuple(record.sha256 for record in records),
-            nominal=np.stack([unknown if record.nominal is None else record.nominal for record in records]),
-            moved_ns=np.array([record.moved_ns for record in records], dtype=np.int64),
-            segment=np.array([record.segment for record in records], dtype=np.int64),
-        )
+        unknown = np.full(measured[0].coefficients.shape, np.nan)
+        columns: dict[str, Any] = {"points": measured[0].points}
+        for name in cls.columns():
+            values = [getattr(one, name) for one in measured]
+            if name == "nominal":
+                values = [unknown if value is None else value for value in values]
+            columns[name] = tuple(values) if isinstance(values[0], str) else np.array(values)
+        return cls(**columns)
+
+    def measurements(self) -> list[Measurement]:
+        """The maps one by one."""
+        rows = []
+        for k in range(len(self)):
+            row: dict[str, Any] = {name: getattr(self, name)[k] for name in self.columns()}
+            row = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
+            if np.isnan(row["nominal"]).all():
+                row["nominal"] = None
+            rows.append(Measurement(points=self.points, **row))
+        return rows
 
     def select(self, keep: NDArray[np.bool_]) -> MapSet:
         """The maps where `keep` (M,) is true."""
         rows = np.flatnonzero(keep)
         changes: dict[str, Any] = {}
-        for column in fields(self):
-            values = getattr(self, column.name)
-            if isinstance(values, np.ndarray):
-                changes[column.name] = values[rows]
-            elif isinstance(values, tuple):
-                changes[column.name] = tuple(values[i] for i in rows)
+        for name in self.columns():
+            values = getattr(self, name)
+            changes[name] = values[rows] if isinstance(values, np.ndarray) else tuple(values[i] for i in rows)
         return replace(self, **changes)

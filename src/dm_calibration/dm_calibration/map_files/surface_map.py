@@ -52,6 +52,7 @@ class SurfaceMap:
         part_name: name of the part; "" when not told.
         time_stamp: Unix time of the measurement, s; None when not told.
         system_error_subtracted: None when not told. Maps that differ in it must not be mixed.
+        piston_tilt_removed: whether the plane of the map was subtracted.
         file: where the map was read from.
         content: the file's bytes, for :attr:`sha256`.
     """
@@ -66,6 +67,7 @@ class SurfaceMap:
     part_name: str = ""
     time_stamp: float | None = None
     system_error_subtracted: bool | None = None
+    piston_tilt_removed: bool = False
     file: str = ""
     content: bytes = field(default=b"", repr=False)
 
@@ -77,10 +79,28 @@ class SurfaceMap:
         """
         return hashlib.sha256(self.content).hexdigest() if self.content else ""
 
-    @property
+    @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """(height, width), True where there is data."""
         return np.isfinite(self.sag)
+
+    @property
+    def pv(self) -> float:
+        """m, peak to valley of `sag` over all its valid pixels."""
+        return self._spread[0]
+
+    @property
+    def rms(self) -> float:
+        """m, standard deviation of the same."""
+        return self._spread[1]
+
+    @cached_property
+    def _spread(self) -> tuple[float, float]:
+        """Found when first asked for: coefficients need not wait for it."""
+        heights = self.sag[self.valid]
+        extent = float(np.ptp(heights))
+        heights -= heights.mean()
+        return extent, float(np.sqrt(heights @ heights / heights.size))
 
 
 def _outside(name: str, value: object, allowed: str) -> MapFileError:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.influence.maps import MapRecord
+from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS
 
 Floats = NDArray[np.float64]
@@ -56,7 +56,7 @@ class BumpCheck:
         # Sums of squares: what the maps showed, rms m, and what was commanded. Their ratio is the size of a response.
         self._shown = self._commanded = 0.0
 
-    def take(self, record: MapRecord, centre: tuple[float, float], reference: bool) -> None:
+    def take(self, record: Measurement, centre: tuple[float, float], reference: bool) -> None:
         """Take a good map, which later reference frames are compared with."""
         if reference:
             self._last = _Look(record.label, record.coefficients, np.array(centre))
@@ -74,7 +74,7 @@ class BumpCheck:
         self._moved = np.maximum(self._moved, abs(signal))
 
     def change(
-        self, record: MapRecord, centre: tuple[float, float], pixel: float = 0.0, interrupted: bool = False
+        self, record: Measurement, centre: tuple[float, float], pixel: float = 0.0, interrupted: bool = False
     ) -> str:
         """How the reference frame `record` differs from the one before it, in words; "" = as it should.
 

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.outcome import Doubted, Dropped, Event, MapTaken, Segment, Setup, Solved, Unseen
+from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
 
 _MARK = b"DMJ1"
@@ -37,7 +38,11 @@ class Storing:
 _EVENTS: dict[str, Any] = {
     kind.__name__: kind for kind in (Setup, Segment, MapTaken, Unseen, Dropped, Solved, Doubted, Storing)
 }
-_PARTS: dict[str, Any] = {"record": MapRecord, "points": SamplePoints}
+#: What a frame keeps of a map; the points stand in Setup, and what all maps share too.
+_RECORD = (
+    "label", "kind", "step", "signals", "applied", "stamp_ns", "coefficients", "sigma", "sag", "residual_rms",
+    "valid_fraction", "file", "sha256", "nominal", "moved_ns", "segment",
+)  # fmt: skip
 
 #: The seal that the first frame of a run follows.
 FIRST = b"\0" * _SEAL
@@ -59,7 +64,7 @@ def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
     Raises:
         ValueError: a frame is whole but of another version.
     """
-    seal, position = FIRST, 0
+    seal, position, points = FIRST, 0, None
     start = len(_MARK) + _LENGTHS.size
     while len(content) - position >= start + _SEAL and content[position : position + len(_MARK)] == _MARK:
         head, payload = _LENGTHS.unpack_from(content, position + len(_MARK))
@@ -70,70 +75,65 @@ def decode(content: bytes) -> Iterator[tuple[Event | Storing, int, bytes]]:
         if hashlib.sha256(seal + content[position:end]).digest() != found:
             return
         text = content[position + start : position + start + head]
-        event = _event(json.loads(text), memoryview(content)[position + start + head : end])
+        event = _event(json.loads(text), memoryview(content)[position + start + head : end], points)
+        if isinstance(event, Setup):
+            points = event.points
         position, seal = end + _SEAL, found
         yield event, position, seal
 
 
-def _event(head: dict[str, Any], payload: memoryview) -> Event | Storing:
+def _event(head: dict[str, Any], payload: memoryview, points: SamplePoints | None) -> Event | Storing:
+    """The event in a frame; its map, if it has one, was sampled at `points`."""
     try:
-        event: Event | Storing = _rebuilt(_EVENTS[head["event"]], head["fields"], payload)
+        values = _rebuilt(head["fields"], payload)
+        if "record" in values:
+            if points is None:
+                raise KeyError("points")
+            values["record"] = Measurement(points=points, **values["record"])
+        if "points" in values:
+            values["points"] = SamplePoints(**values["points"])
+        event: Event | Storing = _EVENTS[head["event"]](**values)
     except (KeyError, TypeError) as error:
         raise ValueError(f"event {head.get('event')!r} of another version: {error}") from error
     return event
 
 
 def _plain(value: Any, arrays: list[bytes]) -> dict[str, Any]:
-    """Fields of a dataclass for JSON; arrays go to `arrays`, their type, shape and place stay."""
+    """Fields of a dataclass for JSON; arrays go to `arrays`, their shape and place stay."""
     result: dict[str, Any] = {}
-    for field in fields(value):
-        item = getattr(value, field.name)
+    for name in _RECORD if isinstance(value, Measurement) else [field.name for field in fields(value)]:
+        item = getattr(value, name)
         if isinstance(item, np.ndarray):
             place = sum(map(len, arrays))
             arrays.append(np.ascontiguousarray(item, dtype="<f8").tobytes())
-            result[field.name] = {"shape": item.shape, "at": place}
-        elif is_dataclass(item):
-            result[field.name] = _plain(item, arrays)
+            result[name] = {"shape": item.shape, "at": place}
         else:
-            result[field.name] = item
+            result[name] = _plain(item, arrays) if is_dataclass(item) else item
     return result
 
 
-def _rebuilt(kind: Any, values: dict[str, Any], payload: memoryview) -> Any:
+def _rebuilt(values: dict[str, Any], payload: memoryview) -> dict[str, Any]:
+    """The fields again, dataclasses as dictionaries of theirs."""
     made: dict[str, Any] = {}
     for name, value in values.items():
-        if name in _PARTS:
-            made[name] = _rebuilt(_PARTS[name], value, payload)
-        elif isinstance(value, dict):
+        if isinstance(value, dict) and "shape" in value:
             shape = tuple(value["shape"])
             count = int(np.prod(shape))
             array = np.frombuffer(payload, dtype="<f8", count=count, offset=value["at"])
             made[name] = array.astype(np.float64).reshape(shape)
-        elif isinstance(value, list):
-            made[name] = tuple(value)
+        elif isinstance(value, dict):
+            made[name] = _rebuilt(value, payload)
         else:
-            made[name] = value
-    return kind(**made)
+            made[name] = tuple(value) if isinstance(value, list) else value
+    return made
 
 
 def map_hashes(maps: MapSet) -> list[str]:
     """SHA-256 over what was measured in each map: equal only when every bit is."""
-    unknown = np.full(maps.terms, np.nan)
-    return [
-        record_hash(
-            MapRecord(
-                maps.label[k], maps.kind[k], int(maps.step[k]), maps.signals[k], maps.applied[k],
-                int(maps.stamp_ns[k]), maps.coefficients[k], maps.sigma[k], maps.sag[k],
-                float(maps.residual_rms[k]), float(maps.valid_fraction[k]), maps.file[k], maps.sha256[k],
-                None if np.array_equal(maps.nominal[k], unknown, equal_nan=True) else maps.nominal[k],
-                int(maps.moved_ns[k]), int(maps.segment[k]),
-            )
-        )
-        for k in range(len(maps))
-    ]  # fmt: skip
+    return [record_hash(record) for record in maps.measurements()]
 
 
-def record_hash(record: MapRecord) -> str:
+def record_hash(record: Measurement) -> str:
     """The same of one map."""
     arrays: list[bytes] = []
     head = json.dumps(_plain(record, arrays))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.influence.maps import REFERENCE, MapRecord
+from dm_calibration.influence.maps import REFERENCE
 from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
 from dm_calibration.procedure.map_checks import check_comparable
 from dm_calibration.procedure.outcome import NOWHERE, Doubted, Event, MapTaken, Outcome, Setup
@@ -126,22 +126,14 @@ class MapAcquisition:
         if self.outcome.points is None:
             self._note(Setup.of(measured))
         assert step.signals is not None
-        record = MapRecord(
+        record = replace(
+            measured,
             label=label,
             kind=step.kind.value,
             step=number,
             signals=step.signals,
             applied=applied,
-            stamp_ns=measured.stamp_ns,
-            coefficients=measured.coefficients,
-            sigma=measured.sigma,
-            sag=measured.sag,
-            residual_rms=measured.residual_rms,
-            valid_fraction=measured.valid_fraction,
-            file=measured.file,
-            sha256=measured.sha256,
             nominal=step.nominal,
-            moved_ns=measured.moved_ns,
             segment=self.outcome.segment,
         )
         centre = NOWHERE

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.influence.maps import MapRecord, MapSet
+from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
@@ -66,7 +66,7 @@ class MapTaken:
         centre: of the aperture on the map, m; NaN = not told.
     """
 
-    record: MapRecord
+    record: Measurement
     radius_known: bool = True
     centre: tuple[float, float] = NOWHERE
 
@@ -75,7 +75,7 @@ class MapTaken:
 class Unseen:
     """A command without a map, kept because the actuators remember it."""
 
-    record: MapRecord
+    record: Measurement
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Outcome:
         centres: of the aperture on each map of `records`, m; NaN = not told.
     """
 
-    records: list[MapRecord] = field(default_factory=list)
+    records: list[Measurement] = field(default_factory=list)
     points: SamplePoints | None = None
     wavelength: float = 0.0
     system_error_subtracted: int = -1
@@ -181,9 +181,9 @@ class Outcome:
         """
         if self.points is None or not self.records:
             raise TooFewMapsError("no map was measured; " + "; ".join(self.dropped[:3]))
-        return MapSet.from_records(self.records, self.points)
+        return MapSet.of(self.records)
 
-    def _add(self, record: MapRecord, centre: tuple[float, float]) -> None:
+    def _add(self, record: Measurement, centre: tuple[float, float]) -> None:
         self.records.append(record)
         self.centres.append(centre)
 

@@ -1,9 +1,10 @@
 """Gains and figure of a calibrated mirror, followed by recursive least squares over maps that arrive later.
 
-In the reduced values of a map (:class:`~dm_calibration.hysteresis.reduction.Reduction`) a calibration says ``v = v0 + V e``
-with the effective signals e. Later it is ``v = v0 + d + V diag(e) (1 + g)``: gains have changed by the shares g, the
-figure by d. Both walk at random, so what is known of them fades with time; each map is one step of the Kalman filter,
-which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section 11.3).
+In the reduced values of a map (:class:`~dm_calibration.hysteresis.reduction.Reduction`) a calibration says
+``v = v0 + V e`` with the effective signals e. Later it is ``v = v0 + d + V diag(e) (1 + g)``: gains have changed by the
+shares g, the figure by d. Both walk at random, so what is known of them fades with time; each map is one step of the
+Kalman filter, which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section
+11.3).
 
 A map that departs further from its prediction than chance allows is a bad map, or the mirror is another one: the caller
 must not take it in.

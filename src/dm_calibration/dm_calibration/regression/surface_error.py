@@ -15,9 +15,9 @@ readings are kept (:class:`Reading`):
 - MEASURED: signals, measured coefficients, and `model` with the part inside the 21 terms from those, c - G s, and the
   rest as COMMAND. It uses what [1] uses, but the surface must have been measured.
 - HISTORY: as COMMAND, but `model` follows the commands before this one too
-  (:mod:`~dm_calibration.regression.sag_history`), so it knows what the actuators remember, and the figure drifts with the
-  reference frames. Nothing measured on the surface itself enters, but the frames before and after it do. This is the
-  one that works, and the default.
+  (:mod:`~dm_calibration.regression.sag_history`), so it knows what the actuators remember, and the figure drifts with
+  the reference frames. Nothing measured on the surface itself enters, but the frames before and after it do. This is
+  the one that works, and the default.
 
 `model` is never taken from a fit that has seen the surface: the eight test surfaces are in none of these fits, and
 every training surface is predicted from a fit without its own fold. (G is: it defines the nominal surface, so it is

@@ -59,8 +59,8 @@ def write_image(columns: Mapping[str, Column], attributes: Mapping[str, Attribut
 def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
     """Columns and attributes of a file written by :func:`write_image`.
 
-    The HDF5 library runs in a process of its own (see :mod:`dm_calibration.store.hdf5_sandbox`), and only plain datasets are
-    read: links out of the file, virtual and external storage are refused.
+    The HDF5 library runs in a process of its own (see :mod:`dm_calibration.store.hdf5_sandbox`), and only plain
+    datasets are read: links out of the file, virtual and external storage are refused.
 
     Raises:
         ImageError: not HDF5, truncated, damaged, not plain, or the hash does not agree.

@@ -1,4 +1,4 @@
-"""The helper that opens HDF5 files; see :mod:`dm_calibration.store.hdf5_sandbox`. Reads requests from standard input."""
+"""The helper that opens HDF5 files; see :mod:`dm_calibration.store.hdf5_sandbox`. Requests come on standard input."""
 
 from __future__ import annotations
 
