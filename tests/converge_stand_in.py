@@ -1,4 +1,4 @@
-"""What the action `converge` works with, for its tests: a host node, and stand-ins for driver and interferometer."""
+"""What the actions `converge` and `build_recipes` work with, for their tests: a host node, and stand-ins for driver and interferometer."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from dm_common.messages import doubles
 from dm_common.ros import qos
 from dm_common.ros.parameters import declare
 from dm_controller.converge.converge_action import CONVERGE_PARAMETERS, ConvergeAction
+from dm_controller.converge.loop_bench import BENCH_PARAMETERS, LoopBench
+from dm_controller.converge.recipe_action import RECIPE_PARAMETERS, BuildRecipesAction
 from dm_controller.conversions import target_of
 from dm_controller.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
@@ -116,8 +118,13 @@ class Host(Node):
         super().__init__("converge_host")
         self.refuse = False
         self.calibration: Calibration | None = calibration()
-        self.values = declare(self, CONVERGE_PARAMETERS)
-        self.action = ConvergeAction(self, self.values, self.decide, lambda: (self.calibration, mirror_info()))
+        self.values = declare(self, (*CONVERGE_PARAMETERS, *RECIPE_PARAMETERS, *BENCH_PARAMETERS))
+        bench = LoopBench(self, self.values)
+        self.action = ConvergeAction(self, self.values, bench, self.decide, self.known)
+        self.recipes = BuildRecipesAction(self, self.values, bench, self.decide, self.known)
+
+    def known(self) -> tuple[Calibration | None, MirrorInfo]:
+        return self.calibration, mirror_info()
 
     def decide(self, request: FocusRequest) -> Decision:
         if self.refuse:

@@ -1,4 +1,4 @@
-"""Recipes by the action `converge` over DDS, and how they reach the calibration node."""
+"""The action `build_recipes` over DDS, and how they reach the calibration node."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from dm_msgs.action import Converge
-from dm_msgs.msg import ErrorCode, FocusRequest
+from dm_msgs.action import BuildRecipes
+from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import StoreRecipes
 
 from converge_stand_in import Bench, Host
@@ -52,20 +52,20 @@ def store(observer: Observer) -> Store:
     return Store(observer)
 
 
-def goal(*curvatures: float, **fields: Any) -> Converge.Goal:
-    return Converge.Goal(curvatures=list(curvatures), max_maps=fields.pop("max_maps", 4), **fields)
+def goal(*curvatures: float, **fields: Any) -> BuildRecipes.Goal:
+    return BuildRecipes.Goal(curvatures=list(curvatures), max_maps=fields.pop("max_maps", 4), **fields)
 
 
-def run(observer: Observer, wanted: Converge.Goal) -> tuple[int, Any]:
-    ended = observer.run_goal(Converge, "converge", wanted, timeout_s=60.0)
+def run(observer: Observer, wanted: BuildRecipes.Goal) -> tuple[int, Any]:
+    ended = observer.run_goal(BuildRecipes, "build_recipes", wanted, timeout_s=60.0)
     return ended.status, ended.result
 
 
 def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Bench, store: Store) -> None:
     feedback: list[Any] = []
     handle, future = observer.send_goal(
-        Converge,
-        "converge",
+        BuildRecipes,
+        "build_recipes",
         goal(0.02, -0.01, max_maps=16, tolerance=1e-9),
         lambda message: feedback.append(message.feedback),
     )
@@ -95,7 +95,7 @@ def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Ben
 def test_a_cancel_keeps_whole_recipes_and_rests_the_mirror(
     observer: Observer, host: Host, bench: Bench, store: Store
 ) -> None:
-    handle, future = observer.send_goal(Converge, "converge", goal(-0.02, 0.0, 0.01, 0.02, 0.03))
+    handle, future = observer.send_goal(BuildRecipes, "build_recipes", goal(-0.02, 0.0, 0.01, 0.02, 0.03))
     wait_until(lambda: bench.measured >= 5, 60)
     bench.pause = 0.3
     handle.cancel_goal_async()
@@ -109,7 +109,7 @@ def test_a_cancel_keeps_whole_recipes_and_rests_the_mirror(
 
 
 def test_a_bench_that_fails_keeps_whole_recipes(observer: Observer, host: Host, bench: Bench, store: Store) -> None:
-    _, future = observer.send_goal(Converge, "converge", goal(-0.02, 0.0, 0.02))
+    _, future = observer.send_goal(BuildRecipes, "build_recipes", goal(-0.02, 0.0, 0.02))
     wait_until(lambda: bench.measured >= 4, 60)
     bench.failures = 1000
     wait_until(future.done, 60)
@@ -142,20 +142,17 @@ def test_recipes_beyond_the_tolerance_are_stored_and_named(
         ({"curvatures": [0.01, float("nan")]}, ErrorCode.NOT_FINITE, "curvatures[1] = nan: must be a finite number"),
         ({"curvatures": [0.01, 0.01]}, ErrorCode.INVALID_ARGUMENT, "+0.0100 1/m is there twice"),
         ({"curvatures": [0.0, 5.0]}, ErrorCode.UNREACHABLE, "curvature = +5.0000 1/m"),
-        ({"curvatures": [0.0], "method": "bounded"}, ErrorCode.INVALID_ARGUMENT, "leave it empty"),
+        ({"curvatures": []}, ErrorCode.INVALID_ARGUMENT, "curvatures: empty"),
         ({"curvatures": [0.0], "max_maps": 3}, ErrorCode.INVALID_ARGUMENT, "maps_max = 3: must be at least 4"),
         ({"curvatures": [0.0], "tolerance": -1.0}, ErrorCode.INVALID_ARGUMENT, "tolerance = -1.0 m"),
-        (
-            {"curvatures": [0.0], "request": FocusRequest(zernike=[1e-9] * 21)},
-            ErrorCode.INVALID_ARGUMENT,
-            "request.zernike: recipes are of plain conics",
-        ),
+        ({"curvatures": [0.0], "max_maps": 101}, ErrorCode.INVALID_ARGUMENT, "max_maps = 101"),
+        ({"curvatures": [0.0], "conic_constant": float("inf")}, ErrorCode.INVALID_ARGUMENT, "conic_constant = inf"),
     ],
 )
 def test_bad_goals_are_refused_and_nothing_moves(
     observer: Observer, host: Host, bench: Bench, store: Store, fields: dict[str, Any], code: int, words: str
 ) -> None:
-    status, result = run(observer, Converge.Goal(**fields))
+    status, result = run(observer, BuildRecipes.Goal(**fields))
     assert status == GoalStatus.STATUS_ABORTED
     assert (result.error_code, words in result.message) == (code, True), result.message
     assert not (bench.measured or bench.degauss_steps or store.requests)

@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any
 
 import rclpy
-from dm_msgs.action import Calibrate, Converge, MoveFocus
+from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
 from dm_msgs.srv import (
     Degauss,
@@ -51,7 +51,7 @@ SERVICES = {
     LoadCalibration: "load_calibration",
     UpdateCalibration: "update_calibration",
 }
-ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus", Converge: "converge"}
+ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus", Converge: "converge", BuildRecipes: "build_recipes"}
 #: Two clients of one process need two names.
 _NUMBERS = itertools.count(1)
 
@@ -335,12 +335,15 @@ class DeformableMirrorClient:
         max_maps: int = 0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
         timeout_s: float = 14400.0,
-    ) -> Converge.Result:
+    ) -> BuildRecipes.Result:
         """Build a recipe for each curvature [1/m] on the bench, and store them with the calibration in use."""
-        request = FocusRequest(conic_constant=float(conic_constant))
-        wanted = [float(curvature) for curvature in curvatures]
-        goal = Converge.Goal(request=request, curvatures=wanted, tolerance=float(tolerance), max_maps=max_maps)
-        return self.run_action(Converge, "converge", goal, on_feedback, timeout_s)
+        goal = BuildRecipes.Goal(
+            curvatures=[float(curvature) for curvature in curvatures],
+            conic_constant=float(conic_constant),
+            tolerance=float(tolerance),
+            max_maps=max_maps,
+        )
+        return self.run_action(BuildRecipes, "build_recipes", goal, on_feedback, timeout_s)
 
     def calibrate(
         self,

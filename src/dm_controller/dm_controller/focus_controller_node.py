@@ -32,6 +32,8 @@ from dm_controller.active_calibration import NO_CALIBRATION, ActiveCalibration, 
 from dm_controller.capabilities import capabilities_message, settling_time
 from dm_controller.conditioning import Conditioner, Waiting
 from dm_controller.converge.converge_action import ConvergeAction
+from dm_controller.converge.loop_bench import LoopBench
+from dm_controller.converge.recipe_action import BuildRecipesAction
 from dm_controller.creep_hold import SAME_SIGNAL, CreepHold
 from dm_controller.decision import Decision, PlanningContext, condition_steps, decide
 from dm_controller.driver_watch import DriverWatch
@@ -86,10 +88,11 @@ class FocusControllerNode(Node):
             self, self._carry_out, self._conditioner.drop, self._standing, self._stop, self._driver, self._values
         )
         self._forecast = ForecastClient(self)
-        self._converge = ConvergeAction(
-            self, self._values, self._decide, lambda: (self._calibration, self._mirror_info),
-            standing=lambda: self._watch.look(self._now()).state,
-        )  # fmt: skip
+        bench = LoopBench(self, self._values)
+        self._converge = ConvergeAction(self, self._values, bench, self._decide, self._known)
+        self._recipes = BuildRecipesAction(
+            self, self._values, bench, self._decide, self._known, lambda: self._watch.look(self._now()).state
+        )
         self._untold: tuple[FocusRequest, Outcome] | None = None
         self._teller = self.create_timer(TELL_S, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
@@ -112,6 +115,9 @@ class FocusControllerNode(Node):
     def _now(self) -> float:
         """ROS time, s."""
         return 1e-9 * self._now_ns()
+
+    def _known(self) -> tuple[Calibration | None, MirrorInfo | None]:
+        return self._calibration, self._mirror_info
 
     # --- what the others say ---
 
@@ -193,6 +199,8 @@ class FocusControllerNode(Node):
         self._driver.check()
         if self._converge.busy:
             raise Refusal(ErrorCode.BUSY, "a closed loop (action converge) is running; cancel it first")
+        if self._recipes.busy:
+            raise Refusal(ErrorCode.BUSY, "recipes are being built (action build_recipes); cancel it first")
 
     def _carry_out(self, request: FocusRequest, dry_run: bool = False) -> tuple[FocusState, Waiting | None]:
         """Judge a request and, unless it is a dry run or refused, send the command. Publishes the state.
@@ -354,7 +362,7 @@ class FocusControllerNode(Node):
         driver = self._driver.latest
         if not self._hold.active or driver is None or driver.moving:
             return
-        if self._converge.busy:
+        if self._converge.busy or self._recipes.busy:
             self._hold.end("a closed loop is running")
             return
         signals = self._hold.correction(self._watch.look(now), now)

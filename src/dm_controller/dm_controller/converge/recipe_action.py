@@ -1,4 +1,4 @@
-"""The part of the action `converge` that builds recipes: goal to targets, build, store with the calibration.
+"""The action `build_recipes`: from a list of curvatures to recipes, built on the bench, stored with the calibration.
 
 Recipes that are whole are stored however the goal ends: on a failure of the bench or a cancel, those built before it.
 The mirror goes back to mid range.
@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from dm_msgs.action import Converge
-from dm_msgs.msg import Calibration, ErrorCode, MirrorInfo
+from dm_msgs.action import BuildRecipes
+from dm_msgs.msg import Calibration, ErrorCode, FocusRequest, MirrorInfo
 from dm_msgs.srv import StoreRecipes
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
@@ -20,33 +20,33 @@ from rclpy.node import Node
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.tracker import Applied, HysteresisTracker
 from dm_common.measurement import BenchError, Cancelled
-from dm_common.messages import doubles, recipe_book_message
+from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeError
-from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.parameters import Parameter
-from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
-from dm_controller.converge.recipe_building import (
-    BuildOptions,
-    BuildStep,
-    RecipeBuilder,
-    recipe_book,
-)
+from dm_common.ros.worker import ServiceCallError, WorkerActionServer, call, wait_for_clock
+from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
+from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
 from dm_controller.conversions import hysteresis_figures_of, limits_of, model_of
 from dm_controller.mirror_model import CalibratedMirror
 from dm_controller.planner import Planner
 from dm_controller.target import FocusTarget, TargetError
 
+#: Parameters that the hosting node declares beside BENCH_PARAMETERS.
 RECIPE_PARAMETERS = (
     Parameter(
-        "recipes.tolerance", float, 6.3e-10, "largest re-measured coefficient error of a recipe", "m", 1e-11, 1e-5,
+        "recipes.tolerance",
+        float,
+        6.3e-10,
+        "largest re-measured coefficient error of a recipe",
+        "m",
+        1e-11,
+        1e-5,
         live=True,
     ),
     Parameter("recipes.max_maps", int, 32, "maps that one recipe may take", "", 4, 100, live=True),
     Parameter("recipes.average", int, 8, "maps averaged after each degauss of a recipe", "", 2, 50, live=True),
-    Parameter("recipes.degauss_steps", int, 100, "half-swings of the degauss that recipes begin with", "", 1, 10000),
-    Parameter("recipes.degauss_timeout", float, 120.0, "longest wait for a degauss", "s", 1.0, 3600.0),
-)  # fmt: skip
+)
 
 #: A model that leaves a larger coefficient error of a curvature, m, cannot reach it.
 UNREACHABLE_ERROR = 2e-8
@@ -54,38 +54,66 @@ UNREACHABLE_ERROR = 2e-8
 STORE_TIMEOUT_S = 30.0
 
 
-class RecipeRun:
-    """Carries out goals with `curvatures`; blocks, in the worker thread of the action.
+class BuildRecipesAction:
+    """Serves `build_recipes`, one goal at a time; a newer goal is refused while one runs.
 
     Args:
-        values: parameters of the hosting node, RECIPE_PARAMETERS among them.
+        node: the hosting node.
+        values: its parameters, RECIPE_PARAMETERS and BENCH_PARAMETERS among them.
+        bench: shared with `converge`.
+        decide: judges a FocusRequest; returns an object with the `target` and raises an exception with an `error_code`
+            when the request cannot be carried out at all (no calibration, no such surface).
         known: calibration and mirror in use.
-        standing: what the host knows of the mirror's memory; None = nothing.
+        state: what the host knows of the actuators' hysteresis; None = nothing.
     """
 
     def __init__(
         self,
         node: Node,
         values: Mapping[str, Any],
-        bench: BenchServices,
+        bench: LoopBench,
+        decide: Callable[[Any], Any],
         known: Callable[[], tuple[Calibration | None, MirrorInfo | None]],
-        standing: Callable[[], HysteresisState | None],
+        state: Callable[[], HysteresisState | None] = lambda: None,
     ) -> None:
         self._node, self._values, self._bench = node, values, bench
-        self._known, self._standing = known, standing
+        self._decide, self._known, self._state = decide, known, state
         self._store = node.create_client(StoreRecipes, "store_recipes")
+        self._server = WorkerActionServer(node, BuildRecipes, "build_recipes", self._run)
 
-    def run(self, handle: ServerGoalHandle, target: FocusTarget) -> tuple[str, Any]:
-        """Build and store. The curvature of `target` does not count.
+    @property
+    def busy(self) -> bool:
+        """Whether recipes are being built: other commands would disturb it."""
+        return self._server.busy
+
+    def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+        try:
+            with self._bench.reserved(lambda: bool(handle.is_cancel_requested)):
+                outcome, result = self._build_and_store(handle)
+        except Exception as error:
+            outcome, error_code, message = ending(error)
+            result = BuildRecipes.Result(
+                error_code=error_code, message=message, residual_rms=math.nan, max_zernike=math.nan
+            )
+        # One line per severity: rclpy ties a severity to the line that logs.
+        if outcome == "succeed":
+            self._node.get_logger().info(f"build_recipes: {result.message}")
+        else:
+            self._node.get_logger().warning(f"build_recipes: {result.message}")
+        return outcome, result
+
+    def _build_and_store(self, handle: ServerGoalHandle) -> tuple[str, BuildRecipes.Result]:
+        """Build and store.
 
         Raises:
             BenchError, ValueError: refused before anything moved.
         """
         goal, bench = handle.request, self._bench
+        options = self._options(goal)
+        target: FocusTarget = self._decide(FocusRequest(conic_constant=goal.conic_constant)).target
         calibration, mirror = self._known()
         if calibration is None or mirror is None:
             raise BenchError(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
-        options = self._options(goal)
         loop = Planner(
             CalibratedMirror(model_of(calibration), limits_of(mirror)),
             hysteresis_figures_of(calibration),
@@ -102,20 +130,24 @@ class RecipeRun:
 
         def report(step: BuildStep) -> None:
             handle.publish_feedback(
-                Converge.Feedback(
+                BuildRecipes.Feedback(
                     step=builder.maps, curvature=step.curvature, residual_rms=step.rms, max_zernike=step.max_zernike
                 )
             )
 
         builder = RecipeBuilder(
-            loop, bench, now, options, state=self._standing() or self._guess(loop.law, now()), on_step=report,
+            loop,
+            bench,
+            now,
+            options,
+            state=self._state() or self._guess(loop.law, now()),
+            on_step=report,
             cancelled=bench.cancelled,
-        )  # fmt: skip
-        recipes, code, words = self._build(builder, targets)
-        result = Converge.Result(maps=builder.maps, residual_rms=math.nan, max_zernike=math.nan)
+        )
+        recipes, code, text = self._build(builder, targets)
+        result = BuildRecipes.Result(maps=builder.maps, residual_rms=math.nan, max_zernike=math.nan)
         rest = bench.rest(np.full(calibration.actuators, 0.5 * (mirror.signal_min + mirror.signal_max)))
         if recipes:
-            result.signals = doubles(recipes[-1].signals)
             result.residual_rms = max(recipe.rms for recipe in recipes)
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
             book = recipe_book(recipes, loop, self._values["recipes.degauss_steps"], clock.now().nanoseconds)
@@ -127,11 +159,11 @@ class RecipeRun:
                 result.recipes = len(recipes)
             else:
                 code = stored if code == ErrorCode.OK else code
-                words = "; ".join(filter(None, (words, f"the recipes were not stored: {reason}")))
+                text = "; ".join(filter(None, (text, f"the recipes were not stored: {reason}")))
         missed = [f"{r.curvature:+.4f}" for r in recipes if r.max_zernike > options.tolerance]
         if code == ErrorCode.OK and missed:
             code = ErrorCode.NOT_CONVERGED
-            words = f"not within the tolerance of {options.tolerance * 1e9:.2f} nm: {', '.join(missed)} 1/m"
+            text = f"not within the tolerance of {options.tolerance * 1e9:.2f} nm: {', '.join(missed)} 1/m"
         figures = (
             f"{result.recipes} of {len(targets)} recipes stored with calibration {calibration.id}, largest coefficient "
             f"error {result.max_zernike * 1e9:.2f} nm re-measured, {result.interpolation_error * 1e9:.2f} nm more "
@@ -139,11 +171,11 @@ class RecipeRun:
             if result.recipes
             else "no recipe was stored"
         )
-        result.error_code, result.message = code, "; ".join(filter(None, (words, figures, rest)))
+        result.error_code, result.message = code, "; ".join(filter(None, (text, figures, rest)))
         return {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "canceled"}.get(code, "abort"), result
 
     def _build(self, builder: RecipeBuilder, targets: list[FocusTarget]) -> tuple[list[Recipe], int, str]:
-        """Whole recipes, and what ended the work: an ErrorCode and words."""
+        """Whole recipes, and what ended the work: an ErrorCode and a sentence."""
         recipes: list[Recipe] = []
         try:
             for target in targets:
@@ -161,10 +193,7 @@ class RecipeRun:
 
     def _options(self, goal: Any) -> BuildOptions:
         """What the goal asks for, 0 = configured. Raises ValueError naming the field."""
-        if goal.method:
-            raise ValueError(
-                f"method = {goal.method!r}: recipes are corrected by the bounded programme; leave it empty"
-            )
+        check_figures(goal)
         values = self._values
         maps = goal.max_maps or values["recipes.max_maps"]
         # At least four rounds: without a memory law, hysteresis makes each correction miss by some share of itself.
@@ -173,8 +202,8 @@ class RecipeRun:
         return BuildOptions(tolerance, maps, average, float(values["converge.settle_time"]))
 
     def _targets(self, goal: Any, target: FocusTarget, loop: Planner) -> list[FocusTarget]:
-        if any(target.zernike):
-            raise ValueError("request.zernike: recipes are of plain conics; leave it empty")
+        if not goal.curvatures:
+            raise ValueError("curvatures: empty; name at least one, 1/m")
         try:
             return recipe_targets(list(goal.curvatures), target.conic_constant, loop, UNREACHABLE_ERROR)
         except UnreachableError as error:
@@ -193,7 +222,7 @@ class RecipeRun:
         return tracker.state
 
     def _stored(self, request: Any) -> tuple[int, str]:
-        """What the calibration node answers: an ErrorCode and words."""
+        """What the calibration node answers: an ErrorCode and a sentence."""
         try:
             response = call(self._store, request, STORE_TIMEOUT_S)
         except ServiceCallError as error:

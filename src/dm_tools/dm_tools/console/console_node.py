@@ -15,7 +15,7 @@ from typing import Any
 import rclpy
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dm_msgs.action import Calibrate, Converge, MoveFocus
+from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
 from dm_msgs.msg import (
     ActuatorState,
     Calibration,
@@ -59,10 +59,10 @@ SERVICES = {
     "list_calibrations": ListCalibrations,
     "load_calibration": LoadCalibration,
 }
-ACTIONS = {"calibrate": Calibrate, "converge": Converge, "move_focus": MoveFocus}
+ACTIONS = {"build_recipes": BuildRecipes, "calibrate": Calibrate, "converge": Converge, "move_focus": MoveFocus}
 
 #: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
-WATCHED = ("calibrate", "converge")
+WATCHED = ("build_recipes", "calibrate", "converge")
 
 #: A node whose diagnostics were not heard for so long counts as missing, s. Nodes publish once a second.
 SILENCE_S = 5.0

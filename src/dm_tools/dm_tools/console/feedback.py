@@ -17,3 +17,8 @@ def calibration_step(feedback: Any) -> str:
 def converge_step(feedback: Any) -> str:
     """Feedback of the action `converge`: the map and how far off it was."""
     return f"map {feedback.step}: largest coefficient {feedback.max_zernike * 1e9:.1f} nm"
+
+
+def recipe_step(feedback: Any) -> str:
+    """Feedback of the action `build_recipes`: the curvature, the map and how far off it was."""
+    return f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"

@@ -6,12 +6,12 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from dm_msgs.action import Calibrate, Converge, MoveFocus
+from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
 from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import Degauss, Flatten, LoadCalibration, Measure, SetFocus, SetSignals
 
 from dm_tools.console.console_node import RefusedError
-from dm_tools.console.feedback import calibration_step, converge_step
+from dm_tools.console.feedback import calibration_step, converge_step, recipe_step
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
 from dm_tools.console.view_models import NM, poke_signals, prediction_words
@@ -109,10 +109,9 @@ async def build_recipes(session: Session, curvatures: list[float]) -> str:
     def show(feedback: Any) -> None:
         done = sum(curvature < feedback.curvature - 1e-9 for curvature in order)
         session.progress.step, session.progress.steps = done, len(order)
-        session.progress.words = f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"
+        session.progress.words = recipe_step(feedback)
 
-    goal = Converge.Goal(curvatures=curvatures)
-    result = await session.ros.run("converge", goal, show)
+    result = await session.ros.run("build_recipes", BuildRecipes.Goal(curvatures=curvatures), show)
     session.base = None
     return str(result.message)
 

@@ -10,13 +10,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dm_tools.console.console_node import ConsoleNode, RefusedError, Snapshot
-from dm_tools.console.feedback import calibration_step, converge_step
+from dm_tools.console.feedback import calibration_step, converge_step, recipe_step
 from dm_tools.console.loops import Loop
 
 #: Failures that are kept until somebody dismisses them.
 FAILURES_KEPT = 50
 #: What an action that was not started here is called.
 ELSEWHERE = {
+    "build_recipes": "A run of recipes that was started elsewhere",
     "calibrate": "A calibration that was started elsewhere",
     "converge": "A closed loop that was started elsewhere",
 }
@@ -102,7 +103,7 @@ class Session:
         elif name == "calibrate":
             shown.step, shown.steps, shown.words = feedback.step, feedback.steps, calibration_step(feedback)
         else:
-            shown.words = converge_step(feedback)
+            shown.words = recipe_step(feedback) if name == "build_recipes" else converge_step(feedback)
         return shown
 
     def fail(self, title: str, sentence: str) -> None:

@@ -35,7 +35,7 @@ _TRANSITIONS = ("~/transition_event",)
 _LIFECYCLE = frozenset(node.name for node in NODES if node.lifecycle)
 #: What an operator's program calls.
 _OPERATION = ("degauss", "flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
-_LONG_OPERATION = ("calibrate", "converge", "move_focus")
+_LONG_OPERATION = ("build_recipes", "calibrate", "converge", "move_focus")
 #: Enclaves of nodes that go by simulated time on a twin.
 _TIMED = frozenset(node.name for node in NODES) - {"virtual_bench"}
 
@@ -98,7 +98,7 @@ _DECLARED = (
         subscribe=("actuator_state", "calibration", "focus_request", "mirror_info"),
         reply=("flatten", "set_focus"),
         request=("degauss", "measure", "predict_error", "set_signals", "store_recipes"),
-        execute=("converge", "move_focus"),
+        execute=("build_recipes", "converge", "move_focus"),
     ),
     NodeInterface(
         "autofocus",

@@ -65,7 +65,7 @@ class RecipesCard:
             session.fail("Recipes", str(error))
             return
         work = lambda: operations.build_recipes(session, curvatures)  # noqa: E731
-        session.begin("Recipes", work, lambda: session.ros.cancel("converge"))
+        session.begin("Recipes", work, lambda: session.ros.cancel("build_recipes"))
 
     def refresh(self, snapshot: Snapshot) -> None:
         why = why_not("converge", snapshot, self._session.running)

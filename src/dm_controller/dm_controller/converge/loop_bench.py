@@ -1,0 +1,102 @@
+"""What the actions `converge` and `build_recipes` have in common: their bench, its parameters, how a goal ends."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from dm_msgs.msg import ErrorCode
+from dm_msgs.srv import Degauss
+from rclpy.node import Node
+
+from dm_common.measurement import BenchError, Cancelled, Measurement, MeasurementError
+from dm_common.names import UnknownNameError
+from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.parameters import Parameter
+
+#: Parameters that the hosting node declares beside those of the two actions.
+BENCH_PARAMETERS = (
+    Parameter("converge.settle_time", float, 0.5, "wait between command and map, in ROS time", "s", 0.0, 600.0),
+    Parameter("converge.driver_timeout", float, 30.0, "longest wait for the driver to set a shape", "s", 0.1, 600.0),
+    Parameter("converge.measure_timeout", float, 60.0, "longest wait for one map", "s", 0.1, 3600.0),
+    Parameter("converge.measure_retries", int, 1, "further tries after a map that failed", "", 0, 20, live=True),
+    Parameter("recipes.degauss_steps", int, 100, "half-swings of the degauss that recipes begin with", "", 1, 10000),
+    Parameter("recipes.degauss_timeout", float, 120.0, "longest wait for a degauss", "s", 1.0, 3600.0),
+)
+
+#: Most maps that a goal may ask for.
+MAPS_MAX = 100
+
+
+class LoopBench(BenchServices):
+    """Driver and interferometer, for one goal of either action at a time.
+
+    Args:
+        node: the hosting node.
+        values: its parameters, BENCH_PARAMETERS among them.
+    """
+
+    def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
+        own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
+        super().__init__(node, own | {"degauss_timeout": values["recipes.degauss_timeout"]})
+        self._parameters = values
+        self._goal = threading.Lock()
+
+    @contextmanager
+    def reserved(self, cancelled: Callable[[], bool]) -> Iterator[None]:
+        """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
+
+        Raises:
+            BenchError: another goal has it.
+        """
+        if not self._goal.acquire(blocking=False):
+            raise BenchError(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
+        try:
+            self.cancelled = cancelled
+            yield
+        finally:
+            self._goal.release()
+
+    def degauss(self) -> None:
+        """The condition that recipes begin with: the driver's own number of steps may be another."""
+        request = Degauss.Request(steps=int(self._parameters["recipes.degauss_steps"]))
+        self._call(self._degauss, request, self._values["degauss_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
+
+    def measure(self, label: str) -> Measurement:
+        """One map. Raises MeasurementError after all tries, or BenchError when no other try can succeed."""
+        left = int(self._parameters["converge.measure_retries"])
+        while True:
+            try:
+                return super().measure(label)
+            except MeasurementError:
+                if left == 0 or self.cancelled():
+                    raise
+                left -= 1
+
+
+def check_figures(goal: Any) -> None:
+    """Raise ValueError naming the field of a goal of either action that makes no sense."""
+    if not (math.isfinite(goal.tolerance) and goal.tolerance >= 0.0):
+        raise ValueError(f"tolerance = {goal.tolerance} m: must be 0 (= configured) or above, and finite")
+    if goal.max_maps > MAPS_MAX:
+        raise ValueError(f"max_maps = {goal.max_maps}: must be 0 (= configured) to {MAPS_MAX}")
+
+
+def ending(error: Exception) -> tuple[str, int, str]:
+    """How a goal ends that `error` ended: the action's outcome, an ErrorCode and a sentence. A defect is raised again."""
+    if isinstance(error, Cancelled):
+        return "canceled", ErrorCode.CANCELED, str(error)
+    if isinstance(error, BenchError):
+        return "abort", error.code, str(error)
+    if hasattr(error, "error_code"):  # a refusal of the host
+        return "abort", error.error_code, str(error)
+    if isinstance(error, UnknownNameError):
+        return "abort", ErrorCode.UNKNOWN_NAME, str(error)
+    if isinstance(error, ValueError):
+        return "abort", ErrorCode.INVALID_ARGUMENT, str(error)
+    if isinstance(error, TimeoutError):
+        return "abort", ErrorCode.TIMEOUT, str(error)
+    raise error
