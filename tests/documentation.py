@@ -116,8 +116,8 @@ PARSED = {
     "./dm calibrate --plan surfaces --surfaces p06,p07,pz02": _LONG + "test_calibration_node.py runs the plan",
     "./dm calibrate --plan poke-check": _LONG + "test_end_to_end.py runs the plan",
     "./dm recipes": _LONG + "test_recipe_action.py runs the action",
-    "./dm recipes --curvatures=-0.02,0,0.02": "needs a memory plan first; test_recipe_action.py runs the action",
-    "./dm recipes --conic=-1 --curvatures=-0.05:0.05:11": "needs a memory plan first",
+    "./dm recipes --curvatures=-0.02,0,0.02": "needs a hysteresis plan first; test_recipe_action.py runs the action",
+    "./dm recipes --conic=-1 --curvatures=-0.05:0.05:11": "needs a hysteresis plan first",
     "./dm report": "the Python block of read-the-report.md writes the same; test_report_command.py runs it",
     "./dm report PDM30-37_virtual-1_20261121T112233Z --store ~/.ros/dm_bench/calibrations": "an example of an id",
     "./dm report path/to/calibration.h5 --out reports --json figures.json": "an example of a path",
@@ -136,7 +136,7 @@ PARSED = {
     "./dm paper --out runs/paper": _LONG + "test_paper.py runs it",
     "./dm paper --out runs/paper --json runs/paper.json": _LONG + "test_paper.py runs it",
     "./dm doctor --config my_bench.yaml": "must complain while the scene runs; test_doctor.py runs it",
-    "./dm exec python -m dm_simulation.plot --output twin.png": "draws for a minute",
+    "./dm exec python -m dm_simulation.plot --output simulation.png": "draws for a minute",
     "./dm exec python -m pytest -q src/dm_driver/test/test_electronics_contract.py": "is a test of its own",
 }
 #: Need another machine, its package manager or the network; what is named in them is checked by hand.
