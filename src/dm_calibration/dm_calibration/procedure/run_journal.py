@@ -164,6 +164,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise JournalError(
             f"{folder.name}: schema version {content.get('schema_version')}: this software reads {SCHEMA_VERSION}"
         )
+    identity = content.get("identity")
+    if isinstance(identity, dict) and "memory_maps" in identity.get("plan_options", ()):  # its name before 0.2
+        identity["plan_options"]["hysteresis_maps"] = identity["plan_options"].pop("memory_maps")
+        if identity.get("plan") == "MEMORY":
+            identity["plan"] = "HYSTERESIS"
     return content
 
 

@@ -1,0 +1,122 @@
+"""What version 0.1.0 stored still loads, is published, and predicts the numbers that it predicted then."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dm_msgs.msg import Calibration as CalibrationMsg
+from numpy.typing import NDArray
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_messages import calibration_message, put_updates
+from dm_calibration.procedure.event_frames import record_hash
+from dm_calibration.procedure.outcome import Setup
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure.resumable_run import ResumeOptions, identity_of, open_run
+from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
+from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.hysteresis.model import follow
+from dm_common.messages import hysteresis_model_from, recipe_book_from
+from dm_common.mirror import NEIGHBOUR_REACH, Mirror
+
+Floats = NDArray[np.float64]
+
+STORED = Path(__file__).with_name("stored")
+EXPECTED: dict[str, Floats] = dict(np.load(STORED / "expected.npz"))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> CalibrationStore:
+    for packed in STORED.glob("*.gz"):
+        (tmp_path / packed.stem).write_bytes(gzip.decompress(packed.read_bytes()))
+    return CalibrationStore(tmp_path)
+
+
+def published(store: CalibrationStore, identifier: str) -> tuple[Calibration, CalibrationMsg]:
+    calibration = store.load(identifier)
+    return calibration, calibration_message(calibration, store.folder / f"{identifier}.h5", "mirror", 1e-8)
+
+
+def check(message: CalibrationMsg, name: str) -> None:
+    """Compare what `message` predicts for the commands, and its figures, with what was expected then."""
+    commands = EXPECTED["commands"]
+    for field, offset, size in (
+        ("coefficients", message.zernike_offset, message.terms),
+        ("sag", message.sag_offset, message.points),
+    ):
+        matrix = message.influence_zernike if field == "coefficients" else message.influence_sag
+        found = np.array(offset) + commands @ np.array(matrix).reshape(size, message.actuators).T
+        np.testing.assert_allclose(found, EXPECTED[f"{name}/{field}"], rtol=0.0, atol=1e-18)
+    figures = (
+        message.held_out_rms,
+        message.held_out_max_zernike,
+        message.condition_number,
+        message.quality,
+        message.maps_used,
+    )
+    np.testing.assert_array_equal(figures, EXPECTED[f"{name}/figures"])
+
+
+def test_an_influence_function(store: CalibrationStore) -> None:
+    calibration, message = published(store, "linear")
+    check(message, "linear")
+    assert message.id == "linear"
+    assert calibration.note == "made before the house"
+    assert calibration.region_weights.size == 10
+    assert calibration.hysteresis is None
+    assert not calibration.recipes.recipes
+
+
+def test_what_later_maps_changed(store: CalibrationStore) -> None:
+    calibration, message = published(store, "linear")
+    manager = RecalibrationManager(store.folder, lambda: UpdateOptions(signal_sigma=1e-3))
+    assert manager.begin(calibration) == ""
+    updates, fit = manager.updates, manager.changed_fit()
+    assert updates is not None
+    assert fit is not None
+    put_updates(message, updates, fit, [], False)
+    check(message, "updated")
+    drift = (message.revision, message.gain_drift, message.offset_drift)
+    np.testing.assert_allclose(drift, EXPECTED["updated/drift"], rtol=1e-12)
+
+
+def test_hysteresis_and_recipes(store: CalibrationStore) -> None:
+    _, message = published(store, "hysteresis")
+    check(message, "hysteresis")
+    model = hysteresis_model_from(message.hysteresis)
+    assert model is not None
+    rest = model.demagnetised(message.actuators, 0.0)
+    effective = follow(model, rest, EXPECTED["commands"], EXPECTED["times"])[0]
+    np.testing.assert_allclose(effective, EXPECTED["hysteresis/effective"], rtol=0.0, atol=1e-14)
+    np.testing.assert_array_equal(message.hysteresis.zernike_sigma, EXPECTED["hysteresis/sigma"])
+    book = recipe_book_from(message.recipes)
+    rows = [[recipe.curvature, *recipe.effective, *recipe.signals] for recipe in book.recipes]
+    np.testing.assert_array_equal(rows, EXPECTED["hysteresis/recipes"])
+
+
+def test_a_run_that_was_cut_off_goes_on(store: CalibrationStore) -> None:
+    folder = store.folder / "unfinished" / "20251122T000000Z"
+    folder.mkdir(parents=True)
+    for name in ("manifest.json", "events"):
+        shutil.copyfile(STORED / name, folder / name)
+    os.utime(folder / "events")
+    linear = store.load("linear")
+    places = np.column_stack((linear.actuator_x, linear.actuator_y))
+    distance = np.linalg.norm(places[:, None] - places, axis=2)
+    neighbours = np.argwhere(np.triu(distance < NEIGHBOUR_REACH * 4.3e-3, 1))
+    mirror = Mirror(linear.mirror_name, linear.mirror_serial, *places.T, linear.aperture_radius, neighbours=neighbours)
+    plan = make_plan(PlanKind.POKES, mirror)
+    identity = identity_of(plan, PlanOptions(), mirror, {"settle_time_s": 0.5}, {"wiring": "w"})
+    with UnfinishedRuns(store.folder) as runs:
+        run = open_run(runs, identity, plan, ResumeOptions(3600.0))
+        run.journal.keep(Setup(run.outcome.maps().points, 0.0, 0))  # it goes on behind the frames of then
+        run.journal.close()
+    assert run.resumed == f"resumed run {folder.name} with 4 maps"
+    assert [record_hash(record) for record in run.outcome.records] == list(EXPECTED["unfinished/hashes"])
+    assert run.outcome.maps().sag.shape == (4, 30)
