@@ -1,4 +1,4 @@
-"""What the actions `converge` and `build_recipes` work with, for their tests: a host node, and stand-ins for driver and interferometer."""
+"""What the actions `converge` and `build_recipes` work with, for tests: a host, stand-in driver and interferometer."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from dm_common.ros.parameters import declare
 from dm_controller.converge.converge_action import CONVERGE_PARAMETERS, ConvergeAction
 from dm_controller.converge.loop_bench import BENCH_PARAMETERS, LoopBench
 from dm_controller.converge.recipe_action import RECIPE_PARAMETERS, BuildRecipesAction
-from dm_controller.conversions import target_of
-from dm_controller.target import FocusTarget
+from dm_controller.planning.conversions import target_of
+from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 X, Y = hexagon()

@@ -19,7 +19,7 @@ from dm_common.optics.sampling import SamplePoints, edge_clustered_points
 from dm_common.optics.zernike import basis
 
 if TYPE_CHECKING:
-    from dm_controller.mirror_model import InfluenceModel
+    from dm_controller.planning.mirror_model import InfluenceModel
 
 Floats = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ class LinearMirror:
     def model(self, held_out: float = 1e-10) -> InfluenceModel:
         """What a perfect calibration would say of this mirror, with a held-out error (m) of choice."""
         # Here, because the tests of dm_calibration use this module too, and that package must do without dm_controller.
-        from dm_controller.mirror_model import InfluenceModel
+        from dm_controller.planning.mirror_model import InfluenceModel
 
         return InfluenceModel(
             aperture_radius=RADIUS,

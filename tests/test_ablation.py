@@ -7,7 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from dm_controller.target import FocusTarget
+from dm_controller.planning.target import FocusTarget
 from studies.comparison.ablation import (
     CONDITIONED,
     DWELLS,

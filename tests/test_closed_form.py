@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dm_common.optics.zernike import TERMS
-from dm_controller.mirror_model import CalibratedMirror, Plan
+from dm_controller.planning.mirror_model import CalibratedMirror, Plan
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import Limits
-from dm_controller.target import FocusTarget
 from linear_mirror import LinearMirror, hexagon, make_mirror
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from dm_common.measurement import BenchError, Measurement
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
+from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.base import Shape, Solver
 from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.registry import make_solver
-from dm_controller.target import FocusTarget, TargetError
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().neighbours, dtype=np.intp), 2.0)

@@ -14,7 +14,7 @@ from dm_msgs.msg import ErrorCode, FocusRequest
 
 from converge_stand_in import Bench, Host
 from dm_common.ros.executor import BackgroundExecutor
-from dm_controller.target import FocusTarget
+from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS
 from support import Observer
 

@@ -26,7 +26,7 @@ from dm_bringup.suite import Suite, own_domain, save_config
 from dm_calibration.map_files import read_map
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.ros.action_client import ThreadedActionClient
-from dm_controller.target import FocusTarget
+from dm_controller.planning.target import FocusTarget
 from dm_simulation.parameters import PARAMETERS
 from dm_tools.demo.demo import bench_config
 from dm_tools.verify import map_of, surface_error

@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from dm_common.errors import Refusal
 from dm_common.hysteresis.model import HysteresisModel
-from dm_controller.active_calibration import active_calibration
+from dm_controller.planning.active_calibration import active_calibration
 from focus_bench import RememberingBench, make_law, mirror_info, recipe, remembering_calibration
 from support import NodeProcess, Observer, wait_until
 

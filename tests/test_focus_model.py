@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dm_common.optics.zernike import basis
-from dm_controller.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.bounded import Limits
-from dm_controller.target import FocusTarget, TargetError
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 PAIRS = np.asarray(make_mirror().neighbours, dtype=np.intp)

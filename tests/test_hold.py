@@ -9,10 +9,10 @@ import numpy as np
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_controller.creep_hold import PERIOD_S, CreepHold
 from dm_controller.hysteresis_observer import Look
-from dm_controller.mirror_model import CalibratedMirror
-from dm_controller.planner import HysteresisFigures, Planner
+from dm_controller.planning.mirror_model import CalibratedMirror
+from dm_controller.planning.planner import HysteresisFigures, Planner
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import Limits
-from dm_controller.target import FocusTarget
 from linear_mirror import LinearMirror, hexagon, make_mirror
 
 DEFAULTS = {

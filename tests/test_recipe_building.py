@@ -20,11 +20,11 @@ from dm_controller.converge.recipe_building import (
     recipe_book,
 )
 from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
-from dm_controller.mirror_model import CalibratedMirror
-from dm_controller.planner import HysteresisFigures, Planner
-from dm_controller.recipes import find
+from dm_controller.planning.mirror_model import CalibratedMirror
+from dm_controller.planning.planner import HysteresisFigures, Planner
+from dm_controller.planning.recipes import find
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import Limits
-from dm_controller.target import FocusTarget
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from studies.comparison.compare import true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model

@@ -24,7 +24,7 @@ from dm_calibration.regression.surface_error import SURFACES
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
-from dm_controller.mirror_model import CalibratedMirror
+from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.prediction import ForecastClient, hysteresis_share, surface_control_error_rms
 from dm_controller.solvers.bounded import Limits
 from hysteretic_mirror import MIRROR, calibrated, calibrated_by_pokes

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from dm_common.names import UnknownNameError
-from dm_controller.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import FREE, Shape, Solver, rms_sag, target_shape
 from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.iterative_learning import IterativeLearning
 from dm_controller.solvers.pseudo_inverse import PseudoInverse
 from dm_controller.solvers.region_weighted import AZWreg
 from dm_controller.solvers.registry import DEFAULT
-from dm_controller.target import FocusTarget
 from dm_simulation.mirror.plate import Plate
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from studies.solvers.plate_model import PlateProperties, plate_influence

@@ -23,8 +23,8 @@ from dm_common.messages import doubles
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import TERMS, basis
-from dm_controller.mirror_model import InfluenceModel
-from dm_controller.planner import HysteresisFigures
+from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.planner import HysteresisFigures
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from studies.benchmarks.jobs.bounded_solve import PITCH, STROKE
 from studies.solvers.plate_model import PlateProperties, plate_influence

@@ -16,9 +16,9 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.procedure import Progress
 from dm_common.hysteresis.tracker import HysteresisTracker
 from dm_controller.creep_hold import PERIOD_S
-from dm_controller.planner import SETTLE_S, Move
-from dm_controller.recipes import find
-from dm_controller.target import FocusTarget
+from dm_controller.planning.planner import SETTLE_S, Move
+from dm_controller.planning.recipes import find
+from dm_controller.planning.target import FocusTarget
 from studies.comparison.ablation_models import MODELS, Variant, make_variants
 from studies.comparison.compare import peak_to_valley
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, plan_steps

@@ -12,9 +12,9 @@ from dm_calibration.influence.fit import FitOptions
 from dm_common.hysteresis.tracker import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
-from dm_controller.mirror_model import CalibratedMirror
-from dm_controller.planner import HysteresisFigures, Planner
-from dm_controller.target import FocusTarget
+from dm_controller.planning.mirror_model import CalibratedMirror
+from dm_controller.planning.planner import HysteresisFigures, Planner
+from dm_controller.planning.target import FocusTarget
 from studies.comparison.compare import CURVATURES
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 

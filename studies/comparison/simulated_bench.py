@@ -24,7 +24,7 @@ from dm_common.hysteresis.tracker import Applied
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points, sample_map
-from dm_controller.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.bounded import Limits
 from dm_driver.degauss import degauss_waypoints
 from dm_driver.output.volts import VoltScale

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.optics.zernike import basis
-from dm_controller.mirror_model import FREE_TERMS
+from dm_controller.planning.mirror_model import FREE_TERMS
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import BoundedProgramme, Limits
-from dm_controller.target import FocusTarget
 from studies.comparison.simulated_bench import SimulatedBench
 
 Floats = NDArray[np.float64]

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import FREE, Floats, Shape, Solver, measured_shape, rms_sag, target_shape
-from dm_controller.target import FocusTarget
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 from studies.paper.regressions import fit_of
 from studies.paper.remembering import RememberingControl

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_controller.target import FocusTarget
+from dm_controller.planning.target import FocusTarget
 from studies.comparison.simulated_bench import SimulationConfig
 from studies.paper.control import (
     LINEAR_READINGS,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dm_controller.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.registry import SOLVERS as OFFERED

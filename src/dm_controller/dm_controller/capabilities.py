@@ -6,8 +6,8 @@ from typing import Any
 
 from dm_msgs.msg import Capabilities
 
-from dm_controller.active_calibration import ActiveCalibration
-from dm_controller.target import FocusTarget
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.target import FocusTarget
 
 
 def capabilities_message(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dm_common.hysteresis.model import HysteresisModel
 from dm_controller.hysteresis_observer import Look
-from dm_controller.planner import Planner
+from dm_controller.planning.planner import Planner
 
 Floats = NDArray[np.float64]
 

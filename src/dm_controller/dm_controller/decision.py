@@ -12,12 +12,12 @@ from dm_msgs.msg import ErrorCode, FocusRequest
 
 from dm_common.errors import Refusal
 from dm_common.recipes import RecipeError
-from dm_controller.active_calibration import ActiveCalibration
-from dm_controller.conversions import target_of
 from dm_controller.hysteresis_observer import Look, after_degauss
-from dm_controller.planner import Move
-from dm_controller.recipes import FoundRecipe, find
-from dm_controller.target import FocusTarget, TargetError
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.conversions import target_of
+from dm_controller.planning.planner import Move
+from dm_controller.planning.recipes import FoundRecipe, find
+from dm_controller.planning.target import FocusTarget, TargetError
 
 #: A message's constants are properties of its class, which take longer to look up.
 _MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED)

@@ -28,7 +28,6 @@ from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import never_silent
-from dm_controller.active_calibration import NO_CALIBRATION, ActiveCalibration, active_calibration
 from dm_controller.capabilities import capabilities_message, settling_time
 from dm_controller.conditioning import Conditioner, Waiting
 from dm_controller.converge.converge_action import ConvergeAction
@@ -42,9 +41,10 @@ from dm_controller.focus_report import Outcome, fill_state, health, state_of
 from dm_controller.hysteresis_observer import CURE, HysteresisObserver, same_model
 from dm_controller.latency import Latency
 from dm_controller.move_focus_action import MoveFocusAction
+from dm_controller.planning.active_calibration import NO_CALIBRATION, ActiveCalibration, active_calibration
+from dm_controller.planning.target import FocusTarget
 from dm_controller.prediction import ForecastClient
 from dm_controller.request_checks import check_age, check_reachable
-from dm_controller.target import FocusTarget
 
 #: Time after a command until `focus_state` tells of it, s. Whoever waits for the command wakes up meanwhile: it may
 #: have to on this very core (measured: 0.2 ms sooner).
@@ -56,7 +56,7 @@ LOOK_S = 0.5
 
 
 class FocusControllerNode(Node):
-    """See README for the interfaces; the mathematics is in `dm_controller.mirror_model` and `dm_controller.planner`.
+    """See README for the interfaces; the mathematics is in `dm_controller.planning`.
 
     Requests come from the executor and from the threads of move_focus and conditioning. They are judged and carried out
     one at a time, under `_turn`.

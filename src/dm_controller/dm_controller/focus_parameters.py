@@ -9,7 +9,7 @@ from dm_controller.converge.converge_action import CONVERGE_PARAMETERS
 from dm_controller.converge.loop_bench import BENCH_PARAMETERS
 from dm_controller.converge.recipe_action import RECIPE_PARAMETERS
 from dm_controller.creep_hold import PERIOD_S
-from dm_controller.planner import SETTLE_S
+from dm_controller.planning.planner import SETTLE_S
 
 PARAMETERS: Final = (
     Parameter(

@@ -16,7 +16,7 @@ from dm_msgs.msg import ActuatorState
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.tracker import Applied, HysteresisTracker
 from dm_common.messages import stamp_ns
-from dm_controller.planner import Planner
+from dm_controller.planning.planner import Planner
 
 #: Reports kept for a law that is identified later: a calibration run makes some hundred.
 LOG_LENGTH = 5_000

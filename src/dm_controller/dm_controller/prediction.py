@@ -21,8 +21,8 @@ from rclpy.node import Node
 
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
-from dm_controller.mirror_model import CalibratedMirror, InfluenceModel
-from dm_controller.target import FocusTarget
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
 

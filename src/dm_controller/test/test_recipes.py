@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
-from dm_controller.recipes import find, interpolation_error
-from dm_controller.target import FocusTarget
+from dm_controller.planning.recipes import find, interpolation_error
+from dm_controller.planning.target import FocusTarget
 
 CURVATURES = (-0.03, -0.01, 0.0, 0.02, 0.03, 0.05)
 DIRECTION = np.random.default_rng(3).standard_normal((4, 5))

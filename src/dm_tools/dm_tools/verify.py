@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.optics.map_fit import MapFitter
-from dm_controller.mirror_model import FREE_TERMS
-from dm_controller.target import FocusTarget
+from dm_controller.planning.mirror_model import FREE_TERMS
+from dm_controller.planning.target import FocusTarget
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ import numpy as np
 
 from dm_common.measurement import Cancelled, Measurement
 from dm_common.optics.zernike import TERM_RMS
-from dm_controller.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import FREE, Floats, Shape, Solver, measured_shape, rms_sag, target_shape
-from dm_controller.target import FocusTarget
 
 #: Bounds of the factor on a correction that the watched response may ask for.
 SCALE_MIN, SCALE_MAX = 0.6, 1.5

@@ -23,10 +23,10 @@ from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
-from dm_controller.conversions import limits_of, model_of
+from dm_controller.planning.conversions import limits_of, model_of
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import MirrorFacts, make_solver
-from dm_controller.target import FocusTarget
 
 #: Parameters that the hosting node declares beside BENCH_PARAMETERS.
 CONVERGE_PARAMETERS = (

@@ -86,7 +86,7 @@ def check_figures(goal: Any) -> None:
 
 
 def ending(error: Exception) -> tuple[str, int, str]:
-    """How a goal ends that `error` ended: the action's outcome, an ErrorCode and a sentence. A defect is raised again."""
+    """Outcome of the action, ErrorCode and sentence of a goal that `error` ended. A defect is raised again."""
     if isinstance(error, Cancelled):
         return "canceled", ErrorCode.CANCELED, str(error)
     if isinstance(error, BenchError):

@@ -27,10 +27,10 @@ from dm_common.ros.worker import ServiceCallError, WorkerActionServer, call, wai
 from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
-from dm_controller.conversions import hysteresis_figures_of, limits_of, model_of
-from dm_controller.mirror_model import CalibratedMirror
-from dm_controller.planner import Planner
-from dm_controller.target import FocusTarget, TargetError
+from dm_controller.planning.conversions import hysteresis_figures_of, limits_of, model_of
+from dm_controller.planning.mirror_model import CalibratedMirror
+from dm_controller.planning.planner import Planner
+from dm_controller.planning.target import FocusTarget, TargetError
 
 #: Parameters that the hosting node declares beside BENCH_PARAMETERS.
 RECIPE_PARAMETERS = (

@@ -20,11 +20,11 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Cancelled, Measurement
 from dm_common.recipes import Recipe, RecipeBook, RecipeError
 from dm_controller.converge.recipe_targets import UnreachableError
-from dm_controller.mirror_model import FREE_TERMS
-from dm_controller.planner import Planner
-from dm_controller.recipes import interpolation_error
+from dm_controller.planning.mirror_model import FREE_TERMS
+from dm_controller.planning.planner import Planner
+from dm_controller.planning.recipes import interpolation_error
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import MISS, Floats, Shape, measured_shape, rms_sag, target_shape
-from dm_controller.target import FocusTarget
 
 #: Effective signals that a limit denies by more than this make a shape unreachable from the condition.
 MISSED_MAX = 1e-3

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from dm_common.recipes import RecipeError
-from dm_controller.planner import Planner
-from dm_controller.recipes import SAME_CURVATURE
-from dm_controller.target import FocusTarget
+from dm_controller.planning.planner import Planner
+from dm_controller.planning.recipes import SAME_CURVATURE
+from dm_controller.planning.target import FocusTarget
 
 
 class UnreachableError(RecipeError):

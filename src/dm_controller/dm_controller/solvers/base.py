@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from dm_common.optics.sag import remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
-from dm_controller.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import SLACK, Limits
-from dm_controller.target import FocusTarget
 
 Floats = NDArray[np.float64]
 

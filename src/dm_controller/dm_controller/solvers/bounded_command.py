@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dm_controller.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows
 from dm_controller.solvers.bounded import BoundedProgramme, Limits
 
@@ -13,7 +13,7 @@ TINY = 1e-12
 
 
 class Bounded(Solver):
-    """Least squares inside the box: `dm_controller.mirror_model.CalibratedMirror` for shapes and corrections of any kind.
+    """Least squares inside the box: `CalibratedMirror` for shapes and corrections of any kind.
 
     The coefficients beyond tilt weigh so much that they act as equalities, the sag beyond the 21 terms is as small as
     possible, and the limits hold by construction: nothing is ever clipped. Corrections also weigh what

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dm_controller.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import FREE, Floats, Shape, Solver, normalised_terms
 from dm_controller.solvers.bounded import Limits
 

@@ -60,9 +60,9 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
 
 def best_possible(calibration: Any, mirror: Any) -> float:
     """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, as the model says."""
-    from dm_controller.conversions import limits_of, model_of
-    from dm_controller.mirror_model import CalibratedMirror
-    from dm_controller.target import FocusTarget
+    from dm_controller.planning.conversions import limits_of, model_of
+    from dm_controller.planning.mirror_model import CalibratedMirror
+    from dm_controller.planning.target import FocusTarget
 
     calibrated = CalibratedMirror(model_of(calibration), limits_of(mirror))
     return max(calibrated.plan(FocusTarget(curvature)).rms for curvature in (CURVATURES[0], CURVATURES[-1]))
@@ -72,7 +72,7 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
     """Ask for each curvature, measure what came, and compare."""
     import numpy as np
 
-    from dm_controller.target import FocusTarget
+    from dm_controller.planning.target import FocusTarget
     from dm_tools.verify import map_of, surface_error
 
     rows = []

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.messages import doubles, hysteresis_model_from
-from dm_controller.mirror_model import InfluenceModel
-from dm_controller.planner import HysteresisFigures
+from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.planner import HysteresisFigures
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import Limits
-from dm_controller.target import FocusTarget
 
 __all__ = ["doubles", "hysteresis_figures_of", "limits_of", "model_of", "target_of"]
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator, make_interp_spline
 
 from dm_common.recipes import Recipe, RecipeBook, RecipeError
-from dm_controller.mirror_model import FREE_TERMS
-from dm_controller.target import FocusTarget
+from dm_controller.planning.mirror_model import FREE_TERMS
+from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
 Curve = Callable[[float], Floats]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dm_common.optics.conic_series import ORDERS, series, series_coefficients, series_sag
 from dm_common.optics.zernike import TERMS, basis
-from dm_controller.target import FocusTarget
+from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.optics.zernike import TERM_RMS, basis
-from dm_controller.closed_form import ClosedForm
+from dm_controller.planning.closed_form import ClosedForm
+from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import BoundedProgramme, Limits
-from dm_controller.target import FocusTarget
 
 #: Piston and the two tilts are free: focus does not care, and an interferometer cannot see piston.
 FREE_TERMS = 3

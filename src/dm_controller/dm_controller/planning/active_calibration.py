@@ -12,10 +12,10 @@ from dm_common.errors import Refusal
 from dm_common.hysteresis.model import certain_reach
 from dm_common.messages import recipe_book_from, stamp_ns
 from dm_common.recipes import RecipeBook
-from dm_controller.conversions import hysteresis_figures_of, limits_of, model_of
-from dm_controller.mirror_model import CalibratedMirror
-from dm_controller.planner import Planner
-from dm_controller.target import FocusTarget
+from dm_controller.planning.conversions import hysteresis_figures_of, limits_of, model_of
+from dm_controller.planning.mirror_model import CalibratedMirror
+from dm_controller.planning.planner import Planner
+from dm_controller.planning.target import FocusTarget
 
 NO_CALIBRATION = "no calibration: run `./dm calibrate` or load_calibration"
 

@@ -1,0 +1,1 @@
+"""From a target and the state of the actuators to a command: targets, the mirror, plans and recipes."""
