@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState, Calibration, ErrorCode, FocusRequest, MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorState, Calibration, FocusRequest, MirrorInfo, ZernikeCoefficients
 from dm_msgs.srv import Degauss, Measure, SetSignals
 from rclpy.node import Node
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles
 from dm_common.ros import qos
 from dm_common.ros.parameters import declare
@@ -22,12 +23,6 @@ from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 X, Y = hexagon()
-
-
-class Refused(Exception):
-    """As the focus controller refuses."""
-
-    error_code = ErrorCode.STALE
 
 
 @dataclass
@@ -128,5 +123,5 @@ class Host(Node):
 
     def decide(self, request: FocusRequest) -> Decision:
         if self.refuse:
-            raise Refused("header.stamp: the request is 9 s old")
+            raise Refusal(ErrorCode.STALE, "header.stamp: the request is 9 s old")
         return Decision(target_of(request))

@@ -7,7 +7,8 @@ from dataclasses import replace
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions, Progress
 from dm_calibration.procedure.recorded_run import Move, RecordedRun
-from dm_common.measurement import MAP_REJECTED, Bench, Measurement, MeasurementError
+from dm_common.errors import ErrorCode, MeasurementError
+from dm_common.measurement import Bench, Measurement
 from dm_common.mirror import Mirror
 from hysteretic_mirror import MIRROR, Floats, RememberingBench
 
@@ -41,7 +42,7 @@ class RecordingBench:
     def measure(self, label: str) -> Measurement:
         self._bench.clock_ns += 10**8
         if label in self._failing:
-            raise MeasurementError(MAP_REJECTED, "no new file within 5 s")
+            raise MeasurementError(ErrorCode.MAP_REJECTED, "no new file within 5 s")
         self.maps.append(self._bench.measure(label))
         return replace(self.maps[-1], moved_ns=self.moves[-1].stamp_ns)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.electronics import Edac40Tcp
@@ -17,7 +18,6 @@ from dm_driver.moves import Kind, Outcome, WriterState
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import TABLES, wiring_table
-from dm_driver.refusal import Reason, Refusal
 from dm_driver.safety_limiter import Limits, SafetyLimiter
 from drive_unit_servers import Edac40TcpUnit, Frame
 from support import wait_until
@@ -66,10 +66,10 @@ def shape(value: float) -> np.ndarray:
     return np.full(37, value)
 
 
-def refused(action: Callable[[], Any]) -> Reason:
+def refused(action: Callable[[], Any]) -> int:
     with pytest.raises(Refusal) as caught:
         action()
-    return caught.value.reason
+    return caught.value.error_code
 
 
 def test_nothing_is_written_before_enable_and_then_the_safe_shape_first(unit: Edac40TcpUnit) -> None:
@@ -81,7 +81,7 @@ def test_nothing_is_written_before_enable_and_then_the_safe_shape_first(unit: Ed
     )
     writer.start()
     assert writer.wait_for_link(5)
-    assert refused(lambda: writer.command(shape(0))) is Reason.DRIVER_INACTIVE
+    assert refused(lambda: writer.command(shape(0))) is ErrorCode.DRIVER_INACTIVE
     assert unit.raw == b""
     assert writer.state().applied is None
     assert writer.enable(5)
@@ -158,7 +158,7 @@ def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac
             try:
                 last = writer.command(limiter.check_shape(generator.uniform(-0.6, 0.6, 37)))
             except Refusal as refusal:
-                assert refusal.reason is Reason.NEIGHBOUR_DIFFERENCE
+                assert refusal.error_code is ErrorCode.NEIGHBOUR_DIFFERENCE
             if number == 30:
                 writer.degauss(0.0, 6, shape(0.0))
             time.sleep(generator.uniform(0, 0.01))
@@ -181,7 +181,7 @@ def test_degauss_on_the_wire(unit: Edac40TcpUnit) -> None:
         assert not writer.state().history_known  # wider swings than 0.5 are still remembered
         wait_until(lambda: len(unit.frames) == writer.state().sequence)
         for bad in (lambda: writer.degauss(1.01, 10, shape(0)), lambda: writer.degauss(0.5, 0, shape(0))):
-            assert refused(bad) is Reason.OUT_OF_RANGE
+            assert refused(bad) is ErrorCode.OUT_OF_RANGE
     one = signals_of(unit.frames)
     assert np.ptp(one, axis=1).max() <= CODE  # all together
     level = one[1:-1, 0]
@@ -249,7 +249,7 @@ def test_link_loss_in_a_ramp_and_return(unit: Edac40TcpUnit) -> None:
         lost = writer.state()
         assert not lost.link_up and not lost.history_known and lost.moving is None
         assert "EDAC40 at 127.0.0.1" in lost.fault
-        assert refused(lambda: writer.command(shape(0.0))) is Reason.ELECTRONICS_UNREACHABLE
+        assert refused(lambda: writer.command(shape(0.0))) is ErrorCode.ELECTRONICS_UNREACHABLE
         assert lost.applied is not None and lost.applied.max() < 0.6
         before = len(unit.frames)
         unit.plug()
@@ -277,7 +277,7 @@ def test_disable_ramps_to_the_safe_shape_and_refuses_commands(unit: Edac40TcpUni
         moving = writer.command(shape(-0.5))
         assert writer.disable(5) is Outcome.REACHED
         assert moving.wait(0) in (Outcome.SUPERSEDED, Outcome.REACHED)
-        assert refused(lambda: writer.command(shape(0.0))) is Reason.DRIVER_INACTIVE
+        assert refused(lambda: writer.command(shape(0.0))) is ErrorCode.DRIVER_INACTIVE
         sequence = writer.state().sequence
         wait_until(lambda: len(unit.frames) == sequence)
         on_wire = signals_of(unit.frames)

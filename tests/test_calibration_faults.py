@@ -17,13 +17,13 @@ import yaml
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
-from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import ListCalibrations, LoadCalibration
 
 from calibration_stand_in import StandIn
 from dm_calibration.procedure.event_frames import map_hashes, record_hash
 from dm_calibration.procedure.run_journal import read_run
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, make_mirror
 from stuck_calibration import MARK

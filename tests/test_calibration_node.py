@@ -13,13 +13,14 @@ import pytest
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.action import Calibrate
-from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo
+from dm_msgs.msg import ActuatorState, MirrorInfo
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
 
 from calibration_stand_in import StandIn, doubles
 from dm_calibration.procedure.plan import PlanKind
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.errors import ErrorCode
 from dm_common.optics.sag import remove_piston_tilt
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, hexagon, make_mirror

@@ -10,7 +10,8 @@ import pytest
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
-from dm_common.measurement import BenchError, Cancelled, Measurement, MeasurementError
+from dm_common.errors import Cancelled, MeasurementError, Refusal
+from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from linear_mirror import RADIUS, LinearMirror, make_mirror
 
@@ -120,9 +121,9 @@ def test_a_state_without_a_map_is_dropped_and_reported(bench: Bench, mirror: Mir
 
 def test_several_states_without_a_map_end_the_run(bench: Bench, mirror: Mirror) -> None:
     bench.failing = {label: 99 for label in ("poke+02", "poke-02", "poke+03")}
-    with pytest.raises(BenchError, match="3 states in a row gave no map; the last: no map within 5 s") as caught:
+    with pytest.raises(Refusal, match="3 states in a row gave no map; the last: no map within 5 s") as caught:
         run(bench, mirror)
-    assert caught.value.code == 302
+    assert caught.value.error_code == 302
     assert "poke-03" not in bench.tries
 
 
@@ -180,11 +181,11 @@ def test_a_failing_driver_ends_the_run_and_keeps_the_maps(bench: Bench, mirror: 
 
     def apply(signals: np.ndarray) -> np.ndarray:
         if len(bench.applied) == 5:
-            raise BenchError(201, "set_signals: the link broke")
+            raise Refusal(201, "set_signals: the link broke")
         return good(signals)
 
     bench.apply = apply  # type: ignore[method-assign]
-    with pytest.raises(BenchError, match="the link broke"):
+    with pytest.raises(Refusal, match="the link broke"):
         procedure.run()
     assert len(procedure.outcome.records) == 5
 

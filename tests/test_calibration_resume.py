@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dm_calibration.calibration_errors import Refused
 from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.hysteresis.identify import CANDIDATES
@@ -24,7 +23,8 @@ from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, ident
 from dm_calibration.procedure.run_journal import EVENTS, read_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_calibration.store.calibration_store import CalibrationStore, StoreError
-from dm_common.measurement import BenchError, Measurement
+from dm_common.errors import Refusal
+from dm_common.measurement import Measurement
 from hysteretic_mirror import MIRROR, RememberingBench
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
@@ -181,12 +181,12 @@ def test_what_failed_last_is_tried_again(tmp_path: Path) -> None:
 
     def measure(label: str) -> Measurement:
         if label in ("poke+02", "poke-02", "poke+03"):
-            raise BenchError(306, "no interferometer node answered")
+            raise Refusal(306, "no interferometer node answered")
         return good(label)
 
     bench.measure = measure  # type: ignore[method-assign]
     run = opened(tmp_path, POKES)
-    with pytest.raises(BenchError):
+    with pytest.raises(Refusal):
         procedure(run, POKES, bench).run()
     run.journal.close()
     bench.measure = good  # type: ignore[method-assign]
@@ -218,7 +218,7 @@ def test_a_disk_that_fills_up_costs_one_map(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_two_nodes_do_not_calibrate_into_one_folder(tmp_path: Path) -> None:
-    with UnfinishedRuns(tmp_path), pytest.raises(Refused, match="another node is calibrating"):
+    with UnfinishedRuns(tmp_path), pytest.raises(Refusal, match="another node is calibrating"):
         UnfinishedRuns(tmp_path).__enter__()
 
 

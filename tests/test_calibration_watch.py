@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.msg import Calibration as CalibrationMsg
-from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import LoadCalibration, UpdateCalibration
 
 from calibration_stand_in import StandIn
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 from linear_mirror import LinearMirror
 from steady_mirror import NOISE, SteadyMirror, without_effect

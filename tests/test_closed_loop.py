@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from dm_common.measurement import BenchError, Measurement
+from dm_common.errors import Refusal
+from dm_common.measurement import Measurement
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
 from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.base import Shape, Solver
@@ -166,9 +167,9 @@ def test_cancelling_keeps_what_was_measured(solver: Solver) -> None:
 def test_failures_of_the_bench_pass_through(solver: Solver) -> None:
     class Broken(Plant):
         def measure(self, label: str) -> Measurement:
-            raise BenchError(302, "no map")
+            raise Refusal(302, "no map")
 
-    with pytest.raises(BenchError, match="no map"):
+    with pytest.raises(Refusal, match="no map"):
         converge(solver, FocusTarget(0.02), Broken())
 
 

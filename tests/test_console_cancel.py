@@ -14,10 +14,11 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from dm_common.errors import Refusal
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import WorkerActionServer
 from dm_tools.console import console_node as ros_side
-from dm_tools.console.console_node import ConsoleNode, RefusedError
+from dm_tools.console.console_node import ConsoleNode
 from support import own_domain
 
 LONGEST_S = 60.0
@@ -55,7 +56,7 @@ def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tu
             await asyncio.sleep(0.01)
         await side.cancel("calibrate")
         served = BackgroundExecutor(node)  # only now does the node take the goal
-        with pytest.raises(RefusedError, match="canceled by the node"):
+        with pytest.raises(Refusal, match="canceled by the node"):
             await run
         return served
 
@@ -70,7 +71,7 @@ def test_a_goal_whose_answer_was_lost_is_seen_and_can_be_cancelled(
     async def scene() -> BackgroundExecutor:
         # By then the node must have been found, and its answer not have come.
         monkeypatch.setattr(ros_side, "ANSWER_S", 3.0)
-        with pytest.raises(RefusedError, match="no answer to the goal"):
+        with pytest.raises(Refusal, match="no answer to the goal"):
             await side.run("calibrate", Calibrate.Goal(), lambda _feedback: None)
         monkeypatch.undo()
         served = BackgroundExecutor(node)
@@ -92,7 +93,7 @@ def test_a_goal_that_is_not_sent_yet_never_begins(bench: tuple[ConsoleNode, Node
         run = asyncio.create_task(side.run("calibrate", Calibrate.Goal(), lambda _feedback: None))
         await asyncio.sleep(0.0)  # it looks for the node
         await side.cancel("calibrate")
-        with pytest.raises(RefusedError, match="cancelled before it began"):
+        with pytest.raises(Refusal, match="cancelled before it began"):
             await run
 
     asyncio.run(asyncio.wait_for(scene(), LONGEST_S))

@@ -13,7 +13,8 @@ from dm_calibration.hysteresis.identify import CANDIDATES
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
-from dm_common.measurement import Measurement, MeasurementError
+from dm_common.errors import MeasurementError
+from dm_common.measurement import Measurement
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 MAPS = 100

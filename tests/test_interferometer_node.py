@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from dm_msgs.msg import ErrorCode, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.msg import SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import IngestFile, Measure
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from sensor_msgs.msg import Image
 
+from dm_common.errors import ErrorCode
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
 from map_fixtures import WAVELENGTH, dat_bytes, disc_counts, write_datx

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.tracker import HysteresisTracker
-from dm_common.measurement import Cancelled, Measurement
+from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS
 from dm_common.recipes import Recipe, RecipeError
 from dm_controller.converge.recipe_building import (

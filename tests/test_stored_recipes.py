@@ -10,16 +10,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from dm_msgs.msg import ErrorCode
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_errors import Refused, error_code
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibrator import Provenance, evaluate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.store.calibration_store import CalibrationStore, StoreError, UnknownCalibrationError
+from dm_common.errors import ErrorCode, Refusal, error_code
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 from hysteretic_mirror import MIRROR, RememberingBench
 from linear_mirror import make_mirror
@@ -121,7 +120,7 @@ def test_recipes_that_do_not_belong_are_refused(
 ) -> None:
     stand.desk.add_recipes("known", book(0.01))
     before = stand.file.read_bytes()
-    with pytest.raises((Refused, RecipeError), match=words) as caught:
+    with pytest.raises((Refusal, RecipeError), match=words) as caught:
         stand.desk.add_recipes(calibration_id, recipes())
     assert error_code(caught.value) == code
     assert stand.file.read_bytes() == before
@@ -129,9 +128,9 @@ def test_recipes_that_do_not_belong_are_refused(
 
 def test_without_a_calibration_in_use_there_is_nothing_to_join(stand: Stand) -> None:
     stand.desk.set_mirror(make_mirror(serial="T-2"))
-    with pytest.raises(Refused, match="no calibration is in use") as caught:
+    with pytest.raises(Refusal, match="no calibration is in use") as caught:
         stand.desk.add_recipes("known", book(0.01))
-    assert caught.value.code == ErrorCode.NOT_CALIBRATED
+    assert caught.value.error_code == ErrorCode.NOT_CALIBRATED
 
 
 def test_other_raw_data_never_replace_those_of_the_file(stand: Stand, calibration: Calibration) -> None:

@@ -10,7 +10,7 @@ import pytest
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.map_files import read_map
 from dm_calibration.procedure.plan import PlanKind
-from dm_driver.refusal import Refusal
+from dm_common.errors import Refusal
 from dm_simulation.bench import BenchConfig, VirtualBench
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.zygo_files import encode_dat

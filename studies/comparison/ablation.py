@@ -266,7 +266,7 @@ def ablate(options: AblationOptions, progress: Callable[[str], None] = lambda st
         progress: called with a description before each of `total_steps` steps.
 
     Raises:
-        TooFewMapsError, BenchError: a twin could not be calibrated.
+        TooFewMapsError, Refusal: a twin could not be calibrated.
     """
     parts: dict[tuple[str, str, str], list[tuple[Requests, float]]] = {}
     identified = []

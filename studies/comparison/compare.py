@@ -256,7 +256,7 @@ def compare(options: CompareOptions, progress: Callable[[str], None] = lambda st
 
     Raises:
         UnknownNameError: an unknown method, listing all.
-        TooFewMapsError, BenchError: the twin could not be calibrated.
+        TooFewMapsError, Refusal: the twin could not be calibrated.
     """
     methods = tuple(dict.fromkeys(options.methods)) or tuple(SOLVERS)
     trials: list[Trial] = []

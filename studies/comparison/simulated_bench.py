@@ -136,7 +136,7 @@ class SimulatedBench:
         """Ramp to `signals` (N,) by the driver's limiter, through the codes of the DAC; returns what was written.
 
         Raises:
-            dm_driver.refusal.Refusal: signals that the driver would refuse.
+            dm_common.errors.Refusal: signals that the driver would refuse.
         """
         target = self._limiter.check_shape(signals)
         if not np.array_equal(target, self._written):
@@ -264,7 +264,7 @@ class SimulatedBench:
         """Run a plan and fit it, as the node `calibration` does, and go back to mid range.
 
         Raises:
-            TooFewMapsError, BenchError, ValueError: as `Procedure` and `evaluate`.
+            TooFewMapsError, Refusal, ValueError: as `Procedure` and `evaluate`.
         """
         options = options or ProcedureOptions()
         plan = make_plan(kind, self.mirror, plan_options)

@@ -142,7 +142,7 @@ def measure(options: PaperOptions, step: Callable[[str], None] = lambda what: No
         step: called with a description before each of `options.steps` steps.
 
     Raises:
-        TooFewMapsError, BenchError, ValueError: a twin could not be calibrated, or its maps judged.
+        TooFewMapsError, Refusal, ValueError: a twin could not be calibrated, or its maps judged.
     """
     configs = {
         STANDARD: options.bench,

@@ -8,15 +8,16 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dm_msgs.action import Autofocus
-from dm_msgs.msg import Capabilities, ErrorCode
+from dm_msgs.msg import Capabilities
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from dm_autofocus.autofocus_view import FocusedView, Look, ViewError
+from dm_autofocus.autofocus_view import FocusedView, Look
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
 from dm_autofocus.search import TELLING, Peak, PeakSearch, Phase, SearchConfig
 from dm_autofocus.sharpness import Region, check_region
 from dm_autofocus.tracking import TrackConfig, Tracker
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import WorkerActionServer
 
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
@@ -24,12 +25,12 @@ MARGIN = 0.002
 
 
 def ready_capabilities(view: FocusedView) -> Capabilities:
-    """The mirror's capabilities. Raises ViewError when it cannot be focused."""
+    """The mirror's capabilities. Raises Refusal when it cannot be focused."""
     capabilities = view.capabilities
     if capabilities is None:
-        raise ViewError(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
+        raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
     if capabilities.quality == Capabilities.UNCALIBRATED:
-        raise ViewError(ErrorCode.NOT_CALIBRATED, capabilities.message)
+        raise Refusal(ErrorCode.NOT_CALIBRATED, capabilities.message)
     return capabilities
 
 
@@ -79,7 +80,7 @@ class AutofocusAction:
             result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_in_words(result.dioptre)}"
             if peak.at_limit:
                 result.message += "; at the end of the range: the object may lie beyond it"
-        except ViewError as error:
+        except Refusal as error:
             outcome = "canceled" if error.error_code == ErrorCode.CANCELED else "abort"
             result.error_code, result.message = error.error_code, str(error)
         finally:
@@ -89,14 +90,14 @@ class AutofocusAction:
         return outcome, result
 
     def _config(self, goal: Any) -> tuple[SearchConfig, Region]:
-        """The search that a goal asks for. Raises ViewError."""
+        """The search that a goal asks for. Raises Refusal."""
         values, capabilities = self._values, ready_capabilities(self._view)
         margin = MARGIN * (capabilities.curvature_max - capabilities.curvature_min)
         low, high = capabilities.curvature_min + margin, capabilities.curvature_max - margin
         if goal.curvature_min != 0 or goal.curvature_max != 0:
             wanted = (goal.curvature_min, goal.curvature_max)
             if not (low - margin <= wanted[0] < wanted[1] <= high + margin):
-                raise ViewError(
+                raise Refusal(
                     ErrorCode.OUT_OF_RANGE,
                     f"curvature_min, curvature_max = {wanted[0]:+.4f}, {wanted[1]:+.4f} 1/m: must be a rising range "
                     f"inside {low:+.4f} to {high:+.4f} 1/m, or both 0",
@@ -115,7 +116,7 @@ class AutofocusAction:
                 values["search.least_contrast"],
             ), region
         except ValueError as error:
-            raise ViewError(ErrorCode.INVALID_ARGUMENT, str(error)) from error
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
 
     def _search(self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region) -> tuple[Peak, SearchConfig]:
         """Search from beginning to end and stand on the peak; without one, where the mirror stood before.
@@ -129,7 +130,7 @@ class AutofocusAction:
             step = search.step
             try:
                 look = self._visit(goal_handle, step.curvature, region if step.measured else None)
-            except ViewError as error:
+            except Refusal as error:
                 if error.error_code != ErrorCode.UNREACHABLE:
                     raise
                 self._draw_in(search, error)
@@ -143,7 +144,7 @@ class AutofocusAction:
         if search.peak is None:
             if math.isfinite(before):
                 self._visit(goal_handle, before, None)
-            raise ViewError(
+            raise Refusal(
                 ErrorCode.NOT_CONVERGED,
                 "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
                 "the range; the mirror is back where it was",
@@ -151,16 +152,16 @@ class AutofocusAction:
         self._visit(goal_handle, search.step.curvature, None)
         return search.peak, search.config
 
-    def _draw_in(self, search: PeakSearch, error: ViewError) -> None:
+    def _draw_in(self, search: PeakSearch, error: Refusal) -> None:
         try:
             search.refuse()
         except ValueError as reason:
-            raise ViewError(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
+            raise Refusal(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
 
     def _track(
         self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region, peak: Peak, result: Any
     ) -> None:
-        """Stay on the peak until cancelled or pre-empted: ends by ViewError only."""
+        """Stay on the peak until cancelled or pre-empted: ends by Refusal only."""
         values = self._values
         trials = TrackConfig(values["track.dither"] * config.tolerance, values["track.drop"], values["track.patience"])
         tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
@@ -177,7 +178,7 @@ class AutofocusAction:
                 try:
                     peak, config = self._search(goal_handle, config, region)
                     standing = peak.curvature
-                except ViewError as error:
+                except Refusal as error:
                     if error.error_code != ErrorCode.NOT_CONVERGED:
                         raise
                     # Nothing to see now: what is seen here from now on is the new normal.
@@ -202,9 +203,9 @@ class AutofocusAction:
 
     def _check_stop(self, goal_handle: ServerGoalHandle) -> None:
         if goal_handle.is_cancel_requested:
-            raise ViewError(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
+            raise Refusal(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
         if self._server.preempted(goal_handle):
-            raise ViewError(ErrorCode.PREEMPTED, "a newer goal took over")
+            raise Refusal(ErrorCode.PREEMPTED, "a newer goal took over")
 
     def _report(
         self, goal_handle: ServerGoalHandle, phase: Phase, look: Look, curvature: float, step: int, steps: int

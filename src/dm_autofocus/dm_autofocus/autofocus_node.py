@@ -6,17 +6,18 @@ import math
 import sys
 from typing import Any
 
-from dm_msgs.msg import AutofocusState, Capabilities, ErrorCode, FocusRequest
+from dm_msgs.msg import AutofocusState, Capabilities, FocusRequest
 from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities, tolerance_of
 from dm_autofocus.autofocus_parameters import PARAMETERS
-from dm_autofocus.autofocus_view import FocusedView, Look, ViewError
+from dm_autofocus.autofocus_view import FocusedView, Look
 from dm_autofocus.optics import FocusOptics, OpticsError, dioptre_of, distance_of
 from dm_autofocus.search import Phase
 from dm_autofocus.sharpness import check_region
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
@@ -57,12 +58,12 @@ class AutofocusNode(Node):
     ) -> SetFocusDistance.Response:
         try:
             if request.distance != 0 and request.dioptre != 0:
-                raise ViewError(
+                raise Refusal(
                     ErrorCode.INVALID_ARGUMENT,
                     f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
                 )
             if self._action.busy:
-                raise ViewError(ErrorCode.BUSY, "a search or tracking (action autofocus) is running; cancel it first")
+                raise Refusal(ErrorCode.BUSY, "a search or tracking (action autofocus) is running; cancel it first")
             response.dioptre = dioptre_of(request.distance) or request.dioptre
             response.distance = distance_of(response.dioptre)
             response.curvature = self._optics.curvature_for(response.dioptre)
@@ -75,7 +76,7 @@ class AutofocusNode(Node):
                 response.message += f"; the camera focuses {self._range_in_words(self._view.capabilities)}"
         except OpticsError as error:
             response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
-        except ViewError as error:
+        except Refusal as error:
             response.error_code, response.message = error.error_code, str(error)
         except ServiceCallError as error:
             response.error_code, response.message = ErrorCode.TIMEOUT, f"focus_controller: {error}"
@@ -86,7 +87,7 @@ class AutofocusNode(Node):
     ) -> GetFocusRange.Response:
         try:
             capabilities = ready_capabilities(self._view)
-        except ViewError as error:
+        except Refusal as error:
             response.error_code, response.message = error.error_code, str(error)
             return response
         response.curvature_min, response.curvature_max = capabilities.curvature_min, capabilities.curvature_max
@@ -128,7 +129,7 @@ class AutofocusNode(Node):
         try:
             self._publish(Phase.IDLE, self._view.judge(image, check_region(self._values["region"])))
             self._trouble = ""
-        except (ViewError, ValueError) as error:
+        except (Refusal, ValueError) as error:
             self._trouble = str(error)
             self.get_logger().warning(self._trouble, throttle_duration_sec=5.0)
 
@@ -137,10 +138,10 @@ class AutofocusNode(Node):
         try:
             ready_capabilities(self._view)
             if self._view.newest is None:
-                raise ViewError(ErrorCode.TIMEOUT, f"no image on {self.resolve_topic_name('image_raw')} yet")
+                raise Refusal(ErrorCode.TIMEOUT, f"no image on {self.resolve_topic_name('image_raw')} yet")
             if self._trouble:
-                raise ViewError(ErrorCode.INVALID_ARGUMENT, self._trouble)
-        except ViewError as error:
+                raise Refusal(ErrorCode.INVALID_ARGUMENT, self._trouble)
+        except Refusal as error:
             return diagnostics.Health(diagnostics.WARN, str(error), values)
         return diagnostics.Health(diagnostics.OK, "searching or tracking" if self._action.busy else "ready", values)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState, Capabilities, ErrorCode, FocusRequest, FocusState
+from dm_msgs.msg import ActuatorState, Capabilities, FocusRequest, FocusState
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
@@ -20,18 +20,11 @@ from sensor_msgs.msg import Image
 from dm_autofocus.gate import SettledGate
 from dm_autofocus.images import ImageError, grey
 from dm_autofocus.sharpness import METRICS, Region, cut
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
 
 #: As cameras publish; depth 1: an image that was not fetched in time is dropped for the next.
 IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-class ViewError(Exception):
-    """Going or looking failed: an ErrorCode and a sentence."""
-
-    def __init__(self, error_code: int, message: str) -> None:
-        super().__init__(message)
-        self.error_code = error_code
 
 
 @dataclass(frozen=True)
@@ -136,7 +129,7 @@ class FocusedView:
         """Ask for a curvature [1/m] and wait until its shape stands. Returns early when `stop()`.
 
         Raises:
-            ViewError: refused, no answer, another node moves the mirror, or the move does not end.
+            Refusal: refused, no answer, another node moves the mirror, or the move does not end.
         """
         with self._news:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
@@ -145,20 +138,20 @@ class FocusedView:
         self._request.publish(FocusRequest(curvature=curvature, mode=FocusRequest.MODE_DIRECT))
         limit = self._values["move_timeout"]
         if not self._wait(lambda: self._answer is not None, limit, stop):
-            raise ViewError(
+            raise Refusal(
                 ErrorCode.TIMEOUT, f"no answer to a focus request within {limit:g} s: is focus_controller running?"
             )
         answer = self._answer
         if answer is None:
             return
         if not answer.applied:
-            raise ViewError(answer.error_code or ErrorCode.INTERNAL, answer.message)
+            raise Refusal(answer.error_code or ErrorCode.INTERNAL, answer.message)
         with self._news:
             self._gate.sent(seconds(answer.header.stamp), answer.predicted_duration)
             self._tell_gate()
         if not self._wait(lambda: math.isfinite(self._gate.settled_at), limit, stop):
             reason = self._driver.message if self._driver is not None else "no actuator_state from pdm_driver"
-            raise ViewError(ErrorCode.TIMEOUT, f"the move did not end within {limit:g} s: {reason}")
+            raise Refusal(ErrorCode.TIMEOUT, f"the move did not end within {limit:g} s: {reason}")
 
     def release(self) -> None:
         """The mirror may be moved by others from here on."""
@@ -168,7 +161,7 @@ class FocusedView:
         """Median sharpness of the next images that show the settled shape; None when `stop()`.
 
         Raises:
-            ViewError: no such image came in time, or it cannot be used.
+            Refusal: no such image came in time, or it cannot be used.
         """
         looks: list[Look] = []
         with self._news:
@@ -176,7 +169,7 @@ class FocusedView:
         try:
             while len(looks) < self._values["images_per_step"]:
                 if not self._wait(lambda: self._fresh is not None, self._values["image_timeout"], stop):
-                    raise ViewError(ErrorCode.TIMEOUT, self._why_no_image())
+                    raise Refusal(ErrorCode.TIMEOUT, self._why_no_image())
                 with self._news:
                     message, self._fresh = self._fresh, None
                 if message is None:
@@ -191,21 +184,21 @@ class FocusedView:
         """Sharpness of an image in a region.
 
         Raises:
-            ViewError: the image cannot be used.
+            Refusal: the image cannot be used.
         """
         try:
             sharpness = METRICS[self._values["metric"]](cut(grey(message), region))
         except (ImageError, ValueError) as error:
-            raise ViewError(ErrorCode.INVALID_ARGUMENT, f"{self._topic}: {error}") from error
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self._topic}: {error}") from error
         return Look(sharpness, message.header)
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
-        """Wait for a condition or `stop()`; False when neither came in time. Raises ViewError on another's move."""
+        """Wait for a condition or `stop()`; False when neither came in time. Raises Refusal on another's move."""
         deadline = time.monotonic() + timeout_s
         with self._news:
             while not (condition() or stop()):
                 if self._intruder is not None:
-                    raise ViewError(
+                    raise Refusal(
                         ErrorCode.PREEMPTED,
                         f"another node asked for a curvature of {self._intruder:+.4f} 1/m meanwhile",
                     )

@@ -15,6 +15,7 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.store.hdf5_image import Attribute, Column
 from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
+from dm_common.errors import ErrorCode
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
@@ -30,6 +31,8 @@ _POINTS = ("x", "y", "weight")
 
 class CalibrationFileError(ValueError):
     """A calibration file is damaged, foreign, or of an unknown schema; the message says which and where."""
+
+    error_code = ErrorCode.CALIBRATION_UNREADABLE
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dm_msgs.action import Calibrate
-from dm_msgs.msg import ErrorCode
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, check_fit, dropped_maps, evaluate
@@ -24,6 +22,7 @@ from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind,
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.mirror import Mirror
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import wait_for_clock
@@ -141,15 +140,15 @@ class CalibrateAction:
     def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> tuple[Plan, PlanOptions]:
         """The plan of a goal and what it follows from, after its fields were checked."""
         if goal.plan not in tuple(PlanKind):
-            raise Refused(ErrorCode.OUT_OF_RANGE, f"plan = {goal.plan}: must be 0 to {max(PlanKind)}")
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"plan = {goal.plan}: must be 0 to {max(PlanKind)}")
         if not 0.0 <= goal.poke_amplitude <= 1.0:  # also refuses NaN
-            raise Refused(
+            raise Refusal(
                 ErrorCode.OUT_OF_RANGE, f"poke_amplitude = {goal.poke_amplitude}: must be 0 to 1, 0 = configured"
             )
         if not 0.0 <= goal.settle_time <= 600.0:
-            raise Refused(ErrorCode.OUT_OF_RANGE, f"settle_time = {goal.settle_time}: must be 0 to 600 s")
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"settle_time = {goal.settle_time}: must be 0 to 600 s")
         if goal.maps_per_state > 100:
-            raise Refused(ErrorCode.OUT_OF_RANGE, f"maps_per_state = {goal.maps_per_state}: must be 0 to 100")
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"maps_per_state = {goal.maps_per_state}: must be 0 to 100")
         options = PlanOptions(
             poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],
             reference_every=goal.reference_every or self._values["reference_every"],
@@ -198,7 +197,7 @@ class CalibrateAction:
 
         def guard() -> None:
             if (now := self._desk.mirror) is not None and mirror_facts(now) != facts:
-                raise Refused(
+                raise Refusal(
                     ErrorCode.CALIBRATION_MISMATCH,
                     f"the mirror changed in the middle of the run: {now.name} {now.serial!r}, before it was "
                     f"{mirror.name} {mirror.serial!r} (or its limits did)",
@@ -248,7 +247,7 @@ class CalibrateAction:
         except ValueError as error:
             # The next goal would end in the same way; what was measured stays at hand.
             run.journal.close()
-            raise Refused(
+            raise Refusal(
                 error_code(error), f"{error}; the maps are in {runs.set_aside(run.journal.folder)}"
             ) from error
         result.dropped = dropped_maps(outcome.maps(), fit, outcome.dropped)
@@ -259,7 +258,7 @@ class CalibrateAction:
         if calibration is None:
             run.journal.remove()
             if not check.passed:
-                raise Refused(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
+                raise Refusal(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
             result.message = "wiring and orientation are as configured"
             return
         if (hysteresis := calibration.hysteresis) is not None:

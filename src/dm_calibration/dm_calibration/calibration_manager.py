@@ -9,13 +9,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from dm_msgs.msg import ErrorCode
-
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_errors import Refused
 from dm_calibration.calibrator import Provenance, mismatch
 from dm_calibration.procedure.event_frames import map_hashes
 from dm_calibration.store.calibration_store import CalibrationStore, StoreError, UnknownCalibrationError
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.mirror import Mirror
 from dm_common.recipes import RecipeBook, RecipeError
 
@@ -59,13 +57,13 @@ class CalibrationManager:
         """The mirror. A worker thread may wait for a driver that is still starting.
 
         Raises:
-            Refused: it is not known yet.
+            Refusal: it is not known yet.
         """
         deadline = time.monotonic() + wait_s
         while (mirror := self.mirror) is None and time.monotonic() < deadline:
             time.sleep(0.02)
         if mirror is None:
-            raise Refused(ErrorCode.DRIVER_UNAVAILABLE, "no mirror_info yet: is pdm_driver running and configured?")
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no mirror_info yet: is pdm_driver running and configured?")
         return mirror
 
     def set_mirror(self, mirror: Mirror) -> str:
@@ -85,10 +83,10 @@ class CalibrationManager:
         return mismatch(calibration, mirror, self._aperture_tolerance()) if mirror else ""
 
     def check_fits(self, calibration: Calibration) -> None:
-        """Raise Refused unless `calibration` belongs to the mirror."""
+        """Raise Refusal unless `calibration` belongs to the mirror."""
         self.known_mirror()
         if wrong := self.mismatch(calibration):
-            raise Refused(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
+            raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
 
     def use(self, calibration: Calibration | None) -> None:
         """Use `calibration`, which is in the store, from now on."""
@@ -111,7 +109,7 @@ class CalibrationManager:
         """Load by id or file, or the newest that fits when `name` is empty, and use it.
 
         Raises:
-            Refused: no mirror, or the calibration belongs to another; the one in use stays.
+            Refusal: no mirror, or the calibration belongs to another; the one in use stays.
             UnknownCalibrationError, CalibrationFileError: see the store.
         """
         mirror = self.known_mirror()
@@ -122,7 +120,7 @@ class CalibrationManager:
             readable = (entry.calibration for entry in self.store.entries() if entry.calibration)
             newest = next((candidate for candidate in readable if not self.mismatch(candidate)), None)
             if newest is None:
-                raise Refused(
+                raise Refusal(
                     ErrorCode.NOT_CALIBRATED, f"no calibration in {self.store.folder} fits mirror {mirror.serial!r}"
                 )
             calibration = newest
@@ -137,7 +135,7 @@ class CalibrationManager:
             changed: makes the new calibration, with the same id and raw data, from the one in use.
 
         Raises:
-            Refused: another calibration is in use, or none.
+            Refusal: another calibration is in use, or none.
             StoreError: it could not be written; file and calibration in use are as they were.
         """
         with self._changing:
@@ -152,9 +150,9 @@ class CalibrationManager:
     def _checked_in_use(self, calibration_id: str) -> Calibration:
         calibration = self.in_use
         if calibration is None:
-            raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use: load_calibration first")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: load_calibration first")
         if calibration.id != calibration_id:
-            raise Refused(
+            raise Refusal(
                 ErrorCode.CALIBRATION_MISMATCH,
                 f"calibration_id = {calibration_id!r}: the calibration in use is {calibration.id!r}",
             )
@@ -164,7 +162,7 @@ class CalibrationManager:
         """Keep recipes with the calibration in use, which they were built on; those of the same shape are replaced.
 
         Raises:
-            Refused: another calibration is in use, recipes of a mirror with another number of actuators, or
+            Refusal: another calibration is in use, recipes of a mirror with another number of actuators, or
                 numbers that are not finite.
             RecipeError: no recipes, or made from another condition.
             StoreError: see :meth:`change`.
@@ -174,12 +172,12 @@ class CalibrationManager:
         for recipe in book.recipes:
             for name in ("curvature", "conic_constant", "max_zernike", "rms"):
                 if not math.isfinite(value := getattr(recipe, name)):
-                    raise Refused(ErrorCode.NOT_FINITE, f"recipes: {name} = {value}: must be a finite number")
+                    raise Refusal(ErrorCode.NOT_FINITE, f"recipes: {name} = {value}: must be a finite number")
 
         def changed(calibration: Calibration) -> Calibration:
             count, has = len(book.recipes[0].effective), calibration.fit.actuators
             if count != has:
-                raise Refused(
+                raise Refusal(
                     ErrorCode.CALIBRATION_MISMATCH,
                     f"recipes: have {count} effective signals each, calibration {calibration.id} {has} actuators",
                 )

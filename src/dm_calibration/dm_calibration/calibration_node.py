@@ -11,7 +11,7 @@ from typing import Any
 
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import Calibration as CalibrationMsg
-from dm_msgs.msg import ErrorCode, MirrorInfo
+from dm_msgs.msg import MirrorInfo
 from dm_msgs.srv import (
     FitInfluenceFunction,
     FitRegression,
@@ -25,7 +25,6 @@ from rclpy.node import Node
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_action import CalibrateAction
-from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_messages import calibration_message, driver_facts
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options
@@ -33,6 +32,7 @@ from dm_calibration.calibrator import refit
 from dm_calibration.recalibration.map_listener import PUBLISH_PERIOD_S, MapListener
 from dm_calibration.regression.error_prediction import ErrorPrediction
 from dm_calibration.report.report_writer import ReportingStore, ReportWriter
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.messages import mirror_from, recipe_book_from, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.bench_services import BenchServices
@@ -172,7 +172,7 @@ class CalibrationNode(Node):
             named = request.calibration
             stored = self._desk.store.load(named) if named else self._desk.in_use
             if stored is None:
-                raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use and none was named")
+                raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use and none was named")
             if request.activate:
                 self._desk.check_fits(stored)
             provenance = self._desk.provenance(stored.mirror_name, stored.mirror_serial, "")

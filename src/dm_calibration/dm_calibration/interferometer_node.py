@@ -13,7 +13,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from dm_msgs.msg import ErrorCode, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.msg import SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import IngestFile, Measure
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -25,32 +25,15 @@ from dm_calibration.acquisition import interferometer_messages as messages
 from dm_calibration.acquisition.acquisition import (
     Acquired,
     Acquisition,
-    AcquisitionStoppedError,
-    MapTimeoutError,
-    NothingToAcquireError,
 )
-from dm_calibration.acquisition.ingest import Ingest, MapRejectedError
-from dm_calibration.acquisition.trigger import TriggerError
+from dm_calibration.acquisition.ingest import Ingest
 from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
-from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
-from dm_calibration.optics.aperture import InsufficientDataError
+from dm_calibration.map_files import MapFileError, SurfaceMap
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.measurement import Measurement
 from dm_common.ros import diagnostics, parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.worker import WorkerService
-
-#: First match wins, so the special case of a family stands before it.
-_ERROR_CODES: tuple[tuple[type[Exception], int], ...] = (
-    (TriggerError, ErrorCode.TRIGGER_FAILED),
-    (MapTimeoutError, ErrorCode.MAP_TIMEOUT),
-    (AcquisitionStoppedError, ErrorCode.INTERFEROMETER_INACTIVE),
-    (InsufficientDataError, ErrorCode.MAP_INSUFFICIENT),
-    (NoValidPixelsError, ErrorCode.MAP_INSUFFICIENT),
-    (MapRejectedError, ErrorCode.MAP_REJECTED),
-    (MapFileError, ErrorCode.MAP_UNREADABLE),
-    (NothingToAcquireError, ErrorCode.NOT_SUPPORTED),
-)
-_REFUSALS = tuple(kind for kind, _code in _ERROR_CODES)
 
 #: A watched file's modification time further in the past is not believed (clocks of two machines differ).
 _RECENT_NS = 60 * 10**9
@@ -146,7 +129,7 @@ class InterferometerNode(LifecycleNode):
             return self._refuse(response, ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
         try:
             surface, measured = self._read(self._expanded(request.path))
-        except _REFUSALS as error:
+        except CodedError as error:
             return self._refuse_for(response, error)
         header = self._header(self._file_time(surface, believe_header=True))
         return self._accept(response, surface, measured, header, "ingested")
@@ -171,7 +154,7 @@ class InterferometerNode(LifecycleNode):
             )
         try:
             acquired = acquisition.acquire(timeout_s)
-        except _REFUSALS as error:
+        except CodedError as error:
             return self._refuse_for(response, error)
         header = self._header(self._measurement_time(acquired))
         what = f"measured {request.label}".strip()
@@ -181,7 +164,7 @@ class InterferometerNode(LifecycleNode):
         """A new file in the watched folder that nobody waits for; runs in the watching thread."""
         try:
             surface, measured = self._read(path)
-        except _REFUSALS as error:
+        except CodedError as error:
             self._warn_of_file(str(error))
             return
         except Exception as error:  # whatever one file does, the next one must be taken
@@ -210,10 +193,9 @@ class InterferometerNode(LifecycleNode):
         response.samples = messages.samples_message(measured, header)
         return response
 
-    def _refuse_for(self, response: Any, error: Exception) -> Any:
-        code = next(code for kind, code in _ERROR_CODES if isinstance(error, kind))
+    def _refuse_for(self, response: Any, error: CodedError) -> Any:
         self._warn_of_file(str(error))
-        return self._refuse(response, code, str(error))
+        return self._refuse(response, error.error_code, str(error))
 
     def _refuse(self, response: Any, code: int, message: str) -> Any:
         response.error_code = code

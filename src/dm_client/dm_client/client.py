@@ -35,6 +35,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.executor import BackgroundExecutor
@@ -60,17 +61,16 @@ _NUMBERS = itertools.count(1)
 STARTING_S = 60.0
 
 
-class DeformableMirrorError(RuntimeError):
+class DeformableMirrorError(Refusal):
     """The suite refused or could not carry out a request.
 
     Attributes:
-        error_code: dm_msgs/ErrorCode.
+        error_code: a value of ErrorCode.
         response: the whole response or result, when there is one.
     """
 
     def __init__(self, error_code: int, message: str, response: Any = None) -> None:
-        super().__init__(message)
-        self.error_code = error_code
+        super().__init__(error_code, message)
         self.response = response
 
 
@@ -129,7 +129,7 @@ class DeformableMirrorClient:
             DeformableMirrorError: none came within the time.
         """
         if not self.wait(lambda: topic in self._latest, timeout_s):
-            raise DeformableMirrorError(599, f"no message on {topic}: are the nodes running (./dm up)?")
+            raise DeformableMirrorError(ErrorCode.INTERNAL, f"no message on {topic}: are the nodes running (./dm up)?")
         return self._latest[topic]
 
     def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
@@ -150,7 +150,7 @@ class DeformableMirrorClient:
 
         if not self.wait(active, timeout_s):
             reason = self.latest("actuator_state", 0.1).message or "it is not in the lifecycle state `active`"
-            raise DeformableMirrorError(200, f"pdm_driver does not accept commands: {reason}")
+            raise DeformableMirrorError(ErrorCode.DRIVER_INACTIVE, f"pdm_driver does not accept commands: {reason}")
 
     @property
     def capabilities(self) -> Capabilities:
@@ -183,7 +183,7 @@ class DeformableMirrorClient:
         try:
             response = call(client, request, self._timeout_s if timeout_s is None else timeout_s)
         except ServiceCallError as error:
-            raise DeformableMirrorError(503, str(error)) from error
+            raise DeformableMirrorError(ErrorCode.TIMEOUT, str(error)) from error
         if response.error_code != 0:
             raise DeformableMirrorError(response.error_code, response.message, response)
         return response
@@ -239,7 +239,7 @@ class DeformableMirrorClient:
             return image is not None and image.header.stamp == response.info.header.stamp
 
         if not self.wait(arrived):
-            raise DeformableMirrorError(302, "the map did not arrive on surface_map")
+            raise DeformableMirrorError(ErrorCode.MAP_TIMEOUT, "the map did not arrive on surface_map")
         return response, self._latest["surface_map"]
 
     def list_calibrations(self) -> ListCalibrations.Response:
@@ -268,17 +268,17 @@ class DeformableMirrorClient:
         """Run a goal to its end. Ctrl-C cancels it first, so that the mirror is left safe."""
         client = self._client(action_type, name)
         if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
-            raise DeformableMirrorError(503, f"{name}: no such action; is its node running?")
+            raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
         finished = None
         try:
             if not self.wait(accepted.done):
-                raise DeformableMirrorError(503, f"{name}: no answer to the goal")
+                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no answer to the goal")
             if not accepted.result().accepted:
-                raise DeformableMirrorError(405, f"{name}: refused, another goal is running")
+                raise DeformableMirrorError(ErrorCode.BUSY, f"{name}: refused, another goal is running")
             finished = accepted.result().get_result_async()
             if not self.wait(finished.done, timeout_s):
-                raise DeformableMirrorError(503, f"{name}: not finished within {timeout_s:g} s")
+                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: not finished within {timeout_s:g} s")
         except BaseException:
             self._cancel(accepted, finished)
             raise

@@ -1,11 +1,93 @@
-"""A request that is not carried out."""
+"""What can go wrong with a request, and the code that answers it. Knows no ROS."""
 
 from __future__ import annotations
 
+from enum import IntEnum
 
-class Refusal(Exception):
-    """An ErrorCode and a sentence that a person can act on."""
+import numpy as np
+from numpy.typing import NDArray
 
-    def __init__(self, error_code: int, message: str) -> None:
+
+class ErrorCode(IntEnum):
+    """The constants of dm_msgs/ErrorCode, where each is explained; a test keeps the two alike."""
+
+    OK = 0
+
+    INVALID_LENGTH = 100
+    NOT_FINITE = 101
+    OUT_OF_RANGE = 102
+    STALE = 103
+    NEIGHBOUR_DIFFERENCE = 104
+    UNREACHABLE = 105
+    UNKNOWN_NAME = 106
+    INVALID_ARGUMENT = 107
+    NOT_SUPPORTED = 108
+
+    DRIVER_INACTIVE = 200
+    ELECTRONICS_UNREACHABLE = 201
+    DRIVER_UNAVAILABLE = 202
+
+    INTERFEROMETER_INACTIVE = 300
+    TRIGGER_FAILED = 301
+    MAP_TIMEOUT = 302
+    MAP_UNREADABLE = 303
+    MAP_INSUFFICIENT = 304
+    MAP_REJECTED = 305
+    INTERFEROMETER_UNAVAILABLE = 306
+
+    NOT_CALIBRATED = 400
+    CALIBRATION_MISMATCH = 401
+    CALIBRATION_UNREADABLE = 402
+    STORAGE_FAILED = 403
+    TOO_FEW_MAPS = 404
+    BUSY = 405
+    POKE_CHECK_FAILED = 406
+
+    CANCELED = 500
+    PREEMPTED = 501
+    NOT_CONVERGED = 502
+    TIMEOUT = 503
+    INTERNAL = 599
+
+
+class CodedError(RuntimeError):
+    """A failure that is answered with a code and a sentence that a person can act on.
+
+    Attributes:
+        error_code: a value of ErrorCode; of the class, where all its failures have the same.
+    """
+
+    error_code: int
+
+
+class Refusal(CodedError):
+    """A request that is not carried out.
+
+    Attributes:
+        error_code: a value of ErrorCode.
+        actuators: (N,) bool, True for the actuators at fault; None when it is not about single actuators.
+    """
+
+    def __init__(self, error_code: int, message: str, actuators: NDArray[np.bool_] | None = None) -> None:
         super().__init__(message)
         self.error_code = error_code
+        self.actuators = actuators
+
+
+class MeasurementError(Refusal):
+    """One map could not be had; another try may succeed."""
+
+
+class Cancelled(CodedError):
+    """A procedure was asked to stop."""
+
+    error_code = ErrorCode.CANCELED
+
+
+#: Failures that are answered with a code and a message; anything else is a defect.
+EXPECTED = (CodedError, ValueError)
+
+
+def error_code(error: Exception) -> int:
+    """The code that answers one of the EXPECTED failures: its own, INVALID_ARGUMENT for a ValueError without."""
+    return int(getattr(error, "error_code", ErrorCode.INVALID_ARGUMENT))

@@ -1,4 +1,4 @@
-"""What a calibration measures, what it drives, and how either can fail. Knows no ROS."""
+"""What a calibration measures and what it drives. Knows no ROS."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
-
-#: Value of dm_msgs/ErrorCode.MAP_REJECTED.
-MAP_REJECTED = 305
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,33 +70,17 @@ class Measurement:
     segment: int = 0
 
 
-class BenchError(Exception):
-    """The mirror or the interferometer failed; `code` is a value of dm_msgs/ErrorCode."""
-
-    def __init__(self, code: int, message: str) -> None:
-        super().__init__(message)
-        self.code = code
-
-
-class MeasurementError(BenchError):
-    """One map could not be had; another try may succeed."""
-
-
-class Cancelled(Exception):
-    """The procedure was asked to stop."""
-
-
 class Bench(Protocol):
     """What the procedure drives."""
 
     def degauss(self) -> None:
-        """Wipe the hysteresis memory and end at rest. Raises BenchError."""
+        """Wipe the hysteresis memory and end at rest. Raises Refusal."""
 
     def apply(self, signals: Floats) -> Floats:
-        """Command `signals` (N,), wait until they stand, return what was written (N,). Raises BenchError."""
+        """Command `signals` (N,), wait until they stand, return what was written (N,). Raises Refusal."""
 
     def settle(self, dwell: float = 0.0) -> bool:
         """Wait the settle time and `dwell` s more; False when cancelled meanwhile."""
 
     def measure(self, label: str) -> Measurement:
-        """Take one map. Raises MeasurementError, or BenchError when no other try can succeed."""
+        """Take one map. Raises MeasurementError, or Refusal when no other try can succeed."""

@@ -5,9 +5,13 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from dm_common.errors import ErrorCode
+
 
 class UnknownNameError(ValueError):
     """No such name; the message lists the near ones."""
+
+    error_code = ErrorCode.UNKNOWN_NAME
 
 
 def unknown_name(what: str, name: str, known: Iterable[str]) -> UnknownNameError:

@@ -12,11 +12,11 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from dm_msgs.msg import ErrorCode, FocusRequest, FocusState
+from dm_msgs.msg import FocusRequest, FocusState
 from dm_msgs.srv import Degauss
 from rclpy.node import Node
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import ServiceCallError, call
 from dm_controller.driver_watch import DriverWatch
 

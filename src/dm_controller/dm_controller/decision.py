@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from dm_msgs.msg import ErrorCode, FocusRequest
+from dm_msgs.msg import FocusRequest
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.recipes import RecipeError
 from dm_controller.hysteresis_observer import Look, after_degauss
 from dm_controller.planning.active_calibration import ActiveCalibration

@@ -10,9 +10,9 @@ import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode, FocusRequest
+from dm_msgs.msg import ActuatorCommand, ActuatorState, FocusRequest
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_controller.request_checks import check_driver
 
 

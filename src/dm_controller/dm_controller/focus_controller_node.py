@@ -8,21 +8,12 @@ import time
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import (
-    ActuatorCommand,
-    ActuatorState,
-    Calibration,
-    Capabilities,
-    ErrorCode,
-    FocusRequest,
-    FocusState,
-    MirrorInfo,
-)
+from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
 from dm_msgs.srv import Flatten, SetFocus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles, stamp_ns, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import MoveFocus
-from dm_msgs.msg import ActuatorState, ErrorCode, FocusRequest, FocusState
+from dm_msgs.msg import ActuatorState, FocusRequest, FocusState
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
+from dm_common.errors import ErrorCode
 from dm_common.ros.worker import WorkerActionServer, sleep
 from dm_controller.conditioning import Waiting
 from dm_controller.driver_watch import DriverWatch

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import PredictError
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from dm_common.errors import ErrorCode
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from dm_msgs.msg import ActuatorState, ErrorCode
+from dm_msgs.msg import ActuatorState
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_controller.decision import Decision
 
 #: A message's constants are properties of its class, which take longer to look up.

@@ -12,12 +12,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_driver.degauss import degauss_waypoints
 from dm_driver.electronics.base import DriveElectronics, ElectronicsError
 from dm_driver.last_shape import LastShape
 from dm_driver.moves import Counters, Kind, Move, Outcome, WriterState
 from dm_driver.output.output_stage import OutputStage
-from dm_driver.refusal import Reason, Refusal
 from dm_driver.safety_limiter import SafetyLimiter, Shape, Watchdog, largest_change
 
 RECONNECT_PERIOD_S = 1.0
@@ -212,9 +212,9 @@ class ActuatorWriter:
         middle = 0.5 * (limits.signal_min + limits.signal_max)
         largest = 0.5 * (limits.signal_max - limits.signal_min)
         if not 0.0 <= amplitude <= largest:
-            raise Refusal(Reason.OUT_OF_RANGE, f"amplitude = {amplitude:g}: must be 0 to {largest:g}")
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"amplitude = {amplitude:g}: must be 0 to {largest:g}")
         if steps < 1:
-            raise Refusal(Reason.OUT_OF_RANGE, f"steps = {steps}: must be at least 1")
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"steps = {steps}: must be at least 1")
         waypoints = degauss_waypoints(limits.actuators, middle, amplitude or largest, steps, end)
         # A smaller cycle leaves what wider swings have written.
         wipes = (amplitude or largest) >= FULL_CYCLE * largest
@@ -236,9 +236,11 @@ class ActuatorWriter:
     def _submit(self, move: Move) -> Move:
         with self._change:
             if not self._accepting or self._stopping:
-                raise Refusal(Reason.DRIVER_INACTIVE, "the driver is not active: activate it first")
+                raise Refusal(ErrorCode.DRIVER_INACTIVE, "the driver is not active: activate it first")
             if not self._link_up:
-                raise Refusal(Reason.ELECTRONICS_UNREACHABLE, f"the drive electronics are unreachable: {self._fault}")
+                raise Refusal(
+                    ErrorCode.ELECTRONICS_UNREACHABLE, f"the drive electronics are unreachable: {self._fault}"
+                )
             self._watchdog.feed(time.monotonic())
             self._put(move)
             return move

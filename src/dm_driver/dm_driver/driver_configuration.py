@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.errors import Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.electronics import DriveElectronics, ElectronicsSettings, make_electronics
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import wiring_table
-from dm_driver.refusal import Refusal
 from dm_driver.safety_limiter import Limits, SafetyLimiter, Shape
 
 

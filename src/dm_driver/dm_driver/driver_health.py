@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from dm_common.errors import ErrorCode
 from dm_common.ros.diagnostics import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.driver_messages import Complaint
-from dm_driver.refusal import Reason
 
 
 def driver_health(writer: ActuatorWriter | None, complaint: Complaint, refused: Mapping[str, int]) -> Health:
@@ -20,7 +20,7 @@ def driver_health(writer: ActuatorWriter | None, complaint: Complaint, refused: 
     """
     values: dict[str, object] = {f"refused {name}": count for name, count in sorted(refused.items())}
     if writer is None:
-        if complaint.reason is Reason.INVALID_ARGUMENT:
+        if complaint.error_code == ErrorCode.INVALID_ARGUMENT:
             return Health(ERROR, complaint.message, values)
         return Health(WARN, "not configured", values)
     state, counters = writer.state(), writer.counters
@@ -36,7 +36,7 @@ def driver_health(writer: ActuatorWriter | None, complaint: Complaint, refused: 
     }
     if not state.link_up:
         return Health(ERROR, f"link lost: {state.fault}", values)
-    if complaint.reason is not Reason.OK:
+    if complaint.error_code != ErrorCode.OK:
         return Health(WARN, f"the last command was refused: {complaint.message}", values)
     if not state.enabled:
         return Health(WARN, "inactive: commands are refused", values)

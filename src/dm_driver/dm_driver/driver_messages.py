@@ -11,16 +11,16 @@ import numpy as np
 from dm_msgs.msg import ActuatorState, MirrorInfo
 from numpy.typing import NDArray
 
+from dm_common.errors import ErrorCode
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Kind, WriterState
-from dm_driver.refusal import Reason
 
 
 @dataclass(frozen=True)
 class Complaint:
-    """Why the last command was not carried out; reason OK when it was."""
+    """Why the last command was not carried out; code OK when it was."""
 
-    reason: Reason = Reason.OK
+    error_code: int = ErrorCode.OK
     message: str = ""
     actuators: NDArray[np.bool_] | None = None
 
@@ -46,7 +46,7 @@ def unconfigured_message(frame_id: str, complaint: Complaint) -> ActuatorState:
     """The state of a driver that has no valid configuration."""
     message = ActuatorState(driver_state=ActuatorState.STATE_UNCONFIGURED)
     message.header.frame_id = frame_id
-    message.error_code = int(complaint.reason)
+    message.error_code = complaint.error_code
     message.message = complaint.message
     return message
 
@@ -63,9 +63,9 @@ def state_message(
     message.history_known = state.history_known
     message.degausses, message.turns = state.degausses, state.turns
     if state.link_up or not state.enabled:
-        message.error_code, message.message = int(complaint.reason), complaint.message
+        message.error_code, message.message = complaint.error_code, complaint.message
     else:
-        message.error_code, message.message = int(Reason.ELECTRONICS_UNREACHABLE), state.fault
+        message.error_code, message.message = ErrorCode.ELECTRONICS_UNREACHABLE, state.fault
     flags = np.zeros(configuration.limiter.limits.actuators, dtype=np.uint8)
     flags[~configuration.output.connected] |= ActuatorState.FLAG_UNUSED
     if complaint.actuators is not None:

@@ -22,6 +22,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.time import Time
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import diagnostics, parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.worker import WorkerService
@@ -32,17 +33,16 @@ from dm_driver.driver_messages import Complaint, mirror_info_message, state_mess
 from dm_driver.driver_parameters import PARAMETERS
 from dm_driver.last_shape import LastShape, record_path
 from dm_driver.moves import Move, Outcome, WriterState
-from dm_driver.refusal import Reason, Refusal
 
 #: Shortest time between two state messages in the middle of a ramp.
 STATE_INTERVAL_S = 0.02
 #: Time for the electronics beyond what a ramp takes.
 MARGIN_S = 2.0
 
-_REASON_OF_OUTCOME = {
-    Outcome.SUPERSEDED: Reason.PREEMPTED,
-    Outcome.LINK_LOST: Reason.ELECTRONICS_UNREACHABLE,
-    Outcome.STOPPED: Reason.DRIVER_INACTIVE,
+_CODE_OF_OUTCOME = {
+    Outcome.SUPERSEDED: ErrorCode.PREEMPTED,
+    Outcome.LINK_LOST: ErrorCode.ELECTRONICS_UNREACHABLE,
+    Outcome.STOPPED: ErrorCode.DRIVER_INACTIVE,
 }
 
 
@@ -95,7 +95,7 @@ class PdmDriverNode(LifecycleNode):
             configuration = build_configuration(self._values)
         except ValueError as error:
             self.get_logger().error(f"configuration refused: {error}")
-            self._complain(Complaint(Reason.INVALID_ARGUMENT, f"configuration refused: {error}"))
+            self._complain(Complaint(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {error}"))
             return TransitionCallbackReturn.FAILURE
         self._configuration = configuration
         self._complaint = Complaint()
@@ -231,24 +231,26 @@ class PdmDriverNode(LifecycleNode):
             self._complaint = Complaint()  # before the writer's thread tells of the first write
         try:
             if writer is None or configuration is None:
-                raise Refusal(Reason.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first")
+                raise Refusal(
+                    ErrorCode.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first"
+                )
             move = carry_out(writer, configuration)
         except Refusal as refusal:
             if not dry_run:
-                self._refused[refusal.reason.name] += 1
+                self._refused[ErrorCode(refusal.error_code).name] += 1
                 self.get_logger().warning(f"{source} refused: {refusal}", throttle_duration_sec=1.0)
-                self._complain(Complaint(refusal.reason, f"{source} refused: {refusal}", refusal.actuators))
+                self._complain(Complaint(refusal.error_code, f"{source} refused: {refusal}", refusal.actuators))
             return refusal
         return move
 
     @staticmethod
     def _answer(response: Any, result: Move | Refusal | None, wait: bool) -> None:
         if isinstance(result, Refusal):
-            response.error_code, response.message = int(result.reason), str(result)
+            response.error_code, response.message = result.error_code, str(result)
         elif result is not None and wait:
             outcome = result.wait()
             if outcome is not None and outcome is not Outcome.REACHED:
-                response.error_code, response.message = int(_REASON_OF_OUTCOME[outcome]), outcome.value
+                response.error_code, response.message = _CODE_OF_OUTCOME[outcome], outcome.value
 
     # State
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dm_driver.refusal import Reason, Refusal
+from dm_common.errors import ErrorCode, Refusal
 
 Shape = NDArray[np.float64]
 
@@ -85,16 +85,19 @@ class SafetyLimiter:
         shape = np.array(signals, dtype=np.float64)
         if shape.shape != (limits.actuators,):
             raise Refusal(
-                Reason.INVALID_LENGTH, f"{name} has {shape.size} values: must have {limits.actuators}, one per actuator"
+                ErrorCode.INVALID_LENGTH,
+                f"{name} has {shape.size} values: must have {limits.actuators}, one per actuator",
             )
         low, high = limits.signal_min, limits.signal_max
         inside = (shape >= low - SLACK) & (shape <= high + SLACK)  # False for NaN
         if not inside.all():
             finite = np.isfinite(shape)
             if not finite.all():
-                raise Refusal(Reason.NOT_FINITE, self._words(name, shape, ~finite, "must be a finite number"), ~finite)
+                raise Refusal(
+                    ErrorCode.NOT_FINITE, self._words(name, shape, ~finite, "must be a finite number"), ~finite
+                )
             raise Refusal(
-                Reason.OUT_OF_RANGE, self._words(name, shape, ~inside, f"must be {low:g} to {high:g}"), ~inside
+                ErrorCode.OUT_OF_RANGE, self._words(name, shape, ~inside, f"must be {low:g} to {high:g}"), ~inside
             )
         self._check_neighbours(shape, name, SLACK)
         return np.clip(shape, low, high, out=shape)
@@ -107,13 +110,13 @@ class SafetyLimiter:
         """
         if not age_s <= self.limits.command_age:
             raise Refusal(
-                Reason.STALE,
+                ErrorCode.STALE,
                 f"header.stamp is {age_s:.3f} s old: must be at most {self.limits.command_age:g} s"
                 " (limits.command_age)",
             )
         if age_s < -self.limits.command_lead:
             raise Refusal(
-                Reason.STALE,
+                ErrorCode.STALE,
                 f"header.stamp lies {-age_s:.3f} s in the future: must be at most {self.limits.command_lead:g} s"
                 " (limits.command_lead); do the clocks agree?",
             )
@@ -132,14 +135,14 @@ class SafetyLimiter:
         outside = ~((shape >= limits.signal_min) & (shape <= limits.signal_max))
         if outside.any():
             rule = f"must be {limits.signal_min:g} to {limits.signal_max:g}"
-            raise Refusal(Reason.INTERNAL, self._words("signals", shape, outside, rule), outside)
+            raise Refusal(ErrorCode.INTERNAL, self._words("signals", shape, outside, rule), outside)
         self._check_neighbours(shape, "signals", SLACK + _ROUNDING)
         if previous is not None:
             change = np.abs(shape - previous)
             too_large = ~(change <= limits.step + _ROUNDING)
             if too_large.any():
                 raise Refusal(
-                    Reason.INTERNAL,
+                    ErrorCode.INTERNAL,
                     self._words("step", change, too_large, f"must be at most {limits.step:g} (limits.step)"),
                     too_large,
                 )
@@ -188,7 +191,7 @@ class SafetyLimiter:
         a, b = int(limits.neighbour_a[worst]), int(limits.neighbour_b[worst])
         others = int(too_far.sum()) - 1
         raise Refusal(
-            Reason.NEIGHBOUR_DIFFERENCE,
+            ErrorCode.NEIGHBOUR_DIFFERENCE,
             f"{name} of the neighbouring actuators {a + 1} and {b + 1} ({shape[a]:g} and {shape[b]:g}) differ by"
             f" {difference[worst]:g}: must be at most {limits.neighbour_difference:g} (limits.neighbour_difference)"
             + (f"; {others} more pairs likewise" if others else ""),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dm_driver.refusal import Reason, Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_driver.safety_limiter import SLACK, Limits, SafetyLimiter
 
 RING = np.arange(7)
@@ -21,10 +21,10 @@ def limiter(**limits: float) -> SafetyLimiter:
     return SafetyLimiter(Limits(7, neighbour_a=RING, neighbour_b=np.roll(RING, 1), **limits))
 
 
-def reason(action: object, *arguments: object) -> Reason:
+def reason(action: object, *arguments: object) -> ErrorCode:
     with pytest.raises(Refusal) as caught:
         action(*arguments)  # type: ignore[operator]
-    return caught.value.reason
+    return caught.value.error_code
 
 
 @given(low=st.floats(-1.0, -0.01), high=st.floats(0.01, 1.0), actuator=st.integers(0, 6))
@@ -35,7 +35,7 @@ def test_range(low: float, high: float, actuator: int) -> None:
         signals[actuator] = edge
         assert judge.check_shape(signals)[actuator] == edge
         signals[actuator] = edge + outwards * BEYOND
-        assert reason(judge.check_shape, signals) is Reason.OUT_OF_RANGE
+        assert reason(judge.check_shape, signals) is ErrorCode.OUT_OF_RANGE
 
 
 @given(most=st.floats(0.001, 0.99), actuator=st.integers(0, 6), side=st.sampled_from((-1.0, 1.0)))
@@ -45,7 +45,7 @@ def test_neighbour_difference(most: float, actuator: int, side: float) -> None:
     signals[actuator] = side * most
     judge.check_shape(signals)
     signals[actuator] = side * (most + BEYOND)
-    assert reason(judge.check_shape, signals) is Reason.NEIGHBOUR_DIFFERENCE
+    assert reason(judge.check_shape, signals) is ErrorCode.NEIGHBOUR_DIFFERENCE
 
 
 @given(age=st.floats(1e-3, 1e6), lead=st.floats(1e-3, 1e6))
@@ -53,9 +53,9 @@ def test_age_and_lead(age: float, lead: float) -> None:
     judge = limiter(command_age=age, command_lead=lead)
     judge.check_age(age)
     judge.check_age(-lead)
-    assert reason(judge.check_age, float(np.nextafter(age, np.inf))) is Reason.STALE
-    assert reason(judge.check_age, float(np.nextafter(-lead, -np.inf))) is Reason.STALE
-    assert reason(judge.check_age, float("nan")) is Reason.STALE
+    assert reason(judge.check_age, float(np.nextafter(age, np.inf))) is ErrorCode.STALE
+    assert reason(judge.check_age, float(np.nextafter(-lead, -np.inf))) is ErrorCode.STALE
+    assert reason(judge.check_age, float("nan")) is ErrorCode.STALE
 
 
 @given(step=st.floats(1e-3, 0.5), actuator=st.integers(0, 6), side=st.sampled_from((-1.0, 1.0)))
@@ -65,7 +65,7 @@ def test_step_of_one_write(step: float, actuator: int, side: float) -> None:
     signals[actuator] = side * step
     judge.check_write(np.zeros(7), signals)
     signals[actuator] = side * (step + BEYOND)
-    assert reason(judge.check_write, np.zeros(7), signals) is Reason.INTERNAL
+    assert reason(judge.check_write, np.zeros(7), signals) is ErrorCode.INTERNAL
 
 
 @given(signals=st.lists(floats, max_size=60))

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.degauss import degauss_waypoints
-from dm_driver.refusal import Reason, Refusal
 from dm_driver.safety_limiter import Limits, SafetyLimiter, Watchdog
 
 A, B = neighbour_pairs(*hexagonal_positions(37))
@@ -36,16 +36,15 @@ def at_fault(refusal: Refusal) -> list[int]:
 
 
 def test_reasons_are_the_error_codes_of_the_suite() -> None:
-    from dm_msgs.msg import ErrorCode
 
-    for reason in Reason:
+    for reason in ErrorCode:
         assert getattr(ErrorCode, reason.name) == reason.value
 
 
 @pytest.mark.parametrize("count", [0, 36, 38])
 def test_wrong_length(count: int) -> None:
     refusal = refusal_of(make_limiter(), np.zeros(count))
-    assert refusal.reason is Reason.INVALID_LENGTH
+    assert refusal.error_code is ErrorCode.INVALID_LENGTH
     assert f"{count} values: must have 37" in str(refusal)
     assert refusal.actuators is None
 
@@ -55,7 +54,7 @@ def test_not_finite(bad: float) -> None:
     signals = np.zeros(37)
     signals[[4, 30]] = bad
     refusal = refusal_of(make_limiter(), signals)
-    assert refusal.reason is Reason.NOT_FINITE
+    assert refusal.error_code is ErrorCode.NOT_FINITE
     assert at_fault(refusal) == [5, 31]
     assert "actuator 5" in str(refusal) and "1 more" in str(refusal)
 
@@ -64,7 +63,7 @@ def test_out_of_range_names_actuator_value_and_range() -> None:
     signals = np.full(37, 0.5)
     signals[11] = 0.91
     refusal = refusal_of(make_limiter(-0.8, 0.9), signals)
-    assert refusal.reason is Reason.OUT_OF_RANGE
+    assert refusal.error_code is ErrorCode.OUT_OF_RANGE
     assert at_fault(refusal) == [12]
     assert "actuator 12 = 0.91: must be -0.8 to 0.9" in str(refusal)
 
@@ -72,14 +71,14 @@ def test_out_of_range_names_actuator_value_and_range() -> None:
 def test_rounding_beyond_the_range_is_cut_off_not_refused() -> None:
     shape = make_limiter().check_shape(np.full(37, 1.0 + 5e-10))
     assert (shape == 1.0).all()
-    assert refusal_of(make_limiter(), np.full(37, 1.0 + 5e-9)).reason is Reason.OUT_OF_RANGE
+    assert refusal_of(make_limiter(), np.full(37, 1.0 + 5e-9)).reason is ErrorCode.OUT_OF_RANGE
 
 
 def test_neighbour_difference_names_the_pair() -> None:
     signals = np.zeros(37)
     signals[0], signals[3] = 0.31, -0.3
     refusal = refusal_of(make_limiter(difference=0.6), signals)
-    assert refusal.reason is Reason.NEIGHBOUR_DIFFERENCE
+    assert refusal.error_code is ErrorCode.NEIGHBOUR_DIFFERENCE
     assert at_fault(refusal) == [1, 4]
     assert re.search(r"actuators 1 and 4 \(0\.31 and -0\.3\) differ by 0\.61: must be at most 0\.6", str(refusal))
     signals[3] = -0.29
@@ -104,7 +103,7 @@ def test_age_of_commands() -> None:
     ):
         with pytest.raises(Refusal, match=words) as caught:
             limiter.check_age(stale)
-        assert caught.value.reason is Reason.STALE
+        assert caught.value.error_code is ErrorCode.STALE
 
 
 def test_a_step_that_is_too_large_is_stopped_in_front_of_the_write() -> None:

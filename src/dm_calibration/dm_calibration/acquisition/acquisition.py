@@ -15,21 +15,28 @@ from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch
 from dm_calibration.acquisition.inotify import ClosedFiles
 from dm_calibration.acquisition.trigger import PLACEHOLDER, TriggerError, run_trigger
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.measurement import Measurement
 
 _POLL_OUTPUT_S = 0.01
 
 
-class MapTimeoutError(Exception):
+class MapTimeoutError(CodedError):
     """No new map arrived in time."""
 
+    error_code = ErrorCode.MAP_TIMEOUT
 
-class AcquisitionStoppedError(Exception):
+
+class AcquisitionStoppedError(CodedError):
     """The node was deactivated during a measurement."""
 
+    error_code = ErrorCode.INTERFEROMETER_INACTIVE
 
-class NothingToAcquireError(Exception):
+
+class NothingToAcquireError(CodedError):
     """Neither a trigger command nor a watched folder is configured."""
+
+    error_code = ErrorCode.NOT_SUPPORTED
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,16 @@ from dm_calibration.map_files import SurfaceMap, read_map
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError, configured_aperture, find_aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import edge_clustered_points, sample_map
 
 
-class MapRejectedError(Exception):
+class MapRejectedError(CodedError):
     """A readable map that does not belong to this bench: another wavelength or setting."""
+
+    error_code = ErrorCode.MAP_REJECTED
 
 
 @dataclass(frozen=True)

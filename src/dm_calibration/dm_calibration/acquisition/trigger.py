@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
+from dm_common.errors import CodedError, ErrorCode
+
 #: In an argument of the command: the file the instrument is expected to write.
 PLACEHOLDER = "{path}"
 
@@ -19,8 +21,10 @@ _OUTPUT_SHOWN = 500  # characters of the command's output in an error message
 _POLL_S = 0.05
 
 
-class TriggerError(Exception):
+class TriggerError(CodedError):
     """The command could not be started, failed, or took too long; the message has the end of its output."""
+
+    error_code = ErrorCode.TRIGGER_FAILED
 
 
 def run_trigger(

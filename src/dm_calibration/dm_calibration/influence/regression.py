@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.drift import drift_columns
 from dm_calibration.influence.maps import MapSet
+from dm_common.errors import ErrorCode
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +30,8 @@ RANK_TOLERANCE = 1e-7
 
 class TooFewMapsError(ValueError):
     """The maps do not determine the influence function; the message says what is missing."""
+
+    error_code = ErrorCode.TOO_FEW_MAPS
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.errors import CodedError, ErrorCode
+
 #: Counts from here up mean "no data" (MetroPro reference, phase data matrix).
 INVALID_COUNTS = 2147483640
 
@@ -29,12 +31,16 @@ _WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
 _PITCH_RANGE = (1e-9, 0.1)  # m per pixel
 
 
-class MapFileError(Exception):
+class MapFileError(CodedError):
     """The file is not a whole, readable surface map; the message names the field, its value and what is allowed."""
+
+    error_code = ErrorCode.MAP_UNREADABLE
 
 
 class NoValidPixelsError(MapFileError):
     """The file is whole, but every pixel of its map is marked as having no data."""
+
+    error_code = ErrorCode.MAP_INSUFFICIENT
 
 
 @dataclass(frozen=True, eq=False)

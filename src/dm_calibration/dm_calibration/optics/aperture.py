@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, optimize
 
+from dm_common.errors import CodedError, ErrorCode
+
 #: Scatter of the rim about the fitted circle, relative to its radius, up to which the region counts as a disc.
 _ROUND = 0.02
 
@@ -17,8 +19,10 @@ _ROUND = 0.02
 _FEWEST_RIM_POINTS = 16
 
 
-class InsufficientDataError(Exception):
+class InsufficientDataError(CodedError):
     """Too few valid pixels for what is asked; the message has the figures."""
+
+    error_code = ErrorCode.MAP_INSUFFICIENT
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.errors import ErrorCode
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.tracker import Applied, HysteresisTracker
 
@@ -24,6 +25,8 @@ STATES_KEPT = 500
 
 class MapNotUsableError(ValueError):
     """A map cannot be compared with the calibration; the message says why."""
+
+    error_code = ErrorCode.MAP_REJECTED
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
 from dm_calibration.procedure.map_checks import check_comparable
 from dm_calibration.procedure.outcome import NOWHERE, Doubted, Event, MapTaken, Outcome, Setup
 from dm_calibration.procedure.plan import Step, StepKind
-from dm_common.measurement import MAP_REJECTED, Bench, BenchError, Measurement, MeasurementError
+from dm_common.errors import ErrorCode, MeasurementError, Refusal
+from dm_common.measurement import Bench, Measurement
 from dm_common.mirror import Mirror
 
 Floats = NDArray[np.float64]
@@ -78,7 +79,7 @@ class MapAcquisition:
 
         Raises:
             MeasurementError: no try gave one.
-            BenchError: a reference frame shows that the mirror was bumped, and another map of it does too.
+            Refusal: a reference frame shows that the mirror was bumped, and another map of it does too.
         """
         taken = self._taken(label, step, number, applied)
         self._note(taken)
@@ -94,7 +95,7 @@ class MapAcquisition:
             except MeasurementError as error:
                 if attempt == self._options.measure_retries:
                     tries = f" ({attempt + 1} tries)" if attempt else ""
-                    raise MeasurementError(error.code, f"{error}{tries}") from error
+                    raise MeasurementError(error.error_code, f"{error}{tries}") from error
         taken = self._as_event(label, step, number, applied, measured)
         if step.kind is StepKind.REFERENCE:
             suspicion = self._bump.change(taken.record, taken.centre, measured.pitch, self._swung)
@@ -108,16 +109,16 @@ class MapAcquisition:
     def _stop_bumped(self, label: str, suspicion: str) -> None:
         """End the run; what was measured since the last good reference frame is in doubt."""
         if self._swung:
-            raise BenchError(
-                MAP_REJECTED,
+            raise Refusal(
+                ErrorCode.MAP_REJECTED,
                 f"{label}: {suspicion}: the mirror does not stand as it did before the run was interrupted. Put it "
                 "back, or begin anew (`dm calibrate --fresh`)",
             )
         frames = [index for index, record in enumerate(self.outcome.records) if record.kind == REFERENCE]
         doubtful = len(self.outcome.records) - frames[-1] - 1
         self._note(Doubted(frames[-1] + 1, f"in doubt, bumped before {label}"))
-        raise BenchError(
-            MAP_REJECTED,
+        raise Refusal(
+            ErrorCode.MAP_REJECTED,
             f"{label}: {suspicion}: the mirror or the interferometer was bumped. The {doubtful} maps since are in "
             "doubt; put the mirror back and start again to go on from the last good reference frame",
         )

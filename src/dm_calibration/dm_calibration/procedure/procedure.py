@@ -20,28 +20,11 @@ from dm_calibration.influence.surfaces import LinearModel
 from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
 from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, Unseen
 from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, solve_step
-from dm_common.measurement import (
-    MAP_REJECTED,
-    Bench,
-    BenchError,
-    Cancelled,
-    Measurement,
-    MeasurementError,
-)
+from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
+from dm_common.measurement import Bench
 from dm_common.mirror import Mirror
 
-__all__ = [
-    "MAP_REJECTED",
-    "Bench",
-    "BenchError",
-    "Cancelled",
-    "Measurement",
-    "MeasurementError",
-    "Outcome",
-    "Procedure",
-    "ProcedureOptions",
-    "Progress",
-]
+__all__ = ["Outcome", "Procedure", "ProcedureOptions", "Progress"]
 
 Floats = NDArray[np.float64]
 
@@ -106,7 +89,7 @@ class Procedure:
 
         Raises:
             Cancelled: `cancelled()` became true; noticed within one step.
-            BenchError: the mirror failed, the interferometer gave no map for several states in a row, or the mirror
+            Refusal: the mirror failed, the interferometer gave no map for several states in a row, or the mirror
                 was bumped.
         """
         steps = self._plan.steps
@@ -149,7 +132,7 @@ class Procedure:
         number = len(self._plan.steps) + self.outcome.segment
         self._measure_state(step, number, repeats)
         if self._failures:
-            raise BenchError(MAP_REJECTED, f"{step.label} gave no map, without which the run cannot go on")
+            raise Refusal(ErrorCode.MAP_REJECTED, f"{step.label} gave no map, without which the run cannot go on")
 
     def _report(self, label: str, kind: StepKind, done: int) -> None:
         residual_rms = self.outcome.records[-1].residual_rms if self.outcome.records else 0.0
@@ -194,7 +177,7 @@ class Procedure:
         if not self._bench.settle(step.dwell):
             raise Cancelled("cancelled while settling")
         taken = 0
-        failure = MeasurementError(MAP_REJECTED, "")
+        failure = MeasurementError(ErrorCode.MAP_REJECTED, "")
         for repeat in range(self.outcome.tried(number), repeats):
             label = step.label if repeat == 0 else f"{step.label} ({repeat + 1})"
             try:
@@ -207,7 +190,7 @@ class Procedure:
             self._note_unseen(step, number, applied)
         self._failures = 0 if taken else self._failures + 1
         if self._failures >= self._options.failures_max:
-            raise BenchError(failure.code, f"{self._failures} states in a row gave no map; the last: {failure}")
+            raise Refusal(failure.error_code, f"{self._failures} states in a row gave no map; the last: {failure}")
 
     def _note_unseen(self, step: Step, number: int, applied: Floats) -> None:
         """Keep a command without a map where the actuators' memory is to be identified: they remember it all the same.

@@ -24,7 +24,8 @@ from dm_calibration.procedure.plan import (
     make_plan,
 )
 from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions
-from dm_common.measurement import MAP_REJECTED, Measurement, MeasurementError
+from dm_common.errors import ErrorCode, MeasurementError
+from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.names import UnknownNameError
 
@@ -128,7 +129,7 @@ class RecordedBench:
         begin, end = self._window
         found = [measured for measured in self._maps if begin <= measured.stamp_ns < end]
         if self._taken >= len(found):
-            raise MeasurementError(MAP_REJECTED, "no further map was recorded in this state")
+            raise MeasurementError(ErrorCode.MAP_REJECTED, "no further map was recorded in this state")
         self._taken += 1
         return replace(found[self._taken - 1], moved_ns=begin)
 
@@ -233,7 +234,7 @@ def repeat_run(
 
     Raises:
         RecordingError: the recording does not hold the whole run.
-        BenchError: as live, when several states in a row gave no map.
+        Refusal: as live, when several states in a row gave no map.
     """
     plan = find_plan(run, configured)
     # As live: a full plan solves its shapes on its own pokes.

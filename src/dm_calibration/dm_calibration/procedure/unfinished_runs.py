@@ -16,11 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dm_msgs.msg import ErrorCode
-
-from dm_calibration.calibration_errors import Refused
 from dm_calibration.procedure.run_journal import JournalError, Kept, RunJournal, read_manifest, read_run
 from dm_calibration.store.calibration_store import StoreError
+from dm_common.errors import ErrorCode, Refusal
 
 #: Name of the folder among the calibrations.
 FOLDER = "unfinished"
@@ -57,7 +55,7 @@ class UnfinishedRuns:
         """Take the folder.
 
         Raises:
-            Refused: another node calibrates into it.
+            Refusal: another node calibrates into it.
             StoreError: it cannot be made.
         """
         try:
@@ -71,7 +69,7 @@ class UnfinishedRuns:
         except OSError:
             os.close(self._lock)
             words = f"another node is calibrating into {self.folder.parent}: wait for it or stop it"
-            raise Refused(ErrorCode.BUSY, words) from None
+            raise Refusal(ErrorCode.BUSY, words) from None
         return self
 
     def __exit__(self, *_exception: object) -> None:

@@ -10,19 +10,18 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState, ErrorCode, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.msg import ActuatorState, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import Measure, UpdateCalibration
 from rclpy.node import Node
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_errors import EXPECTED, Refused, error_code
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_messages import put_updates, report_from
 from dm_calibration.calibration_parameters import update_options
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
-from dm_calibration.store.calibration_store import StoreError
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
 from dm_common.messages import measurement_from, stamp_ns
@@ -174,7 +173,7 @@ class MapListener:
                 measured = measurement_from(halves)
                 if measured.stamp_ns not in self._judged:
                     self._judge(measured, dry_run=False)
-        except (ValueError, StoreError, Refused) as error:
+        except EXPECTED as error:
             self._refuse(str(error))
             log.info(f"map not taken: {error}", throttle_duration_sec=10.0)
         except Exception as error:  # whatever one map does, the next one must be taken
@@ -185,7 +184,7 @@ class MapListener:
         """Compare a map with the calibration and take it in; `_turn` must be held.
 
         Raises:
-            Refused: a calibration is running, or the driver is silent.
+            Refusal: a calibration is running, or the driver is silent.
             MapNotUsableError, StoreError: see :class:`RecalibrationManager`.
         """
         self._judged.append(measured.stamp_ns)
@@ -194,10 +193,10 @@ class MapListener:
         deadline = time.monotonic() + REPORT_WAIT_S
         while not self._history.heard_since(at + still):
             if time.monotonic() > deadline:
-                raise Refused(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
+                raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
             time.sleep(0.01)
         if self._busy():
-            raise Refused(ErrorCode.BUSY, "a calibration is running")
+            raise Refusal(ErrorCode.BUSY, "a calibration is running")
         verdict = self._updates.take(measured, self._history.standing(at, still), dry_run)
         if dry_run:
             return verdict
@@ -231,7 +230,7 @@ class MapListener:
 
     def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
         if request.dry_run:
-            raise Refused(ErrorCode.INVALID_ARGUMENT, "forget and dry_run: only one of them may be set")
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, "forget and dry_run: only one of them may be set")
         self._check_calibrated()
         with self._turn:
             self._updates.forget()
@@ -242,7 +241,7 @@ class MapListener:
         self._check_calibrated()
         with self._turn:
             if self._busy():
-                raise Refused(ErrorCode.BUSY, "a calibration is running")
+                raise Refusal(ErrorCode.BUSY, "a calibration is running")
             measured = self._bench.measure_as_it_stands("calibration check")
             try:
                 verdict = self._judge(measured, request.dry_run)
@@ -257,7 +256,7 @@ class MapListener:
 
     def _check_calibrated(self) -> None:
         if self._updates.calibration is None:
-            raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
 
     # --- health ---
 

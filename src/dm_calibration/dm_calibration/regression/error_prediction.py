@@ -7,15 +7,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ErrorCode
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_errors import Refused, error_code
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.regression.predictor import ErrorPredictor, fit_predictor
 from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions
+from dm_common.errors import ErrorCode, Refusal, error_code
 from dm_common.messages import doubles
 
 
@@ -36,7 +35,7 @@ class ErrorPrediction:
         """Serve `fit_regression`.
 
         Raises:
-            Refused, ValueError, StoreError: see :mod:`~dm_calibration.calibration_errors`; nothing has changed then.
+            Refusal, ValueError, StoreError: see :mod:`~dm_common.errors`; nothing has changed then.
         """
         stored = self._desk.store.load(request.calibration) if request.calibration else self._in_use()
         options = _selection(request.p_enter, request.p_remove)
@@ -59,7 +58,7 @@ class ErrorPrediction:
         """Serve `predict_error`.
 
         Raises:
-            Refused, ValueError: see :mod:`~dm_calibration.calibration_errors`.
+            Refusal, ValueError: see :mod:`~dm_common.errors`.
         """
         calibration = self._in_use()
         signals = self._checked(np.array(request.signals, dtype=np.float64), calibration)
@@ -75,7 +74,7 @@ class ErrorPrediction:
     def _in_use(self) -> Calibration:
         calibration = self._desk.in_use
         if calibration is None:
-            raise Refused(ErrorCode.NOT_CALIBRATED, "no calibration is in use: calibrate, or load one")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: calibrate, or load one")
         return calibration
 
     def _fitted(self, stored: Calibration, method: str, options: SelectionOptions | None) -> ErrorPredictor:
@@ -86,23 +85,23 @@ class ErrorPrediction:
                 influence = fit_influence(stored.maps, fit_options(self._values, method), exclude=left_out)
             return fit_predictor(stored.maps, influence, options)
         except ValueError as error:
-            raise Refused(error_code(error), f"calibration {stored.id}: {error}") from error
+            raise Refusal(error_code(error), f"calibration {stored.id}: {error}") from error
 
     def _checked(self, signals: np.ndarray, calibration: Calibration) -> np.ndarray:
         actuators = calibration.fit.actuators
         if signals.size != actuators:
-            raise Refused(
+            raise Refusal(
                 ErrorCode.INVALID_LENGTH, f"signals: {signals.size} values, the calibrated mirror needs {actuators}"
             )
         if not np.isfinite(signals).all():
-            raise Refused(
+            raise Refusal(
                 ErrorCode.NOT_FINITE, f"signals: number {int(np.argmin(np.isfinite(signals))) + 1} is not finite"
             )
         mirror = self._desk.mirror
         low, high = (mirror.signal_min, mirror.signal_max) if mirror else (-1.0, 1.0)
         worst = int(np.argmax(np.maximum(low - signals, signals - high)))
         if not low <= signals[worst] <= high:
-            raise Refused(
+            raise Refusal(
                 ErrorCode.OUT_OF_RANGE,
                 f"signals: number {worst + 1} is {signals[worst]:g}, must be within {low:g} to {high:g}",
             )

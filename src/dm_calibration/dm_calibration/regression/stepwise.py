@@ -20,6 +20,8 @@ import statsmodels.api as sm
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, stats
 
+from dm_common.errors import ErrorCode
+
 Floats = NDArray[np.float64]
 
 P_ENTER = 0.05
@@ -36,9 +38,13 @@ CONSTANT = 1e-12
 class CollinearError(ValueError):
     """Candidates that cannot be told apart, or from the constant; the message names them."""
 
+    error_code = ErrorCode.TOO_FEW_MAPS
+
 
 class TooFewSamplesError(ValueError):
     """Fewer samples than a regression needs."""
+
+    error_code = ErrorCode.TOO_FEW_MAPS
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
 from dm_calibration.store.atomic_write import write_whole
 from dm_calibration.store.hdf5_image import ImageError, content_hash, read_image, write_image
+from dm_common.errors import CodedError, ErrorCode
 
 SUFFIX = ".h5"
 #: What was measured, and where: never changed after a calibration was stored.
@@ -17,12 +18,16 @@ _RAW = ("maps/", "points/", "mirror/")
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
-class StoreError(Exception):
+class StoreError(CodedError):
     """A calibration could not be written; the message says why, and nothing that was stored has changed."""
+
+    error_code = ErrorCode.STORAGE_FAILED
 
 
 class UnknownCalibrationError(ValueError):
     """There is no such calibration in the folder."""
+
+    error_code = ErrorCode.UNKNOWN_NAME
 
 
 @dataclass(frozen=True)

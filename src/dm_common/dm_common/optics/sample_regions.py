@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dm_common.errors import ErrorCode
 from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
@@ -27,6 +28,8 @@ _RADIUS_DECIMALS = 9
 
 class EmptyRegionError(ValueError):
     """A region holds no data; the message names the map and the region."""
+
+    error_code = ErrorCode.MAP_INSUFFICIENT
 
 
 def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from dm_msgs.msg import ActuatorState, ErrorCode
+from dm_msgs.msg import ActuatorState
 from dm_msgs.srv import Degauss, Measure, SetSignals
 from numpy.typing import NDArray
 from rclpy.context import Context
@@ -17,7 +17,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from dm_common.measurement import BenchError, Cancelled, Measurement, MeasurementError
+from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
+from dm_common.measurement import Measurement
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.worker import ServiceCallError, call, sleep
@@ -65,14 +66,14 @@ class BenchServices:
         self.state = message
 
     def check_ready(self) -> None:
-        """Raise BenchError when the driver says that it takes no commands."""
+        """Raise Refusal when the driver says that it takes no commands."""
         state = self.state
         if state is None or state.driver_state in (ActuatorState.STATE_ACTIVE, ActuatorState.STATE_LINK_LOST):
             return
-        raise BenchError(ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active: activate it first")
+        raise Refusal(ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active: activate it first")
 
     def check_history(self) -> None:
-        """Raise BenchError when the driver knew what the actuators went through and no longer does.
+        """Raise Refusal when the driver knew what the actuators went through and no longer does.
 
         A driver that was restarted, or lost its link, takes commands again soon; what was measured before and after
         does not belong together without a degauss between.
@@ -82,7 +83,7 @@ class BenchServices:
             return
         if self._history_known and not state.history_known:
             self._history_known = False
-            raise BenchError(
+            raise Refusal(
                 ErrorCode.DRIVER_UNAVAILABLE,
                 "pdm_driver no longer knows what the actuators went through: it was restarted or lost its link",
             )
@@ -103,7 +104,7 @@ class BenchServices:
         try:
             return sleep(self._node.get_clock(), self.settle_time + dwell, self.cancelled)
         except TimeoutError as error:
-            raise BenchError(ErrorCode.TIMEOUT, str(error)) from error
+            raise Refusal(ErrorCode.TIMEOUT, str(error)) from error
 
     def measure(self, label: str) -> Measurement:
         return self._measured(label, self._check_undisturbed)
@@ -118,17 +119,17 @@ class BenchServices:
         # The interferometer keeps the time itself; the call waits a little longer for its answer in words.
         try:
             response = self._call(self._measure, request, timeout + 5.0, ErrorCode.INTERFEROMETER_UNAVAILABLE)
-        except BenchError as error:
-            if error.code in _FATAL:
+        except Refusal as error:
+            if error.error_code in _FATAL:
                 raise
-            raise MeasurementError(error.code, str(error)) from error
+            raise MeasurementError(error.error_code, str(error)) from error
         check()
         try:
             # The state was looked at after the map, so its stamp is of the write that the map shows.
             moved_ns = stamp_ns(self.state.header.stamp) if self.state is not None else 0
             return replace(measurement_from(response), moved_ns=moved_ns)
         except ValueError as error:
-            raise BenchError(ErrorCode.INTERNAL, f"measure: {error}") from error
+            raise Refusal(ErrorCode.INTERNAL, f"measure: {error}") from error
 
     def rest(self, signals: Floats) -> str:
         """Ramp back to `signals`, whatever was cancelled. Returns what became of it, in words."""
@@ -138,9 +139,9 @@ class BenchServices:
             try:
                 self.apply(signals)
                 return "the mirror is back at mid range"
-            except BenchError as error:
+            except Refusal as error:
                 # A degauss or ramp that was cancelled here may still be running there.
-                if error.code in (ErrorCode.BUSY, ErrorCode.PREEMPTED) and time.monotonic() < deadline:
+                if error.error_code in (ErrorCode.BUSY, ErrorCode.PREEMPTED) and time.monotonic() < deadline:
                     time.sleep(0.2)
                     continue
                 return f"the mirror could NOT be brought back to mid range: {error}"
@@ -174,13 +175,13 @@ class BenchServices:
         except ServiceCallError as error:
             if self.cancelled():
                 raise Cancelled("cancelled") from error
-            raise BenchError(unavailable, str(error)) from error
+            raise Refusal(unavailable, str(error)) from error
         if response.error_code != ErrorCode.OK:
-            raise BenchError(response.error_code, f"{client.srv_name}: {response.message}")
+            raise Refusal(response.error_code, f"{client.srv_name}: {response.message}")
         return response
 
     def _check_undisturbed(self) -> None:
-        """Raise BenchError when the mirror no longer holds what this node commanded: the map shows something else."""
+        """Raise Refusal when the mirror no longer holds what this node commanded: the map shows something else."""
         deadline = time.monotonic() + _STATE_WAIT_S
         while self.state is not None and self._commanded is not None:
             requested = np.array(self.state.requested, dtype=np.float64)
@@ -189,5 +190,5 @@ class BenchServices:
             ):
                 return
             if time.monotonic() > deadline or self.cancelled():
-                raise BenchError(ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first")
+                raise Refusal(ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first")
             time.sleep(0.01)

@@ -23,6 +23,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.service import Service
 
+from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
@@ -41,7 +42,7 @@ def _tell(node: Node, what: str, error: Exception, answer: Any) -> None:
     """Log an exception of the body of `what`, and tell it in the answer as ErrorCode.INTERNAL if that has a place."""
     node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
     if hasattr(answer, "error_code"):
-        answer.error_code = 599  # ErrorCode.INTERNAL
+        answer.error_code = ErrorCode.INTERNAL
         answer.message = f"{type(error).__name__}: {error}"
 
 

@@ -23,7 +23,8 @@ from typing import Protocol
 
 import numpy as np
 
-from dm_common.measurement import Cancelled, Measurement
+from dm_common.errors import Cancelled
+from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
@@ -203,7 +204,7 @@ def converge(
     Raises:
         TargetError: no such surface exists over the aperture.
         StoppedLoop: `cancelled()` became true, or the plant was cancelled while settling.
-        BenchError: the mirror or the interferometer failed.
+        Refusal: the mirror or the interferometer failed.
         ValueError: maps of another kind than the calibration's.
     """
     options = options or LoopOptions()

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import Converge
-from dm_msgs.msg import Calibration, ErrorCode, MirrorInfo
+from dm_msgs.msg import Calibration, MirrorInfo
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from dm_common.measurement import BenchError, Cancelled
+from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.messages import doubles
 from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, wait_for_clock
@@ -98,8 +98,6 @@ class ConvergeAction:
             outcome, error_code, message = ending(error)
             if isinstance(error, Cancelled):
                 message = str(StoppedLoop(tuple(steps)))
-            elif isinstance(error, BenchError) and error.code != ErrorCode.BUSY:
-                message += "; the mirror holds the last command"
         # One line per severity: rclpy ties a severity to the line that logs.
         if outcome == "succeed":
             self._node.get_logger().info(f"converge: {message}")
@@ -123,7 +121,10 @@ class ConvergeAction:
         if state is not None and len(state.applied) == count and np.isfinite(state.applied).all():
             before = np.asarray(state.applied, dtype=float)
             creep = Creep(self._values["converge.creep"], before, lambda: clock.now().nanoseconds * 1e-9)
-        return converge(solver, target, bench, options, creep=creep, on_step=report, cancelled=bench.cancelled)
+        try:
+            return converge(solver, target, bench, options, creep=creep, on_step=report, cancelled=bench.cancelled)
+        except Refusal as error:
+            raise Refusal(error.error_code, f"{error}; the mirror holds the last command") from error
 
     def _options(self, goal: Any) -> LoopOptions:
         """What the goal asks for, 0 = configured. Raises ValueError naming the field."""
@@ -135,7 +136,7 @@ class ConvergeAction:
     def _solver(self, method: str) -> Solver:
         calibration, mirror = self._known()
         if calibration is None or mirror is None:
-            raise BenchError(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
         facts = MirrorFacts(
             np.asarray(mirror.actuator_x, dtype=float),
             np.asarray(mirror.actuator_y, dtype=float),

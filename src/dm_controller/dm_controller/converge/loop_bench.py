@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import Degauss
 from rclpy.node import Node
 
-from dm_common.measurement import BenchError, Cancelled, Measurement, MeasurementError
-from dm_common.names import UnknownNameError
+from dm_common.errors import EXPECTED, Cancelled, ErrorCode, MeasurementError, Refusal, error_code
+from dm_common.measurement import Measurement
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.parameters import Parameter
 
@@ -50,10 +49,10 @@ class LoopBench(BenchServices):
         """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
 
         Raises:
-            BenchError: another goal has it.
+            Refusal: another goal has it.
         """
         if not self._goal.acquire(blocking=False):
-            raise BenchError(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
+            raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
         try:
             self.cancelled = cancelled
             yield
@@ -66,7 +65,7 @@ class LoopBench(BenchServices):
         self._call(self._degauss, request, self._values["degauss_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
 
     def measure(self, label: str) -> Measurement:
-        """One map. Raises MeasurementError after all tries, or BenchError when no other try can succeed."""
+        """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""
         left = int(self._parameters["converge.measure_retries"])
         while True:
             try:
@@ -89,14 +88,8 @@ def ending(error: Exception) -> tuple[str, int, str]:
     """Outcome of the action, ErrorCode and sentence of a goal that `error` ended. A defect is raised again."""
     if isinstance(error, Cancelled):
         return "canceled", ErrorCode.CANCELED, str(error)
-    if isinstance(error, BenchError):
-        return "abort", error.code, str(error)
-    if hasattr(error, "error_code"):  # a refusal of the host
-        return "abort", error.error_code, str(error)
-    if isinstance(error, UnknownNameError):
-        return "abort", ErrorCode.UNKNOWN_NAME, str(error)
-    if isinstance(error, ValueError):
-        return "abort", ErrorCode.INVALID_ARGUMENT, str(error)
+    if isinstance(error, EXPECTED):
+        return "abort", error_code(error), str(error)
     if isinstance(error, TimeoutError):
         return "abort", ErrorCode.TIMEOUT, str(error)
     raise error

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import BuildRecipes
-from dm_msgs.msg import Calibration, ErrorCode, FocusRequest, MirrorInfo
+from dm_msgs.msg import Calibration, FocusRequest, MirrorInfo
 from dm_msgs.srv import StoreRecipes
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
+from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.tracker import Applied, HysteresisTracker
-from dm_common.measurement import BenchError, Cancelled
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeError
 from dm_common.ros.parameters import Parameter
@@ -106,14 +106,14 @@ class BuildRecipesAction:
         """Build and store.
 
         Raises:
-            BenchError, ValueError: refused before anything moved.
+            Refusal, ValueError: refused before anything moved.
         """
         goal, bench = handle.request, self._bench
         options = self._options(goal)
         target: FocusTarget = self._decide(FocusRequest(conic_constant=goal.conic_constant)).target
         calibration, mirror = self._known()
         if calibration is None or mirror is None:
-            raise BenchError(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
         loop = Planner(
             CalibratedMirror(model_of(calibration), limits_of(mirror)),
             hysteresis_figures_of(calibration),
@@ -172,7 +172,8 @@ class BuildRecipesAction:
             else "no recipe was stored"
         )
         result.error_code, result.message = code, "; ".join(filter(None, (text, figures, rest)))
-        return {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "canceled"}.get(code, "abort"), result
+        outcomes: dict[int, str] = {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "canceled"}
+        return outcomes.get(code, "abort"), result
 
     def _build(self, builder: RecipeBuilder, targets: list[FocusTarget]) -> tuple[list[Recipe], int, str]:
         """Whole recipes, and what ended the work: an ErrorCode and a sentence."""
@@ -183,8 +184,8 @@ class BuildRecipesAction:
                 recipes.append(recipe)  # one by one: what is whole stays when the next fails
         except Cancelled as error:
             return recipes, ErrorCode.CANCELED, str(error)
-        except BenchError as error:
-            return recipes, error.code, str(error)
+        except Refusal as error:
+            return recipes, error.error_code, str(error)
         except UnreachableError as error:
             return recipes, ErrorCode.UNREACHABLE, str(error)
         except ValueError as error:
@@ -207,10 +208,10 @@ class BuildRecipesAction:
         try:
             return recipe_targets(list(goal.curvatures), target.conic_constant, loop, UNREACHABLE_ERROR)
         except UnreachableError as error:
-            raise BenchError(ErrorCode.UNREACHABLE, str(error)) from error
+            raise Refusal(ErrorCode.UNREACHABLE, str(error)) from error
         except (RecipeError, TargetError) as error:
             finite = all(math.isfinite(curvature) for curvature in goal.curvatures)
-            raise BenchError(ErrorCode.INVALID_ARGUMENT if finite else ErrorCode.NOT_FINITE, str(error)) from error
+            raise Refusal(ErrorCode.INVALID_ARGUMENT if finite else ErrorCode.NOT_FINITE, str(error)) from error
 
     def _guess(self, law: HysteresisModel, now: float) -> HysteresisState | None:
         """The mirror long rested where the driver says it stands; None when it does not say."""

@@ -16,8 +16,9 @@ from typing import Protocol
 
 import numpy as np
 
+from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
-from dm_common.measurement import Cancelled, Measurement
+from dm_common.measurement import Measurement
 from dm_common.recipes import Recipe, RecipeBook, RecipeError
 from dm_controller.converge.recipe_targets import UnreachableError
 from dm_controller.planning.mirror_model import FREE_TERMS
@@ -156,7 +157,7 @@ class RecipeBuilder:
             RecipeError: added terms.
             UnreachableError: the limits deny the shape.
             Cancelled: `cancelled()` became true.
-            BenchError, ValueError: the bench failed, or its maps are of another kind than the calibration's.
+            Refusal, ValueError: the bench failed, or its maps are of another kind than the calibration's.
         """
         if any(target.zernike):
             raise RecipeError("zernike: recipes are of plain conics, without added terms")

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from dm_msgs.msg import Calibration, ErrorCode, MirrorInfo
+from dm_msgs.msg import Calibration, MirrorInfo
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import certain_reach
 from dm_common.messages import recipe_book_from, stamp_ns
 from dm_common.recipes import RecipeBook

@@ -31,6 +31,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import Image
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.action_client import ThreadedActionClient
@@ -71,10 +72,6 @@ ANSWER_S = 10.0
 #: Time that runs back by more than this is another time: a simulator that was started again, s.
 TIME_JUMP_S = 60.0
 _NUMBERS = itertools.count(1)
-
-
-class RefusedError(Exception):
-    """A node refused, or did not answer; the message is the sentence to show."""
 
 
 @dataclass(frozen=True)
@@ -174,21 +171,21 @@ class ConsoleNode:
         """Call a service of the suite.
 
         Raises:
-            RefusedError: it refused, with its sentence, or did not answer.
+            Refusal: it refused, with its sentence, or did not answer.
         """
         try:
             response = await asyncio.to_thread(call, self._services[name], request, timeout_s)
         except ServiceCallError as error:
-            raise RefusedError(str(error)) from error
+            raise Refusal(ErrorCode.TIMEOUT, str(error)) from error
         if response.error_code != 0:
-            raise RefusedError(f"{response.message} (error {response.error_code})")
+            raise Refusal(response.error_code, f"{response.message} (error {response.error_code})")
         return response
 
     async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = 7200.0) -> Any:
         """Run an action to its end and return its result.
 
         Raises:
-            RefusedError: the goal was refused, ended with an error or was cancelled, with the node's sentence.
+            Refusal: the goal was refused, ended with an error or was cancelled, with the node's sentence.
         """
         client = self._actions[name]
         identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
@@ -202,10 +199,12 @@ class ConsoleNode:
             if self._beginning.pop(name):
                 await self.cancel(name)
             if not await _until(finished.done, timeout_s, lambda: self._server_is_gone(client)):
-                with contextlib.suppress(RefusedError):
+                with contextlib.suppress(Refusal):
                     await self.cancel(name)
-                raise RefusedError(f"{name}: no result: its node has gone, or it took longer than {timeout_s:g} s")
-        except RefusedError:
+                raise Refusal(
+                    ErrorCode.TIMEOUT, f"{name}: no result: its node has gone, or it took longer than {timeout_s:g} s"
+                )
+        except Refusal:
             if name in self.watched:  # it may run all the same: then it must be seen, and be cancelled from here
                 self.watched[name].disown(identity)
             raise
@@ -214,22 +213,22 @@ class ConsoleNode:
             self._goals.pop(name, None)
         result = finished.result().result
         if result.error_code != 0:
-            raise RefusedError(f"{result.message} (error {result.error_code})")
+            raise Refusal(result.error_code, f"{result.message} (error {result.error_code})")
         return result
 
     async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None], identity: Any) -> Any:
         """The handle of a goal that was accepted."""
         client = self._actions[name]
         if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
-            raise RefusedError(f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
+            raise Refusal(ErrorCode.TIMEOUT, f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
         if self._beginning[name]:
-            raise RefusedError(f"{name}: cancelled before it began; nothing has changed")
+            raise Refusal(ErrorCode.CANCELED, f"{name}: cancelled before it began; nothing has changed")
         accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
         if not await _until(accepted.done, ANSWER_S):
-            raise RefusedError(f"{name}: no answer to the goal within {ANSWER_S:g} s")
+            raise Refusal(ErrorCode.TIMEOUT, f"{name}: no answer to the goal within {ANSWER_S:g} s")
         handle = accepted.result()
         if not handle.accepted:
-            raise RefusedError(f"{name}: refused, another goal is running")
+            raise Refusal(ErrorCode.BUSY, f"{name}: refused, another goal is running")
         return handle
 
     @staticmethod
@@ -245,7 +244,7 @@ class ConsoleNode:
         """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs.
 
         Raises:
-            RefusedError: no answer, or the node does not know the goal.
+            Refusal: no answer, or the node does not know the goal.
         """
         handle = self._goals.get(name)
         if handle is None and name in self._beginning:
@@ -258,10 +257,10 @@ class ConsoleNode:
         if asked is None:
             return
         if not await _until(asked.done, ANSWER_S):
-            raise RefusedError(f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
+            raise Refusal(ErrorCode.TIMEOUT, f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
         code, codes = asked.result().return_code, CancelGoal.Response
         if code not in (codes.ERROR_NONE, codes.ERROR_GOAL_TERMINATED):
-            raise RefusedError(f"{name}: its node does not cancel the goal (code {code})")
+            raise Refusal(ErrorCode.NOT_SUPPORTED, f"{name}: its node does not cancel the goal (code {code})")
 
 
 async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[[], bool] = lambda: False) -> bool:

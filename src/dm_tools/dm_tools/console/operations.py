@@ -10,7 +10,7 @@ from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
 from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import Degauss, Flatten, LoadCalibration, Measure, SetFocus, SetSignals
 
-from dm_tools.console.console_node import RefusedError
+from dm_common.errors import ErrorCode, Refusal
 from dm_tools.console.feedback import calibration_step, converge_step, recipe_step
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
@@ -29,7 +29,7 @@ DEGAUSS_S, MEASURE_S, MOVE_S = 300.0, 120.0, 60.0
 
 
 async def predict(session: Session, request: FocusRequest) -> str:
-    """The prediction for a request, in words; nothing moves. Raises RefusedError."""
+    """The prediction for a request, in words; nothing moves. Raises Refusal."""
     answer = await session.ros.call("set_focus", SetFocus.Request(request=request, dry_run=True))
     return prediction_words(answer.state)
 
@@ -123,11 +123,11 @@ async def load(session: Session, name: str) -> str:
 
 
 def _standing(session: Session) -> tuple[Any, list[float]]:
-    """mirror_info and the requested signals. Raises RefusedError when the driver has not told them."""
+    """mirror_info and the requested signals. Raises Refusal when the driver has not told them."""
     snapshot = session.snapshot()
     state, mirror = snapshot.actuator_state, snapshot.mirror_info
     if mirror is None or state is None:
-        raise RefusedError("the driver has not told its mirror and signals yet")
+        raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "the driver has not told its mirror and signals yet")
     requested = list(state.requested)
     if not requested:
         requested = [0.5 * (mirror.signal_min + mirror.signal_max)] * mirror.actuators
@@ -169,11 +169,14 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
     snapshot, (mirror, start) = session.snapshot(), _standing(session)
     calibration, following = snapshot.calibration, session.ros.following
     if calibration is None or not calibration.id:
-        raise RefusedError("a measured loop needs a calibration: it holds what the actuator does to the surface")
+        raise Refusal(
+            ErrorCode.NOT_CALIBRATED,
+            "a measured loop needs a calibration: it holds what the actuator does to the surface",
+        )
     standing = following.now(snapshot.bench_time)
     state = following.state()
     if standing.effective is None or state is None:
-        raise RefusedError(f"where the actuators stand is not known: {standing.doubt}")
+        raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"where the actuators stand is not known: {standing.doubt}")
     signals = way(start[actuator - 1], amplitude, mirror.signal_min, mirror.signal_max)
     first = float(standing.effective[actuator - 1])
     model = modelled_way(following.law, state, actuator, signals)
@@ -183,13 +186,13 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
     try:
         for step, signal in enumerate(signals, start=1):
             if session.cancelled:
-                raise RefusedError("cancelled; the actuator is back where it began")
+                raise Refusal(ErrorCode.CANCELED, "cancelled; the actuator is back where it began")
             session.progress.step, session.progress.words = step, f"actuator {actuator} at {signal:+.2f}"
             shape = [*start[: actuator - 1], signal, *start[actuator:]]
             await session.ros.call("set_signals", SetSignals.Request(signals=shape, wait=True), MOVE_S)
             after = (await session.ros.call("measure", Measure.Request(label=f"loop {step}"), MEASURE_S)).samples
             values.append(first + effective_change(before, after, calibration, actuator))
-    except (RefusedError, ValueError):
+    except (Refusal, ValueError):
         await session.ros.call("set_signals", SetSignals.Request(signals=start, wait=True), MOVE_S)
         raise
     loop = modelled_loop(following.law, actuator, mirror.signal_min, mirror.signal_max)

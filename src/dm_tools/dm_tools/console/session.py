@@ -9,7 +9,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from dm_tools.console.console_node import ConsoleNode, RefusedError, Snapshot
+from dm_common.errors import Refusal
+from dm_tools.console.console_node import ConsoleNode, Snapshot
 from dm_tools.console.feedback import calibration_step, converge_step, recipe_step
 from dm_tools.console.loops import Loop
 
@@ -124,7 +125,7 @@ class Session:
         """Start an operation; when another is under way, say so instead.
 
         Args:
-            work: returns its outcome in words; raises RefusedError or ValueError with the sentence to show.
+            work: returns its outcome in words; raises Refusal or ValueError with the sentence to show.
             cancel: how to stop it; None = it cannot be.
         """
         if self.running:
@@ -137,7 +138,7 @@ class Session:
     async def _follow(self, title: str, work: Callable[[], Awaitable[str]]) -> None:
         try:
             self.outcome = f"{title}: {await work()}"
-        except (RefusedError, ValueError) as error:
+        except (Refusal, ValueError) as error:
             self.fail(title, str(error))
         except Exception as error:  # a defect of the console must be seen, too
             self.fail(title, f"{type(error).__name__}: {error}")
@@ -154,7 +155,7 @@ class Session:
                 self.cancelled = True
                 self.progress.words = "cancelling"
                 await self._cancel()
-        except RefusedError as error:
+        except Refusal as error:
             self.fail("Cancel", str(error))
 
     async def between_steps(self) -> None:

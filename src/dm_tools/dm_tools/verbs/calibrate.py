@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_common.errors import ErrorCode
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
 
 
@@ -55,10 +56,12 @@ def start_fresh(client: Any) -> None:
 
     parameters = AsyncParameterClient(client.node, "calibration")
     if not client.wait(lambda: answers_arrive(parameters, parameters.services_are_ready)):
-        raise DeformableMirrorError(599, "the node `calibration` does not answer: is it running (./dm up)?")
+        raise DeformableMirrorError(
+            ErrorCode.INTERNAL, "the node `calibration` does not answer: is it running (./dm up)?"
+        )
     answer = parameters.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, True)])
     if not client.wait(answer.done) or not all(each.successful for each in answer.result().results):
-        raise DeformableMirrorError(599, "the node `calibration` did not take start_fresh = true")
+        raise DeformableMirrorError(ErrorCode.INTERNAL, "the node `calibration` did not take start_fresh = true")
 
 
 def show_result(result: Any) -> None:

@@ -9,8 +9,9 @@ from dm_msgs.action import Calibrate
 from dm_msgs.srv import ListCalibrations
 from nicegui import background_tasks, ui
 
+from dm_common.errors import Refusal
 from dm_tools.console import operations
-from dm_tools.console.console_node import RefusedError, Snapshot
+from dm_tools.console.console_node import Snapshot
 from dm_tools.console.drawing.charts import residual_chart
 from dm_tools.console.session import Session
 from dm_tools.console.status import why_not
@@ -114,7 +115,7 @@ class CalibrationCard:
     async def _list(self) -> None:
         try:
             answer: Any = await self._session.ros.call("list_calibrations", ListCalibrations.Request())
-        except RefusedError as error:
+        except Refusal as error:
             self._session.fail("List of calibrations", str(error))
             return
         options = {

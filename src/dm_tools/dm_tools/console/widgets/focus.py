@@ -8,8 +8,9 @@ import time
 from dm_msgs.msg import FocusRequest
 from nicegui import background_tasks, ui
 
+from dm_common.errors import Refusal
 from dm_tools.console import operations
-from dm_tools.console.console_node import RefusedError, Snapshot
+from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import why_not
 from dm_tools.console.view_models import MODES, reachable
@@ -145,7 +146,7 @@ class FocusCard:
                 words = await operations.predict(self._session, request)
                 self._prediction.label.classes(remove="refused")
                 self._prediction.show(words)
-        except RefusedError as error:
+        except Refusal as error:
             self._prediction.label.classes(add="refused")
             self._prediction.show(str(error))
         finally:
