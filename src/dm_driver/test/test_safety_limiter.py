@@ -71,7 +71,7 @@ def test_out_of_range_names_actuator_value_and_range() -> None:
 def test_rounding_beyond_the_range_is_cut_off_not_refused() -> None:
     shape = make_limiter().check_shape(np.full(37, 1.0 + 5e-10))
     assert (shape == 1.0).all()
-    assert refusal_of(make_limiter(), np.full(37, 1.0 + 5e-9)).reason is ErrorCode.OUT_OF_RANGE
+    assert refusal_of(make_limiter(), np.full(37, 1.0 + 5e-9)).error_code == ErrorCode.OUT_OF_RANGE
 
 
 def test_neighbour_difference_names_the_pair() -> None:
