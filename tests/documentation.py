@@ -11,7 +11,7 @@ from pathlib import Path
 from markdown_it import MarkdownIt
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,8 @@ PARSED = {
     "./dm demo --camera": _LONG + "its parts run in test_autofocus_node.py",
     "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
     "./dm test": "would run this test again",
+    "./dm test --fast": "would run tests within a test",
+    "./dm test src/dm_common/test/test_zernike_terms.py": "would run tests within a test",
     "./dm calibrate": _LONG + "test_end_to_end.py runs the plan",
     "./dm calibrate --fresh": _LONG + "test_end_to_end.py runs the plan",
     "./dm calibrate --hysteresis 300": _LONG + "test_calibration_node.py and the demo run the plan",
@@ -149,6 +151,11 @@ ELSEWHERE = {
     "source install/setup.bash": "the same",
     'ln -s "$PWD/dm" ~/.local/bin/dm': "test_completion.py makes such a link and completes through it",
     "dm --install-completion": "test_completion.py runs it",
+    './dm exec python -c "import dm_client"': "would set up within the tests",
+    "./dm exec pip install pre-commit": "needs the network",
+    "./dm exec pre-commit install": "needs what the command before it installs",
+    "./dm exec python -m dm_tools.documentation.parameters": "test_repository.py compares page and code",
+    "./dm exec python -m dm_tools.documentation.interfaces": "test_interface_reference.py compares page and code",
 }
 #: What Python blocks take for granted, by page and number of the block on it.
 PRELUDES = {

@@ -68,6 +68,29 @@ def test_nothing_is_classified_that_the_documentation_does_not_say() -> None:
     assert told.TEXTS.keys() == {block.text.split("\n", 1)[0] for block in BLOCKS if block.kind == "text"}
 
 
+@pytest.mark.parametrize("page", told.PAGES, ids=lambda page: page.name)
+def test_links_to_files_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
+        assert target.startswith("http") or (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_references_are_those_that_the_code_cites() -> None:
+    listed = set(re.findall(r"(?m)^\[(\d+)\]", (ROOT / "docs" / "references.md").read_text()))
+    cited = set()
+    for path in (path for folder in ("src", "studies", "tests") for path in (ROOT / folder).rglob("*.py")):
+        for text in (*docstrings(path), *re.findall(r"(?m)#:? .*$", path.read_text())):
+            for numbers in re.findall(r"(?<![\w\]`])\[([1-9]\d*(?:, \d+)?)\]", text):
+                cited |= set(numbers.split(", "))
+    assert cited == listed
+
+
+def docstrings(path: Path) -> Iterator[str]:
+    """Of the module, its classes and functions."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+            yield ast.get_docstring(node) or ""
+
+
 def dm_commands() -> dict[str, Any]:
     """The commands of `dm` by name."""
     group: Any = typer.main.get_command(app)
