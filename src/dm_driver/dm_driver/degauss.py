@@ -6,7 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from dm_driver.safety_limiter import Shape
+from dm_driver.moves import Kind, Move
+from dm_common.errors import ErrorCode, Refusal
+from dm_driver.safety_limiter import Limits, Shape
+
+#: A degauss of at least this share of the full range leaves nothing of what was before.
+FULL_CYCLE = 0.999
 
 
 def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: int, end: Shape) -> Iterator[Shape]:
@@ -26,3 +31,27 @@ def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: in
         radius = amplitude * (1.0 - step / steps)
         yield np.full(actuators, middle + (radius if step % 2 else -radius))
     yield end
+
+
+def degauss_move(limits: Limits, amplitude: float, steps: int, end: Shape) -> Move:
+    """The decaying cycle about mid range, then the way to `end` (a legal shape).
+
+    Args:
+        limits: of the mirror.
+        amplitude: first half-swing; 0 = the largest inside the limits.
+        steps: half-swings.
+        end: (N,) signals to end in.
+
+    Raises:
+        Refusal: OUT_OF_RANGE.
+    """
+    middle = 0.5 * (limits.signal_min + limits.signal_max)
+    largest = 0.5 * (limits.signal_max - limits.signal_min)
+    if not 0.0 <= amplitude <= largest:
+        raise Refusal(ErrorCode.OUT_OF_RANGE, f"amplitude = {amplitude:g}: must be 0 to {largest:g}")
+    if steps < 1:
+        raise Refusal(ErrorCode.OUT_OF_RANGE, f"steps = {steps}: must be at least 1")
+    swing = amplitude or largest
+    waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)
+    # A smaller cycle leaves what wider swings have written.
+    return Move(Kind.DEGAUSS, waypoints, end, wipes=swing >= FULL_CYCLE * largest)
