@@ -20,8 +20,14 @@ from dm_simulation.mirror.hysteresis import LAWS
 from dm_simulation.mirror.piezo import PiezoConfig
 from dm_simulation.mirror.plate import PlateConfig
 
-_PLATE, _PIEZO, _CAMERA, _SCENE = PlateConfig(), PiezoConfig(), InterferometerConfig(), CameraConfig()
-_DRIVE, _PORTS, _WATCH, _FILES = DriveConfig(), PortsConfig(), MonitorConfig(), FilesConfig()
+_PLATE = PlateConfig()
+_PIEZO = PiezoConfig()
+_INSTRUMENT = InterferometerConfig()
+_CAMERA = CameraConfig()
+_DRIVE = DriveConfig()
+_PORTS = PortsConfig()
+_MONITOR = MonitorConfig()
+_FILES = FilesConfig()
 _FRAMED = FramedConfig()
 _PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
 
@@ -49,67 +55,111 @@ PARAMETERS = (
     Parameter("piezo.law", str, _PIEZO.law, "Hysteresis law.", choices=LAWS),
     Parameter("piezo.hysteresis", float, _PIEZO.hysteresis, "Widest loop opening over the full stroke.", "", 0.0, 0.3),
     Parameter("piezo.creep", float, _PIEZO.creep, "Creep of a step per decade of time.", "", 0.0, 0.1),
-    Parameter("interferometer.pixels", int, _CAMERA.pixels, "Pixels along each side.", "px", 32, 4096),
+    Parameter("interferometer.pixels", int, _INSTRUMENT.pixels, "Pixels along each side.", "px", 32, 4096),
     Parameter(
-        "interferometer.field_diameter", float, _CAMERA.field_diameter, "Diameter of the field of view.", "m", 1e-3, 1.0
+        "interferometer.field_diameter",
+        float,
+        _INSTRUMENT.field_diameter,
+        "Diameter of the field of view.",
+        "m",
+        1e-3,
+        1.0,
     ),
-    Parameter("interferometer.wavelength", float, _CAMERA.wavelength, "Wavelength.", "m", 1e-7, 2e-5),
-    Parameter("interferometer.figure_rms", float, _CAMERA.figure_rms, "Initial figure, rms.", "m", 0.0, 1e-5),
-    Parameter("interferometer.pixel_noise", float, _CAMERA.pixel_noise, "Noise per pixel, rms.", "m", 0.0, 1e-6),
+    Parameter("interferometer.wavelength", float, _INSTRUMENT.wavelength, "Wavelength.", "m", 1e-7, 2e-5),
+    Parameter("interferometer.figure_rms", float, _INSTRUMENT.figure_rms, "Initial figure, rms.", "m", 0.0, 1e-5),
+    Parameter("interferometer.pixel_noise", float, _INSTRUMENT.pixel_noise, "Noise per pixel, rms.", "m", 0.0, 1e-6),
     Parameter(
         "interferometer.low_order_noise",
         float,
-        _CAMERA.low_order_noise,
+        _INSTRUMENT.low_order_noise,
         "Noise of all Zernike terms of orders 2-5 together, rms over the field.",
         "m",
         0.0,
         1e-6,
     ),
-    Parameter("interferometer.piston_spread", float, _CAMERA.piston_spread, "Spread of piston.", "m", 0.0, 1e-4),
-    Parameter("interferometer.tilt_spread", float, _CAMERA.tilt_spread, "Spread of edge sag by tilt.", "m", 0.0, 1e-4),
-    Parameter("interferometer.specks", int, _CAMERA.specks, "Mean number of dropped pixels.", "", 0, 1_000_000),
-    Parameter("interferometer.blobs", int, _CAMERA.blobs, "Dropped discs per map.", "", 0, 1000),
-    Parameter("interferometer.flip_x", bool, _CAMERA.flip_x, "Picture mirrored left-right, after turning."),
-    Parameter("interferometer.flip_y", bool, _CAMERA.flip_y, "Picture mirrored upside down, after turning."),
+    Parameter("interferometer.piston_spread", float, _INSTRUMENT.piston_spread, "Spread of piston.", "m", 0.0, 1e-4),
     Parameter(
-        "interferometer.rotate_deg", int, _CAMERA.rotate_deg, "Picture turned anticlockwise by 0, 90, 180 or 270.",
-        "deg", 0, 270,
+        "interferometer.tilt_spread", float, _INSTRUMENT.tilt_spread, "Spread of edge sag by tilt.", "m", 0.0, 1e-4
+    ),
+    Parameter("interferometer.specks", int, _INSTRUMENT.specks, "Mean number of dropped pixels.", "", 0, 1_000_000),
+    Parameter("interferometer.blobs", int, _INSTRUMENT.blobs, "Dropped discs per map.", "", 0, 1000),
+    Parameter("interferometer.flip_x", bool, _INSTRUMENT.flip_x, "Picture mirrored left-right, after turning."),
+    Parameter("interferometer.flip_y", bool, _INSTRUMENT.flip_y, "Picture mirrored upside down, after turning."),
+    Parameter(
+        "interferometer.rotate_deg",
+        int,
+        _INSTRUMENT.rotate_deg,
+        "Picture turned anticlockwise by 0, 90, 180 or 270.",
+        "deg",
+        0,
+        270,
     ),
     Parameter(
-        "camera.rate", float, _SCENE.rate, "Images per second of wall time on image_raw; 0 = no camera.", "Hz",
-        0.0, 200.0,
+        "camera.rate",
+        float,
+        _CAMERA.rate,
+        "Images per second of wall time on image_raw; 0 = no camera.",
+        "Hz",
+        0.0,
+        200.0,
     ),
-    Parameter("camera.width", int, _SCENE.width, "Image width.", "px", 16, 2048),
-    Parameter("camera.height", int, _SCENE.height, "Image height.", "px", 16, 2048),
-    Parameter("camera.pixel_pitch", float, _SCENE.pixel_pitch, "Pixel pitch.", "m", 1e-7, 1e-3),
-    Parameter("camera.focal_length", float, _SCENE.focal_length, "Focal length of the lens.", "m", 1e-3, 10.0),
+    Parameter("camera.width", int, _CAMERA.width, "Image width.", "px", 16, 2048),
+    Parameter("camera.height", int, _CAMERA.height, "Image height.", "px", 16, 2048),
+    Parameter("camera.pixel_pitch", float, _CAMERA.pixel_pitch, "Pixel pitch.", "m", 1e-7, 1e-3),
+    Parameter("camera.focal_length", float, _CAMERA.focal_length, "Focal length of the lens.", "m", 1e-3, 10.0),
     Parameter(
-        "camera.rest_distance", float, _SCENE.rest_distance,
-        "Object distance in focus while the mirror is flat; 0 = infinity.", "m", 0.0, 1e6,
+        "camera.rest_distance",
+        float,
+        _CAMERA.rest_distance,
+        "Object distance in focus while the mirror is flat; 0 = infinity.",
+        "m",
+        0.0,
+        1e6,
     ),
     Parameter(
-        "camera.relay_magnification", float, _SCENE.relay_magnification,
-        "Diameter of the beam on the mirror / of the entrance pupil.", "", 0.01, 100.0,
+        "camera.relay_magnification",
+        float,
+        _CAMERA.relay_magnification,
+        "Diameter of the beam on the mirror / of the entrance pupil.",
+        "",
+        0.01,
+        100.0,
     ),
-    Parameter("camera.wavelength", float, _SCENE.wavelength, "Wavelength of the images.", "m", 1e-7, 2e-5),
+    Parameter("camera.wavelength", float, _CAMERA.wavelength, "Wavelength of the images.", "m", 1e-7, 2e-5),
     Parameter(
-        "camera.distances", "float[]", list(_SCENE.distances),
-        "Distances of the objects, from left to right; 0 = infinity.", "m", 0.0, 1e6,
+        "camera.distances",
+        "float[]",
+        list(_CAMERA.distances),
+        "Distances of the objects, from left to right; 0 = infinity.",
+        "m",
+        0.0,
+        1e6,
     ),
-    Parameter("camera.photons", float, _SCENE.photons, "Electrons per pixel at the mean grey level.", "", 1.0, 1e9),
+    Parameter("camera.photons", float, _CAMERA.photons, "Electrons per pixel at the mean grey level.", "", 1.0, 1e9),
     Parameter("electronics.tcp_port", int, _PORTS.tcp_port, f"EDAC40 over TCP {_PORT_TEXT}", low=-1, high=65535),
     Parameter("electronics.udp_port", int, _PORTS.udp_port, f"EDAC40 over UDP {_PORT_TEXT}", low=-1, high=65535),
     Parameter(
-        "electronics.discovery_port", int, _PORTS.discovery_port, f"EDAC40 discovery {_PORT_TEXT}",
-        low=-1, high=65535,
+        "electronics.discovery_port",
+        int,
+        _PORTS.discovery_port,
+        f"EDAC40 discovery {_PORT_TEXT}",
+        low=-1,
+        high=65535,
     ),
     Parameter(
-        "electronics.pty_link", str, _PORTS.pty_link,
+        "electronics.pty_link",
+        str,
+        _PORTS.pty_link,
         "Path of a symbolic link to the pseudo-terminal of the USB DAC-40 or the framed unit; empty = not offered.",
     ),
     Parameter(
-        "framed.channels", int, _FRAMED.channels, "Words in a frame of the serial unit; 0 = it is a USB DAC-40.", "",
-        0, 4096,
+        "framed.channels",
+        int,
+        _FRAMED.channels,
+        "Words in a frame of the serial unit; 0 = it is a USB DAC-40.",
+        "",
+        0,
+        4096,
     ),
     Parameter("framed.bits", int, _FRAMED.bits, "Bits of a code of the serial unit.", "", 1, 16),
     Parameter("framed.header", str, _FRAMED.header, "Bytes before the words, hexadecimal."),
@@ -139,14 +189,19 @@ PARAMETERS = (
     Parameter(
         "wiring", "int[]", list(_DRIVE.wiring), "True connector channel (0-based) of actuators 1, 2, ...", "", 0, 4095
     ),
-    Parameter("monitor.jump", float, _WATCH.jump, "Counted: change per frame above this; 0 = off.", "", 0.0, 4.0),
+    Parameter("monitor.jump", float, _MONITOR.jump, "Counted: change per frame above this; 0 = off.", "", 0.0, 4.0),
     Parameter(
-        "monitor.neighbour_difference", float, _WATCH.neighbour_difference,
-        "Counted: difference of neighbouring signals above this; 0 = off.", "", 0.0, 4.0,
+        "monitor.neighbour_difference",
+        float,
+        _MONITOR.neighbour_difference,
+        "Counted: difference of neighbouring signals above this; 0 = off.",
+        "",
+        0.0,
+        4.0,
     ),
-    Parameter("monitor.signal_min", float, _WATCH.signal_min, "Counted: signals below this.", "", -10.0, 10.0),
-    Parameter("monitor.signal_max", float, _WATCH.signal_max, "Counted: signals above this.", "", -10.0, 10.0),
-    Parameter("monitor.tolerance", float, _WATCH.tolerance, "Allowance for DAC steps.", "", 0.0, 1.0),
+    Parameter("monitor.signal_min", float, _MONITOR.signal_min, "Counted: signals below this.", "", -10.0, 10.0),
+    Parameter("monitor.signal_max", float, _MONITOR.signal_max, "Counted: signals above this.", "", -10.0, 10.0),
+    Parameter("monitor.tolerance", float, _MONITOR.tolerance, "Allowance for DAC steps.", "", 0.0, 1.0),
     Parameter("trigger.port", int, 1235, f"Trigger {_PORT_TEXT}", low=-1, high=65535),
     Parameter(
         "output_folder", str, str(Path(tempfile.gettempdir()) / "virtual_bench"), "Folder of maps without a given path."
@@ -155,16 +210,25 @@ PARAMETERS = (
     Parameter("output_datx_unit", str, _FILES.datx_unit, "Unit of the heights in .datx files.", choices=UNITS),
     Parameter("output_intensity", bool, _FILES.intensity, "Whether .dat files have an intensity frame."),
     Parameter(
-        "output_slow_write", float, _FILES.slow_write, "Wall time over which a file grows; 0 = it appears whole.",
-        "s", 0.0, 60.0,
+        "output_slow_write",
+        float,
+        _FILES.slow_write,
+        "Wall time over which a file grows; 0 = it appears whole.",
+        "s",
+        0.0,
+        60.0,
     ),
     Parameter(
-        "clock.speed", float, 0.0,
+        "clock.speed",
+        float,
+        0.0,
         "Publish /clock at this multiple of the wall clock, and live by it; 0 = no /clock, the node's own time.",
-        "", 0.0, 1e4,
+        "",
+        0.0,
+        1e4,
     ),
     Parameter("clock.period", float, 0.002, "Wall time between two messages on /clock.", "s", 1e-4, 1.0),
-)  # fmt: skip
+)
 
 
 def bench_config(values: Mapping[str, Any]) -> BenchConfig:

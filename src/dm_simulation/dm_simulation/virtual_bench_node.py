@@ -1,4 +1,4 @@
-"""Node `virtual_bench`: the digital twin of mirror, drive electronics and interferometer.
+"""Node `virtual_bench`: simulation of mirror, drive electronics and interferometer.
 
 Other nodes meet it as they meet hardware: on the wire and in map files. ROS carries only what a person at the bench
 would do: pull the plug (`~/power`), press the instrument's button (`~/trigger`), read the labels (`~/endpoints`); and
@@ -28,8 +28,20 @@ from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
-from dm_simulation.clock import FastClock
 from dm_simulation.parameters import PARAMETERS, bench_config
+
+
+class FastClock:
+    """Starts at the Unix time of its making and runs at `speed` times the wall clock."""
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed
+        self._start_ns = time.time_ns()
+        self._origin_ns = time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Time in ns since the Unix epoch."""
+        return self._start_ns + round(self.speed * (time.monotonic_ns() - self._origin_ns))
 
 
 class VirtualBenchNode(Node):
@@ -55,12 +67,12 @@ class VirtualBenchNode(Node):
             self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=1))
             self._ticker = threading.Thread(target=self._tick, args=(values["clock.period"],), daemon=True)
             self._ticker.start()
-        self._photographer: threading.Thread | None = None
+        self._camera_thread: threading.Thread | None = None
         if self.bench.camera is not None:
             # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
             self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
-            self._photographer = threading.Thread(target=self._film, args=(1 / values["camera.rate"],), daemon=True)
-            self._photographer.start()
+            self._camera_thread = threading.Thread(target=self._film, args=(1 / values["camera.rate"],), daemon=True)
+            self._camera_thread.start()
         places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
         law = f"{values['piezo.law']} {100 * values['piezo.hysteresis']:g} %, creep {100 * values['piezo.creep']:g} %"
         self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; clock speed {speed:g}")
@@ -85,7 +97,8 @@ class VirtualBenchNode(Node):
                 return
             height, width = picture.shape
             message = Image(height=height, width=width, encoding="mono8", step=width)
-            message.header.stamp, message.header.frame_id = Time(sec=seconds, nanosec=nanoseconds), "camera"
+            message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
+            message.header.frame_id = "camera"
             message.data = array.array("B", picture.tobytes())
             self._image_publisher.publish(message)
 
@@ -144,8 +157,8 @@ class VirtualBenchNode(Node):
         self._stop.set()
         if self._ticker is not None:
             self._ticker.join(2)
-        if self._photographer is not None:
-            self._photographer.join(2)
+        if self._camera_thread is not None:
+            self._camera_thread.join(2)
         self.bench.close()
 
 

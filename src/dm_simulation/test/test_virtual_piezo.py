@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, PreisachMemory
+from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, PreisachHysteresis
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 
 Array = NDArray[np.float64]
-REMEMBERING = ("prandtl_ishlinskii", "preisach", "bouc_wen")
+HYSTERETIC = ("prandtl_ishlinskii", "preisach", "bouc_wen")
 RETURN_POINT = ("prandtl_ishlinskii", "preisach")
 signal = st.floats(-1, 1, allow_nan=False)
 
@@ -21,7 +21,7 @@ def drive(law: Hysteresis, *signals: float) -> Array:
     return np.array([law.move(np.array([u]))[0] for u in signals])
 
 
-@pytest.mark.parametrize("law", REMEMBERING)
+@pytest.mark.parametrize("law", HYSTERETIC)
 @pytest.mark.parametrize("fraction", [0.05, 0.10, 0.15])
 def test_loop_opens_by_the_stated_fraction_of_a_total_stroke_of_two(law: str, fraction: float) -> None:
     hysteresis = Hysteresis(law, fraction, 1)
@@ -49,7 +49,7 @@ def test_branches_are_monotone(law: str, history: list[float], start: float, sto
     assert np.all(np.diff(branch) * np.sign(stop - start) >= -1e-12)
 
 
-@pytest.mark.parametrize("law", REMEMBERING)
+@pytest.mark.parametrize("law", HYSTERETIC)
 @settings(max_examples=25, deadline=None)
 @given(turns=st.lists(signal, min_size=1, max_size=8), cuts=st.integers(2, 9))
 def test_rate_independence(law: str, turns: list[float], cuts: int) -> None:
@@ -121,14 +121,14 @@ def test_preisach_equals_a_crowd_of_relays() -> None:
     radii, centres = 128, 1200
     r = (np.arange(radii) + 0.5) / radii
     v = (np.arange(centres) + 0.5) / centres * 4 - 2
-    memory = PreisachMemory(1)
-    weight = memory.density(v[None, :], r[:, None]) * (4 / centres) / radii
+    law = PreisachHysteresis(1)
+    weight = law.density(v[None, :], r[:, None]) * (4 / centres) / radii
     up = np.repeat((v < 0)[None, :], radii, axis=0)
     start = (weight * up).sum()
     rng = np.random.default_rng(5)
     for u in rng.uniform(-1, 1, 60):
         up = np.where(u >= v + r[:, None], True, np.where(u <= v - r[:, None], False, up))
-        assert memory.move(np.array([u]))[0] == pytest.approx((weight * up).sum() - start, abs=2e-3)
+        assert law.move(np.array([u]))[0] == pytest.approx((weight * up).sum() - start, abs=2e-3)
 
 
 def test_unknown_laws_and_impossible_loops_are_refused() -> None:

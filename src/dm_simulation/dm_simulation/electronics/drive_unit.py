@@ -13,9 +13,9 @@ from dm_simulation.mirror.zernike import Array
 
 #: Actuator 1..37 of a PDM30-37 (trihex) -> connector channel, 0-based.
 TRIHEX = (
-    14, 16, 38, 23, 26, 1, 8, 10, 13, 37, 18, 36, 25, 28, 22, 7, 5, 2, 6,
-    19, 17, 32, 15, 11, 35, 34, 39, 33, 31, 21, 27, 29, 24, 9, 3, 4, 12,
-)  # fmt: skip
+    *(14, 16, 38, 23, 26, 1, 8, 10, 13, 37, 18, 36, 25, 28, 22, 7, 5, 2, 6),
+    *(19, 17, 32, 15, 11, 35, 34, 39, 33, 31, 21, 27, 29, 24, 9, 3, 4, 12),
+)
 EDAC40_FULL_SCALE = 65535
 DAC40_FULL_SCALE = 4095
 FACTORY_GLOBAL_OFFSET = 0x2000

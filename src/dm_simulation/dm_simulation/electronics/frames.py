@@ -11,17 +11,21 @@ CHANNELS = 40
 
 #: Connector channel of each physical channel of the EDAC40 (both 0-based). The permutation is its own inverse.
 EDAC40_CONNECTOR = np.array(
-    (6, 7, 4, 5, 2, 3, 0, 1, 22, 23, 20, 21, 18, 19, 16, 17, 14, 15, 12, 13,
-     10, 11, 8, 9, 38, 39, 36, 37, 34, 35, 32, 33, 30, 31, 28, 29, 26, 27, 24, 25)
-)  # fmt: skip
+    [
+        *(6, 7, 4, 5, 2, 3, 0, 1, 22, 23, 20, 21, 18, 19, 16, 17, 14, 15, 12, 13),
+        *(10, 11, 8, 9, 38, 39, 36, 37, 34, 35, 32, 33, 30, 31, 28, 29, 26, 27, 24, 25),
+    ]
+)
 EDAC40_VALUE, EDAC40_OFFSET, EDAC40_GAIN, EDAC40_GLOBAL_OFFSET, EDAC40_SAVE = range(5)
 EDAC40_HEADER = 6
 
 #: Connector channel that bit c of group g of a USB DAC-40 frame belongs to: element 5 g + c.
 DAC40_CHANNEL = np.array(
-    (7, 15, 23, 31, 39, 6, 14, 22, 30, 38, 5, 13, 21, 29, 37, 4, 12, 20, 28, 36,
-     3, 11, 19, 27, 35, 2, 10, 18, 26, 34, 1, 9, 17, 25, 33, 0, 8, 16, 24, 32)
-)  # fmt: skip
+    [
+        *(7, 15, 23, 31, 39, 6, 14, 22, 30, 38, 5, 13, 21, 29, 37, 4, 12, 20, 28, 36),
+        *(3, 11, 19, 27, 35, 2, 10, 18, 26, 34, 1, 9, 17, 25, 33, 0, 8, 16, 24, 32),
+    ]
+)
 DAC40_FRAME = 130
 DAC40_START = 0xFF
 

@@ -7,10 +7,8 @@ which they arrived, and whoever asks for the state sees every frame that was sen
 from __future__ import annotations
 
 import errno
-import os
 import socket
 import time
-import tty
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,8 +18,9 @@ from typing import TypeVar
 from dm_simulation.electronics import frames
 from dm_simulation.electronics.drive_unit import DriveUnit
 from dm_simulation.electronics.event_loop import EventLoop
-from dm_simulation.electronics.framed_unit import FramedConfig, FramedDecoder
+from dm_simulation.electronics.framed_unit import FramedConfig
 from dm_simulation.electronics.frames import FrameError
+from dm_simulation.electronics.serial_terminal import SerialTerminal
 
 T = TypeVar("T")
 
@@ -77,12 +76,9 @@ class ElectronicsServer:
         self._listener: socket.socket | None = None
         self._client: socket.socket | None = None
         self._datagrams: list[socket.socket] = []
-        self._terminal: tuple[int, int] | None = None
-        self._terminal_name = ""
         self._stream = bytearray()
-        self._serial = bytearray()
-        self._framed = FramedDecoder(ports.framed) if ports.framed.channels else None
         self._loop = EventLoop("electronics", lambda error: on_event(f"{type(error).__name__}: {error}"))
+        self._terminal = SerialTerminal(unit, ports.framed, self._loop, on_update, self._reject)
         try:
             self._loop.run(self._plug)
         except BaseException:
@@ -127,7 +123,9 @@ class ElectronicsServer:
         if self._ports.discovery_port != OFF:
             self._bind_udp("discovery_port", wanted("discovery_port", self._ports.discovery_port), self._on_discovery)
         if self._ports.pty_link:
-            self._open_terminal(Path(self._ports.pty_link))
+            link = Path(self._ports.pty_link)
+            self._terminal.open(link)
+            self.endpoints["pty"] = str(link)
 
     def _unplug(self) -> None:
         self.plugged = False
@@ -138,15 +136,7 @@ class ElectronicsServer:
                 endpoint.close()
         self._datagrams.clear()
         self._listener = None
-        if self._terminal is not None:
-            self._loop.forget(self._terminal[0])
-            for descriptor in self._terminal:
-                os.close(descriptor)
-            self._terminal = None
-            self._serial.clear()
-            link = Path(self._ports.pty_link)
-            if link.is_symlink() and str(link.readlink()) == self._terminal_name:
-                link.unlink()
+        self._terminal.close()
 
     def _reject(self, source: str, reason: str, data: bytes) -> None:
         self.malformed_count += 1
@@ -260,62 +250,6 @@ class ElectronicsServer:
                 endpoint.sendto(DISCOVERY_ANSWER, sender)
             else:
                 self._reject("discovery", "unknown question", question)
-
-    def _open_terminal(self, link: Path) -> None:
-        leader, follower = os.openpty()
-        self._terminal = (leader, follower)  # the follower stays open, so that the outputs outlive the client
-        tty.setraw(follower)
-        os.set_blocking(leader, False)
-        self._terminal_name = os.ttyname(follower)
-        if link.is_symlink() and str(link.readlink()).startswith("/dev/pts/"):
-            link.unlink()  # left behind by a bench that was killed
-        try:
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(self._terminal_name)
-        except OSError as error:
-            raise OSError(f"electronics.pty_link = {str(link)!r}: {error}") from None
-        self.endpoints["pty"] = str(link)
-        self._loop.watch(leader, self._on_serial)
-
-    def _on_serial(self) -> None:
-        assert self._terminal is not None
-        try:
-            self._serial += os.read(self._terminal[0], 65536)
-        except OSError:
-            return
-        if self._framed is not None:
-            self._take_framed(self._framed)
-            return
-        while len(self._serial) >= frames.DAC40_FRAME:
-            frame = bytes(self._serial[: frames.DAC40_FRAME])
-            try:
-                codes = frames.decode_dac40(frame)
-            except FrameError as error:
-                # Look for the next start byte, as the unit does.
-                start = self._serial.find(frames.DAC40_START, 1)
-                skipped = bytes(self._serial[:start] if start > 0 else self._serial)
-                del self._serial[: len(skipped)]
-                self._reject("serial", str(error), skipped)
-                continue
-            del self._serial[: frames.DAC40_FRAME]
-            if codes is not None:
-                self._unit.take_dac40(codes)
-                self._on_update()
-
-    def _take_framed(self, decoder: FramedDecoder) -> None:
-        assert self._terminal is not None
-        while True:
-            try:
-                outputs = decoder.take(self._serial)
-            except FrameError as error:
-                self._reject("serial", str(error), b"")
-                continue
-            if outputs is None:
-                return
-            self._unit.take_shares(outputs)
-            self._on_update()
-            if decoder.reply:
-                os.write(self._terminal[0], decoder.reply)
 
 
 def _bind(endpoint: socket.socket, port: int, name: str, patience_s: float = 0.0) -> None:

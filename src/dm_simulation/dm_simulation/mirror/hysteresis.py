@@ -1,8 +1,9 @@
 """Hysteresis laws of piezo ceramics: rate-independent, one state per actuator, vectorised over actuators.
 
-Each law is a reversible straight line plus a memory m: y = scale (u + weight m[u]). Weight and scale follow from a
-simulated full cycle, such that y spans 2 over signals -1..+1 (total stroke 1 in units of half the stroke each way) and
-the loop opens by `fraction` of the total stroke where it is widest, which is how vendors state hysteresis.
+Each law is a reversible straight line plus a part m that depends on the past: y = scale (u + weight m[u]). Weight and
+scale follow from a simulated full cycle, such that y spans 2 over signals -1..+1 (total stroke 1 in units of half the
+stroke each way) and the loop opens by `fraction` of the total stroke where it is widest, which is how vendors state
+hysteresis.
 """
 
 from __future__ import annotations
@@ -14,18 +15,16 @@ import numpy as np
 
 from dm_simulation.mirror.zernike import Array
 
-LAWS = ("none", "prandtl_ishlinskii", "preisach", "bouc_wen", "mixed")
 
-
-class Memory(ABC):
-    """The part of a law that remembers. `move(u)` takes signals (N,) and returns m (N,)."""
+class HysteresisLaw(ABC):
+    """The part of the response that depends on the past. `move(u)` takes signals (N,) and returns m (N,)."""
 
     @abstractmethod
     def move(self, u: Array) -> Array:
         """Go monotonically from the last signals to `u`."""
 
 
-class NoMemory(Memory):
+class NoHysteresis(HysteresisLaw):
     """A linear actuator."""
 
     def __init__(self, count: int) -> None:
@@ -35,7 +34,7 @@ class NoMemory(Memory):
         return self._zero
 
 
-class PlayMemory(Memory):
+class PlayHysteresis(HysteresisLaw):
     """Prandtl-Ishlinskii: a weighted sum of play (backlash) operators with 40 half-widths.
 
     Weights fall exponentially with the half-width, so that small moves have narrow loops. The loops are symmetric.
@@ -52,7 +51,7 @@ class PlayMemory(Memory):
         return self._play @ self._weight
 
 
-class PreisachMemory(Memory):
+class PreisachHysteresis(HysteresisLaw):
     """Preisach operator: relays switching up at v + r and down at v - r, with a density that is not symmetric in v.
 
     The relays of half-width r that are up are those with v below the value of a play operator of that half-width ([16],
@@ -81,7 +80,7 @@ class PreisachMemory(Memory):
         return (v * (1 + v * (self._skew / 2 - v * (self._bend / 3)))) @ self._weight
 
 
-class BoucWenMemory(Memory):
+class BoucWenHysteresis(HysteresisLaw):
     """Bouc-Wen: dz = du - (beta |du| z + gamma du |z|), the lag -z ([19] with n = 1).
 
     For n = 1 every monotone move has a closed form, so the result does not depend on how a move is cut into steps. The
@@ -114,7 +113,7 @@ class BoucWenMemory(Memory):
         return -self._z
 
 
-class AsymmetricBoucWenMemory(Memory):
+class AsymmetricBoucWenHysteresis(HysteresisLaw):
     """Bouc-Wen of order 2 that saturates earlier on falling than on rising moves, the lag -z.
 
     Along the way, dz/d|u| = 1 - onward z^2 where z points along the way and 1 + back z^2 where it points against it
@@ -147,24 +146,25 @@ class AsymmetricBoucWenMemory(Memory):
         return -self._z
 
 
-class MixedMemory(Memory):
+class MixedHysteresis(HysteresisLaw):
     """Half the loop by a Preisach operator, half by an asymmetric Bouc-Wen law of order 2."""
 
     def __init__(self, count: int, preisach: float = 4.0, bouc_wen: float = 0.5) -> None:
-        self._preisach, self._bouc_wen = PreisachMemory(count), AsymmetricBoucWenMemory(count)
+        self._preisach, self._bouc_wen = PreisachHysteresis(count), AsymmetricBoucWenHysteresis(count)
         self._weight = preisach, bouc_wen
 
     def move(self, u: Array) -> Array:
         return self._weight[0] * self._preisach.move(u) + self._weight[1] * self._bouc_wen.move(u)
 
 
-_MEMORIES = {
-    "none": NoMemory,
-    "prandtl_ishlinskii": PlayMemory,
-    "preisach": PreisachMemory,
-    "bouc_wen": BoucWenMemory,
-    "mixed": MixedMemory,
+_LAWS = {
+    "none": NoHysteresis,
+    "prandtl_ishlinskii": PlayHysteresis,
+    "preisach": PreisachHysteresis,
+    "bouc_wen": BoucWenHysteresis,
+    "mixed": MixedHysteresis,
 }
+LAWS = tuple(_LAWS)
 
 
 class Hysteresis:
@@ -179,26 +179,26 @@ class Hysteresis:
     """
 
     def __init__(self, law: str, fraction: float, count: int) -> None:
-        if law not in _MEMORIES:
+        if law not in _LAWS:
             raise ValueError(f"piezo.law = {law!r}: must be one of {', '.join(LAWS)}")
         self._weight, self._scale = _weight_and_scale(law, fraction)
-        self._memory: Memory = _MEMORIES[law](count)
+        self._law: HysteresisLaw = _LAWS[law](count)
 
     def move(self, u: Array) -> Array:
         """Go to signals u (N,) and return y (N,), in units of half the total stroke."""
-        return self._scale * (u + self._weight * self._memory.move(u))
+        return self._scale * (u + self._weight * self._law.move(u))
 
 
 @cache
 def _weight_and_scale(law: str, fraction: float) -> tuple[float, float]:
-    """Weight of the memory and scale of the whole for the wanted opening, from a steady full cycle."""
+    """Weight of the law and scale of the whole for the wanted opening, from a steady full cycle."""
     if law == "none" or fraction == 0:
         return 0.0, 1.0
     grid = np.linspace(-1, 1, 801)
-    memory = _MEMORIES[law](1)
+    trial = _LAWS[law](1)
 
     def sweep(signals: Array) -> Array:
-        return np.array([memory.move(np.array([u]))[0] for u in signals])
+        return np.array([trial.move(np.array([u]))[0] for u in signals])
 
     for _ in range(4):
         rising, falling = sweep(grid), sweep(grid[::-1])[::-1]

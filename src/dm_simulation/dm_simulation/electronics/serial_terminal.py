@@ -1,0 +1,121 @@
+"""The serial unit on a pseudo-terminal: a USB DAC-40, or a unit whose frames a data sheet describes."""
+
+from __future__ import annotations
+
+import os
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+from dm_simulation.electronics import frames
+from dm_simulation.electronics.drive_unit import DriveUnit
+from dm_simulation.electronics.event_loop import EventLoop
+from dm_simulation.electronics.framed_unit import FramedConfig, FramedDecoder
+from dm_simulation.electronics.frames import FrameError
+
+
+class SerialTerminal:
+    """Carries out the frames that a client writes to the terminal.
+
+    Args:
+        unit: what the frames set.
+        framed: frames of the unit; without channels it is a USB DAC-40.
+        loop: runs everything but the making of this object.
+        on_update: called after every frame that was carried out.
+        reject: called with source, reason and bytes of what is no frame.
+
+    Raises:
+        ValueError: a description of frames that makes no sense, naming the parameter.
+    """
+
+    def __init__(
+        self,
+        unit: DriveUnit,
+        framed: FramedConfig,
+        loop: EventLoop,
+        on_update: Callable[[], None],
+        reject: Callable[[str, str, bytes], None],
+    ) -> None:
+        self._unit = unit
+        self._framed = FramedDecoder(framed) if framed.channels else None
+        self._loop = loop
+        self._on_update = on_update
+        self._reject = reject
+        self._descriptors: tuple[int, int] | None = None
+        self._link = Path()
+        self._name = ""
+        self._received = bytearray()
+
+    def open(self, link: Path) -> None:
+        """Make the terminal and the symbolic link to it.
+
+        Raises:
+            OSError: the link cannot be made.
+        """
+        leader, follower = os.openpty()
+        self._descriptors = (leader, follower)  # the follower stays open, so that the outputs outlive the client
+        tty.setraw(follower)
+        os.set_blocking(leader, False)
+        self._link, self._name = link, os.ttyname(follower)
+        if link.is_symlink() and str(link.readlink()).startswith("/dev/pts/"):
+            link.unlink()  # left behind by a bench that was killed
+        try:
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(self._name)
+        except OSError as error:
+            raise OSError(f"electronics.pty_link = {str(link)!r}: {error}") from None
+        self._loop.watch(leader, self._on_readable)
+
+    def close(self) -> None:
+        """Take terminal and link away, if they are there."""
+        if self._descriptors is None:
+            return
+        self._loop.forget(self._descriptors[0])
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        self._descriptors = None
+        self._received.clear()
+        if self._link.is_symlink() and str(self._link.readlink()) == self._name:
+            self._link.unlink()
+
+    def _on_readable(self) -> None:
+        assert self._descriptors is not None
+        try:
+            self._received += os.read(self._descriptors[0], 65536)
+        except OSError:
+            return
+        if self._framed is not None:
+            self._take_framed(self._framed, self._descriptors[0])
+        else:
+            self._take_dac40()
+
+    def _take_dac40(self) -> None:
+        while len(self._received) >= frames.DAC40_FRAME:
+            frame = bytes(self._received[: frames.DAC40_FRAME])
+            try:
+                codes = frames.decode_dac40(frame)
+            except FrameError as error:
+                # Look for the next start byte, as the unit does.
+                start = self._received.find(frames.DAC40_START, 1)
+                skipped = bytes(self._received[:start] if start > 0 else self._received)
+                del self._received[: len(skipped)]
+                self._reject("serial", str(error), skipped)
+                continue
+            del self._received[: frames.DAC40_FRAME]
+            if codes is not None:
+                self._unit.take_dac40(codes)
+                self._on_update()
+
+    def _take_framed(self, decoder: FramedDecoder, leader: int) -> None:
+        while True:
+            try:
+                outputs = decoder.take(self._received)
+            except FrameError as error:
+                self._reject("serial", str(error), b"")
+                continue
+            if outputs is None:
+                return
+            self._unit.take_shares(outputs)
+            self._on_update()
+            if decoder.reply:
+                os.write(leader, decoder.reply)
