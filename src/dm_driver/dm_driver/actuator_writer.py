@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import time
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_driver.degauss import degauss_move
 from dm_driver.moves import Kind, Move, Outcome
-from dm_common.errors import ErrorCode, Refusal
 from dm_driver.safety_limiter import Shape, largest_change
 from dm_driver.writer_thread import WriterThread
 
@@ -118,7 +118,9 @@ class ActuatorWriter(WriterThread):
             if not self._accepting or self._stopping:
                 raise Refusal(ErrorCode.DRIVER_INACTIVE, "the driver is not active: activate it first")
             if not self._link_up:
-                raise Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, f"the drive electronics are unreachable: {self._fault}")
+                raise Refusal(
+                    ErrorCode.ELECTRONICS_UNREACHABLE, f"the drive electronics are unreachable: {self._fault}"
+                )
             self._watchdog.feed(time.monotonic())
             self._put(move)
             return move

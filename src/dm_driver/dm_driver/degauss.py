@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from dm_driver.moves import Kind, Move
 from dm_common.errors import ErrorCode, Refusal
+from dm_driver.moves import Kind, Move
 from dm_driver.safety_limiter import Limits, Shape
 
 #: A degauss of at least this share of the full range leaves nothing of what was before.

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.errors import Refusal
 from dm_driver.electronics.base import DriveElectronics
 from dm_driver.last_shape import LastShape
 from dm_driver.output.output_stage import OutputStage
-from dm_common.errors import Refusal
 from dm_driver.safety_limiter import SafetyLimiter, Shape
 
 #: A link that opened counts as standing when it still does after this time: a busy EDAC40 accepts a second TCP client
