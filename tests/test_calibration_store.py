@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dm_calibration.calibration import Calibration, CalibrationFileError, to_columns
-from dm_calibration.calibrator import Provenance, evaluate, mismatch, refit
+from dm_calibration.calibrator import Provenance, evaluate, refit
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
@@ -307,10 +307,3 @@ def test_refit_of_stored_data(tmp_path: Path, calibration: Calibration) -> None:
         refit(calibration, FitOptions(), calibration.maps.label[2:], Provenance("x", 0))
     store.save(again)
     assert_equal(store.load("PDM_2"), again)
-
-
-def test_mismatch_names_both_sides(calibration: Calibration) -> None:
-    assert mismatch(calibration, MIRROR, 0.02) == ""
-    assert "'S 7/é', this is 'S 8'" in mismatch(calibration, replace(MIRROR, serial="S 8"), 0.02)
-    assert "aperture radius 11.000 mm" in mismatch(calibration, replace(MIRROR, working_radius=12e-3), 0.02)
-    assert "has 7 actuators, this mirror 19" in mismatch(calibration, make_mirror(2, serial="S 7/é"), 0.02)

@@ -10,11 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibrator import Provenance, mismatch
+from dm_calibration.calibrator import Provenance
 from dm_calibration.procedure.event_frames import map_hashes
 from dm_calibration.store.calibration_store import CalibrationStore, StoreError, UnknownCalibrationError
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.mirror import Mirror
+from dm_common.mirror import Mirror, mismatch
 from dm_common.recipes import RecipeBook, RecipeError
 
 
@@ -80,7 +80,10 @@ class CalibrationManager:
     def mismatch(self, calibration: Calibration) -> str:
         """Why `calibration` does not belong to the mirror, in words; "" = it does, or no mirror is known."""
         mirror = self.mirror
-        return mismatch(calibration, mirror, self._aperture_tolerance()) if mirror else ""
+        if mirror is None:
+            return ""
+        of = calibration
+        return mismatch(mirror, of.mirror_serial, of.fit.actuators, of.aperture_radius, self._aperture_tolerance())
 
     def check_fits(self, calibration: Calibration) -> None:
         """Raise Refusal unless `calibration` belongs to the mirror."""

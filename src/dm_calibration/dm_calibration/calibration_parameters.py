@@ -12,6 +12,7 @@ from dm_calibration.procedure.bump_check import BumpOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift_filter import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
+from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.parameters import Parameter
 
 PARAMETERS = (
@@ -92,7 +93,7 @@ PARAMETERS = (
     Parameter(
         "aperture_tolerance",
         float,
-        0.02,
+        APERTURE_TOLERANCE,
         "Largest relative difference between the aperture radius of maps or calibrations and the mirror's.",
         "",
         0.0,

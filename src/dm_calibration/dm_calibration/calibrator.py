@@ -139,20 +139,6 @@ def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], pr
     )
 
 
-def mismatch(calibration: Calibration, mirror: Mirror, aperture_tolerance: float) -> str:
-    """Why `calibration` does not belong to `mirror`, in words; "" = it does."""
-    if calibration.mirror_serial != mirror.serial:
-        return f"measured on mirror {calibration.mirror_serial!r}, this is {mirror.serial!r}"
-    if calibration.fit.actuators != mirror.actuators:
-        return f"has {calibration.fit.actuators} actuators, this mirror {mirror.actuators}"
-    if abs(calibration.aperture_radius - mirror.working_radius) > aperture_tolerance * mirror.working_radius:
-        return (
-            f"aperture radius {calibration.aperture_radius * 1e3:.3f} mm, this mirror's working aperture "
-            f"{mirror.working_radius * 1e3:.3f} mm +-{aperture_tolerance:.1%}"
-        )
-    return ""
-
-
 def dropped_maps(maps: MapSet, fit: InfluenceFit, never_measured: Collection[str]) -> list[str]:
     """ "label: reason" of everything that is not in the fit."""
     rejected = [f"{maps.label[i]}: {fit.reasons[i]}" for i in np.flatnonzero(~fit.used)]

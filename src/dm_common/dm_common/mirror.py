@@ -1,4 +1,4 @@
-"""Geometry and limits of the mirror under calibration."""
+"""Geometry and limits of a mirror, and whether a calibration belongs to it."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 
 #: Actuators closer than this many pitches are neighbours.
 NEIGHBOUR_REACH = 1.25
+#: Relative difference between the aperture radius of a calibration and the mirror's up to which it belongs to it.
+APERTURE_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,28 @@ class Mirror:
     def breaks_limits(self, signals: Floats, tolerance: float = 1e-9) -> bool:
         """Whether `signals` leave the range or the neighbour limit."""
         return scale_to_limits(signals, self)[1] < 1.0 - tolerance
+
+
+def mismatch(
+    mirror: Mirror, serial: str, actuators: int, aperture_radius: float, tolerance: float = APERTURE_TOLERANCE
+) -> str:
+    """Why a calibration does not belong to `mirror`, as a sentence; "" = it does.
+
+    Args:
+        mirror: as the driver describes it.
+        serial, actuators, aperture_radius: of the mirror that was calibrated, the last in m.
+        tolerance: largest relative difference of the two aperture radii.
+    """
+    if serial != mirror.serial:
+        return f"measured on mirror serial {serial!r}, this is {mirror.serial!r}"
+    if actuators != mirror.actuators:
+        return f"has {actuators} actuators, this mirror {mirror.actuators}"
+    if not abs(aperture_radius - mirror.working_radius) <= tolerance * mirror.working_radius:
+        return (
+            f"aperture radius {aperture_radius * 1e3:.3f} mm, this mirror's working aperture "
+            f"{mirror.working_radius * 1e3:.3f} mm +-{tolerance:.1%}"
+        )
+    return ""
 
 
 def pitch(x: Floats, y: Floats) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.parameters import Parameter
 from dm_controller.converge.converge_action import CONVERGE_PARAMETERS
 from dm_controller.converge.loop_bench import BENCH_PARAMETERS
@@ -103,8 +104,8 @@ PARAMETERS: Final = (
     Parameter(
         "aperture_tolerance",
         float,
-        0.01,
-        "allowed relative difference of calibrated and working aperture",
+        APERTURE_TOLERANCE,
+        "largest relative difference between the aperture radius of a calibration and the mirror's",
         "",
         0.0,
         0.5,

@@ -16,7 +16,7 @@ from dm_calibration.procedure.outcome import NOWHERE, Doubted, Event, MapTaken, 
 from dm_calibration.procedure.plan import Step, StepKind
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench, Measurement
-from dm_common.mirror import Mirror
+from dm_common.mirror import APERTURE_TOLERANCE, Mirror
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class ProcedureOptions:
     measure_retries: int = 1
     failures_max: int = 3
     maps_per_state: int = 1
-    aperture_tolerance: float = 0.02
+    aperture_tolerance: float = APERTURE_TOLERANCE
     wavelength_tolerance: float = 1e-4
     fit: FitOptions = field(default_factory=FitOptions)
     bump: BumpOptions = field(default_factory=BumpOptions)

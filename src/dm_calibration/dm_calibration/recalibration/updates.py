@@ -21,6 +21,7 @@ from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter, D
 from dm_calibration.store.calibration_store import StoreError
 from dm_calibration.store.update_storage import Updates, UpdatesFileError, basis_hash, read_updates, write_updates
 from dm_common.measurement import Measurement
+from dm_common.mirror import APERTURE_TOLERANCE
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ class UpdateOptions:
     surprise_max: float = 3.0
     surprises_max: int = 3
     valid_fraction_min: float = 0.5
-    aperture_tolerance: float = 0.02
+    aperture_tolerance: float = APERTURE_TOLERANCE
     signal_sigma: float = 0.05
     rates: DriftRates = field(default_factory=DriftRates)
 

@@ -10,7 +10,8 @@ from dm_msgs.msg import Calibration, MirrorInfo
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import certain_reach
-from dm_common.messages import recipe_book_from, stamp_ns
+from dm_common.messages import mirror_from, recipe_book_from, stamp_ns
+from dm_common.mirror import mismatch
 from dm_common.recipes import RecipeBook
 from dm_controller.planning.conversions import hysteresis_figures_of, limits_of, model_of
 from dm_controller.planning.mirror_model import CalibratedMirror
@@ -90,10 +91,16 @@ def active_calibration(
         raise Refusal(
             ErrorCode.DRIVER_UNAVAILABLE, "the mirror's limits are unknown: no mirror_info from pdm_driver yet"
         )
-    reason = _mismatch(calibration, mirror, aperture_tolerance)
-    if reason is not None:
-        raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {reason}")
     try:
+        wrong = mismatch(
+            mirror_from(mirror),
+            calibration.mirror_serial,
+            calibration.actuators,
+            calibration.aperture_radius,
+            aperture_tolerance,
+        )
+        if wrong:
+            raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
         slew_rate = mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf
         limits = limits_of(mirror)
         calibrated = CalibratedMirror(model_of(calibration), limits)
@@ -118,17 +125,3 @@ def active_calibration(
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
     low, high = mirror.signal_min, mirror.signal_max
     return ActiveCalibration(calibration, calibrated, certain, loop, recipes, 0.5 * (low + high), slew_rate, high - low)
-
-
-def _mismatch(calibration: Calibration, mirror: MirrorInfo, aperture_tolerance: float) -> str | None:
-    if calibration.mirror_serial != mirror.serial:
-        return f"is of mirror serial {calibration.mirror_serial!r}, this one is {mirror.serial!r}"
-    if calibration.actuators != mirror.actuators:
-        return f"has {calibration.actuators} actuators, this mirror {mirror.actuators}"
-    working = mirror.working_aperture_diameter / 2
-    if abs(calibration.aperture_radius - working) > aperture_tolerance * working:
-        return (
-            f"was made over an aperture of radius {calibration.aperture_radius * 1e3:.3f} mm, "
-            f"the working aperture's is {working * 1e3:.3f} mm"
-        )
-    return None

@@ -1,0 +1,27 @@
+"""Whether a calibration belongs to a mirror."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dm_common.mirror import APERTURE_TOLERANCE, Mirror, mismatch
+
+MIRROR = Mirror("PDM", "S 7/é", np.array([0.0, 4.3e-3]), np.zeros(2), working_radius=11e-3)
+
+
+def test_a_calibration_of_this_mirror_fits() -> None:
+    assert mismatch(MIRROR, "S 7/é", 2, 11e-3) == ""
+    assert mismatch(MIRROR, "S 7/é", 2, 11e-3 * 1.015) == ""
+    assert mismatch(MIRROR, "S 7/é", 2, 11e-3 * (1 - 0.015)) == ""
+
+
+def test_a_mismatch_names_both_sides() -> None:
+    assert "'S 8', this is 'S 7/é'" in mismatch(MIRROR, "S 8", 2, 11e-3)
+    assert "has 7 actuators, this mirror 2" in mismatch(MIRROR, "S 7/é", 7, 11e-3)
+    assert "aperture radius 12.000 mm, this mirror's working aperture 11.000 mm" in mismatch(MIRROR, "S 7/é", 2, 12e-3)
+
+
+@pytest.mark.parametrize("radius", [11e-3 * (1 + 1.01 * APERTURE_TOLERANCE), 0.0, np.nan, np.inf])
+def test_another_aperture_or_none_is_a_mismatch(radius: float) -> None:
+    assert mismatch(MIRROR, "S 7/é", 2, radius)
