@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,18 +21,7 @@ from dm_bringup.suite import own_domain
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import answers_arrive
-
-
-def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:
-    """Return the first true value of `condition()`; fail the test when there is none in time."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.01)
-    raise AssertionError(f"not within {timeout_s:g} s: {what or condition}")
-
+from waiting import wait_until
 
 __all__ = ["NodeProcess", "Observer", "bench_figures", "own_domain", "wait_until"]
 

@@ -32,7 +32,7 @@ def found() -> list[Focused]:
 def test_the_animation_shows_every_image_and_rests_on_the_last(found: list[Focused], tmp_path: Path) -> None:
     with Image.open(save_animation(found, tmp_path / "a.gif", "two objects", frames_per_second=10)) as animation:
         durations = []
-        for frame in range(animation.n_frames):  # equal frames are merged into a longer one
+        for frame in range(getattr(animation, "n_frames", 1)):  # equal frames are merged into a longer one
             animation.seek(frame)
             durations.append(animation.info["duration"])
     assert len(durations) >= 2 * 4

@@ -15,10 +15,11 @@ from dm_controller.solvers.base import Shape, Solver
 from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.registry import make_solver
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
+from perfect_calibration import perfect_model
 
 LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().neighbours, dtype=np.intp), 2.0)
 MIRROR = LinearMirror(*hexagon())
-MODEL = MIRROR.model()
+MODEL = perfect_model(MIRROR)
 
 
 class Plant:

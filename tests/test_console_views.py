@@ -145,7 +145,7 @@ def test_a_calibration_that_does_not_fit_together_names_the_field() -> None:
 
 
 def test_bars_leave_out_tilt_and_hold_the_interval() -> None:
-    measured = np.arange(21) * 1e-9
+    measured = np.linspace(0.0, 20e-9, 21)
     message = ZernikeCoefficients(coefficients=measured.tolist(), sigma=np.full(21, 1e-9).tolist())
     found = view_models.bars(message, measured - 2e-9, True)
     assert len(found) == 18

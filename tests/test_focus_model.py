@@ -12,6 +12,7 @@ from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.bounded import Limits
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
+from perfect_calibration import perfect_model
 
 PAIRS = np.asarray(make_mirror().neighbours, dtype=np.intp)
 
@@ -22,7 +23,7 @@ def mirror() -> LinearMirror:
 
 
 def calibrated(mirror: LinearMirror, neighbour_difference: float = 2.0, held_out: float = 0.0) -> CalibratedMirror:
-    return CalibratedMirror(mirror.model(held_out), Limits(-1.0, 1.0, PAIRS, neighbour_difference))
+    return CalibratedMirror(perfect_model(mirror, held_out), Limits(-1.0, 1.0, PAIRS, neighbour_difference))
 
 
 @pytest.mark.parametrize("curvature", [-0.03, 0.0, 0.01, 0.03])
@@ -121,7 +122,7 @@ def test_sag_and_coefficients_agree() -> None:
 
 
 def test_inconsistent_calibrations_are_refused(mirror: LinearMirror) -> None:
-    good = mirror.model(0.0)
+    good = perfect_model(mirror, 0.0)
     fields = {name: getattr(good, name) for name in good.__dataclass_fields__}
     with pytest.raises(ValueError, match="sag_offset has shape"):
         InfluenceModel(**{**fields, "sag_offset": np.zeros(3)})

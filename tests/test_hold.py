@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import Limits
 from linear_mirror import LinearMirror, hexagon, make_mirror
+from perfect_calibration import perfect_model
 
 DEFAULTS = {
     "hold.enable": True, "hold.period": 1.0, "hold.tolerance": 2e-10, "hold.slew": 0.02, "hold.resolution": 3e-5,
@@ -23,11 +25,13 @@ DEFAULTS = {
 class Shape:
     """A shape that was set at 0 s and is held since; `look` follows the corrections."""
 
-    def __init__(self, creep_rate: float = 0.01, known: bool = True, **values: Any) -> None:
+    def __init__(self, values: Mapping[str, Any] = {}, creep_rate: float = 0.01, known: bool = True) -> None:
         law = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.9], [0.1]]), np.zeros(0), 0.0, creep_rate, CREEP_TIMES)
-        mirror = CalibratedMirror(LinearMirror(*hexagon()).model(), Limits(-1.0, 1.0, make_mirror().neighbours, 2.0))
+        mirror = CalibratedMirror(
+            perfect_model(LinearMirror(*hexagon())), Limits(-1.0, 1.0, make_mirror().neighbours, 2.0)
+        )
         self.loop = Planner(mirror, HysteresisFigures(law, np.full(21, 3e-10), 1e-9, 0.05))
-        self.hold = CreepHold(DEFAULTS | values)
+        self.hold = CreepHold(DEFAULTS | dict(values))
         state = law.demagnetised(37, 0.0)
         move = self.loop.plan(FocusTarget(0.03), state, 0.0, known, ahead=0.05)
         self.look = Look(law.move(state, move.plan.signals, 0.0), "" if known else "a test says so")
@@ -57,8 +61,8 @@ def test_corrections_come_ever_more_rarely_and_keep_the_shape() -> None:
 
 
 def test_a_shape_is_right_within_its_first_second() -> None:
-    shape = Shape(**{"hold.period": PERIOD_S})
-    left_alone = Shape(**{"hold.enable": False}).look.state
+    shape = Shape({"hold.period": PERIOD_S})
+    left_alone = Shape({"hold.enable": False}).look.state
     assert left_alone is not None and shape.look.state is not None
     for now in np.arange(PERIOD_S, 1.0, PERIOD_S):
         shape.correct(float(now))
@@ -67,15 +71,15 @@ def test_a_shape_is_right_within_its_first_second() -> None:
 
 
 def test_a_correction_is_no_larger_than_allowed() -> None:
-    shape = Shape(creep_rate=0.1, **{"hold.slew": 1e-3})
+    shape = Shape({"hold.slew": 1e-3}, creep_rate=0.1)
     correction = shape.correct(100.0)
     assert correction is not None
     np.testing.assert_allclose(np.abs(correction - shape.signals).max(), 1e-3)
 
 
 def test_less_than_half_a_step_of_the_electronics_is_not_sent() -> None:
-    assert Shape(**{"hold.resolution": 0.05}).correct(1000.0) is None
-    assert Shape(**{"hold.resolution": 1e-5}).correct(1000.0) is not None
+    assert Shape({"hold.resolution": 0.05}).correct(1000.0) is None
+    assert Shape({"hold.resolution": 1e-5}).correct(1000.0) is not None
 
 
 def test_no_correction_before_the_driver_has_taken_the_last() -> None:
@@ -119,7 +123,7 @@ def test_a_mirror_without_creep_is_not_held() -> None:
 
 
 def test_it_is_looked_at_ever_more_rarely() -> None:
-    shape = Shape(**{"hold.period": PERIOD_S, "hold.tolerance": 1e-6})  # no correction is ever due
+    shape = Shape({"hold.period": PERIOD_S, "hold.tolerance": 1e-6})  # no correction is ever due
     assert shape.hold.next_look == PERIOD_S
     for now in (1.0, 10.0, 100.0):
         assert shape.correct(now) is None

@@ -6,13 +6,36 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import expected_accuracy
+from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.identify import CANDIDATES, ExcitationError, Identification, Run, identify
 from dm_calibration.hysteresis.responses import Responses
-from hysteresis_models import twin_run
+from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+from linear_mirror import make_mirror
 
 LINEAR = CANDIDATES[0]
+
+
+def twin_run(
+    law: str, maps: int = 150, noise: float = 2e-10, creep: float = 0.01, seed: int = 3
+) -> tuple[Run, NDArray[np.bool_]]:
+    """A run of the excitation on the twin's actuators, seven of them, seen through a random matrix, and its checks."""
+    mirror = make_mirror(rings=1)
+    rng = np.random.default_rng(seed)
+    piezo = PiezoActuators(PiezoConfig(law=law, creep=creep), rng, np.zeros(mirror.actuators))
+    commands = excitation(mirror, maps)
+    mixing = rng.standard_normal((mirror.actuators, 12)) / 4.0
+    time = np.cumsum(1.0 + commands.dwell)
+    values = []
+    for signals, seen in zip(commands.signals, time, strict=True):
+        piezo.apply(signals, piezo._time)
+        piezo.advance(float(seen))
+        values.append(piezo.displacement @ mixing)
+    measured = np.array(values) + noise * rng.standard_normal((maps, mixing.shape[1]))
+    responses = Responses(measured, mixing.shape[1], np.ones(maps, dtype=bool))
+    return Run(commands.signals, time, responses, 0.0), commands.check
 
 
 def held_out_rms(found: Identification) -> float:

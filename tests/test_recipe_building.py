@@ -27,6 +27,7 @@ from dm_controller.planning.recipes import find
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.bounded import Limits
 from linear_mirror import LinearMirror, hexagon, make_mirror
+from perfect_calibration import perfect_model
 from studies.comparison.compare import true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
@@ -136,11 +137,11 @@ class LinearPlant:
         """Largest coefficient error that the recipe truly leaves, m."""
         mirror = self.mirror
         sag = mirror.sag(self.gains * recipe.effective)
-        wanted = FocusTarget(recipe.curvature).coefficients(LinearMirror.model(mirror).aperture_radius)
+        wanted = FocusTarget(recipe.curvature).coefficients(perfect_model(mirror).aperture_radius)
         return float(np.abs(mirror.fit_terms(sag) - wanted)[3:].max())
 
 
-LOOP = Planner(CalibratedMirror(LinearMirror(*hexagon()).model(), LIMITS))
+LOOP = Planner(CalibratedMirror(perfect_model(LinearMirror(*hexagon())), LIMITS))
 
 
 def build(plant: LinearPlant, options: BuildOptions, curvature: float = 0.02) -> Recipe:

@@ -61,6 +61,18 @@ def test_imports_go_one_way(package: str) -> None:
         assert others <= ALLOWED[package], f"{path.relative_to(ROOT)} imports {others - ALLOWED[package]}"
 
 
+@pytest.mark.parametrize("package", [*ALLOWED])
+def test_a_packages_own_tests_need_that_package_and_below_only(package: str) -> None:
+    """Helper modules count: those of other packages and of tests/ are out of reach."""
+    folder = SOURCE / package / "test"
+    ours = ALLOWED.keys() | {"dm_msgs", "studies", "fault_injection"}
+    helpers = {path.stem for other in [ROOT / "tests", *SOURCE.glob("*/test")] for path in other.glob("*.py")}
+    reach = ALLOWED[package] | {package} | {path.stem for path in folder.glob("*.py")}
+    for path in folder.rglob("*.py"):
+        others = {name.split(".")[0] for name in imported(path)} & (ours | helpers)
+        assert others <= reach, f"{path.relative_to(ROOT)} imports {others - reach}"
+
+
 def test_the_twin_shares_no_code_with_what_it_judges() -> None:
     for path in (SOURCE / "dm_simulation" / "dm_simulation").rglob("*.py"):
         own = {name for name in imported(path) if name.startswith("dm_")}

@@ -14,7 +14,8 @@ FILES = [path for path in SOURCE.rglob("*.py") if "build" not in path.parts]
 #: Run text as code, or rebuild objects from bytes.
 CALLS = {"eval", "exec", "os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput", "yaml.load"}
 MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
-#: Where HDF5 files of others are opened: always from bytes in memory, in the process of dm_calibration.store.hdf5_sandbox.
+#: Where HDF5 files of others are opened: always from bytes in memory, in the process of
+#: dm_calibration.store.hdf5_sandbox.
 READERS = {"hdf5_image.py", "datx.py"}
 
 

@@ -18,6 +18,7 @@ from dm_controller.solvers.region_weighted import AZWreg
 from dm_controller.solvers.registry import DEFAULT
 from dm_simulation.mirror.plate import Plate
 from linear_mirror import LinearMirror, hexagon, make_mirror
+from perfect_calibration import perfect_model
 from studies.solvers.plate_model import PlateProperties, plate_influence
 from studies.solvers.registry import SOLVERS, MirrorFacts, check_method, make_solver
 from studies.solvers.sparse import SparseSampling
@@ -37,7 +38,7 @@ def mirror() -> LinearMirror:
 
 @pytest.fixture(scope="module")
 def model(mirror: LinearMirror) -> InfluenceModel:
-    return mirror.model()
+    return perfect_model(mirror)
 
 
 def limits(neighbour_difference: float = 2.0) -> Limits:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -161,7 +163,7 @@ def test_a_figure_that_is_none_is_refused() -> None:
 )
 def test_a_senseless_search_is_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=field.replace("high", "range of curvatures")):
-        SearchConfig(**{"low": LOW, "high": HIGH, "tolerance": TOLERANCE, field: value})
+        replace(SearchConfig(LOW, HIGH, TOLERANCE), **{field: value})  # type: ignore[arg-type]
 
 
 def follow(tracker: Tracker, scene: object, images: int) -> None:

@@ -20,7 +20,7 @@ from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import TABLES, wiring_table
 from dm_driver.safety_limiter import Limits, SafetyLimiter
 from drive_unit_servers import Edac40TcpUnit, Frame
-from support import wait_until
+from waiting import wait_until
 
 A, B = neighbour_pairs(*hexagonal_positions(37))
 SCALE = VoltScale(65535, -6.0, 6.0, 80.0, 0.0, 300.0)
@@ -204,7 +204,7 @@ def test_every_turn_is_counted_and_told_with_its_place(unit: Edac40TcpUnit) -> N
         assert writer.command(shape(0.5)).wait(5) is Outcome.REACHED
         assert writer.state().turns == 1 and writer.state().turned_at == pytest.approx(0.5, abs=CODE)
         left = writer.command(shape(-0.9))
-        wait_until(lambda: writer.state().applied is not None and writer.state().applied[0] < 0.2)
+        wait_until(lambda: (applied := writer.state().applied) is not None and applied[0] < 0.2)
         assert writer.command(shape(0.9)).wait(5) is Outcome.REACHED
         assert left.wait(5) is Outcome.SUPERSEDED
         assert writer.state().turns == 3

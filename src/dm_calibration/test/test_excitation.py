@@ -8,33 +8,33 @@ import numpy as np
 import pytest
 
 from dm_calibration.hysteresis.excitation import CHECK_SHARE, MAPS_MIN, excitation
-from hysteresis_models import hexagon
+from linear_mirror import make_mirror
 
 
 @pytest.mark.parametrize("difference", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-0.4, 0.8)])
 def test_commands_keep_the_limits(difference: float, low: float, high: float) -> None:
-    mirror = replace(hexagon(), neighbour_difference_max=difference, signal_min=low, signal_max=high)
+    mirror = replace(make_mirror(rings=1), neighbour_difference_max=difference, signal_min=low, signal_max=high)
     commands = excitation(mirror, 200)
     assert not any(mirror.breaks_limits(signals) for signals in commands.signals)
 
 
 @pytest.mark.parametrize("difference", [0.5, 1.0, 2.0])
 def test_every_actuator_turns_over_a_wide_swing(difference: float) -> None:
-    signals = excitation(replace(hexagon(), neighbour_difference_max=difference), 150).signals
+    signals = excitation(replace(make_mirror(rings=1), neighbour_difference_max=difference), 150).signals
     change = np.diff(signals, axis=0)
     assert ((change[1:] * change[:-1] < 0.0).sum(axis=0) >= 50).all()
     assert (np.ptp(signals, axis=0) > 1.5).all()
 
 
 def test_the_last_moves_are_checks() -> None:
-    commands = excitation(hexagon(), 200)
+    commands = excitation(make_mirror(rings=1), 200)
     assert commands.check.sum() == round(CHECK_SHARE * 200)
     assert commands.check[-int(commands.check.sum()) :].all()
 
 
 def test_a_seed_is_a_sequence() -> None:
-    one, same, other = (excitation(hexagon(), 80, seed) for seed in (1, 1, 2))
+    one, same, other = (excitation(make_mirror(rings=1), 80, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.signals, same.signals)
     assert not np.array_equal(one.signals, other.signals)
 
@@ -42,4 +42,4 @@ def test_a_seed_is_a_sequence() -> None:
 @pytest.mark.parametrize("maps", [MAPS_MIN - 1, 100_000])
 def test_another_number_of_maps_is_refused(maps: int) -> None:
     with pytest.raises(ValueError, match=f"hysteresis_maps = {maps}"):
-        excitation(hexagon(), maps)
+        excitation(make_mirror(rings=1), maps)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dm_common.hysteresis.tracker import Applied, HysteresisTracker
-from hysteresis_models import rich
+from example_hysteresis import rich
 
 LAW = rich()
 A, B, C = (np.array(signals) for signals in ([0.5, -0.2], [-0.3, 0.8], [0.1, 0.0]))

@@ -7,10 +7,19 @@ import pytest
 
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
-from hysteresis_models import rich
 
-HYSTERESIS = HysteresisFit("Preisach and Duhem", rich(), np.linspace(0.0, 1e-9, 21), 2e-9, 0.03, 312, ("One.", "Two."))
+#: Preisach of second order and a Duhem operator, with creep.
+MODEL = HysteresisModel(
+    np.array([0.0, 0.1, 0.3]),
+    np.array([[0.9, 0.05], [0.1, 0.02], [0.08, 0.01]]),
+    np.array([1.6, 0.3]),
+    -0.1,
+    0.01,
+    CREEP_TIMES,
+)
+HYSTERESIS = HysteresisFit("Preisach and Duhem", MODEL, np.linspace(0.0, 1e-9, 21), 2e-9, 0.03, 312, ("One.", "Two."))
 
 
 def recipe(curvature: float) -> Recipe:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, follow
-from hysteresis_models import RADIUS, plays, rich
+from example_hysteresis import RADIUS, plays, rich
 
 signal = st.floats(-1.0, 1.0)
 LAWS = [plays(), rich()]

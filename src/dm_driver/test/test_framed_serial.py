@@ -23,7 +23,7 @@ from dm_driver.electronics.base import LinkError
 from dm_driver.electronics.check_sums import CHECK_SUMS
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.electronics.framed_serial import FramedSerial
-from support import wait_until
+from waiting import wait_until
 
 ALL_ON = np.ones(4, dtype=np.bool_)
 

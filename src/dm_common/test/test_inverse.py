@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dm_common.hysteresis.inverse import TOLERANCE, invert
 from dm_common.hysteresis.model import HysteresisModel
-from hysteresis_models import plays, rich
+from example_hysteresis import plays, rich
 
 LAWS = [plays(), rich()]
 signal = st.floats(-1.0, 1.0)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -61,11 +62,11 @@ def book(*curvatures: float, actuators: int = ACTUATORS, steps: int = 100, maps:
 
 def raw_data(file: Path) -> dict[str, bytes]:
     """Datasets of what was measured, as they lie in the file."""
-    found: dict[str, bytes] = {}
+    found: dict[str, Any] = {}
     with h5py.File(file) as content:
         for group in ("maps", "points", "mirror"):
             content[group].visititems(lambda name, item, group=group: found.update({f"{group}/{name}": item[()]}))
-    return {name: value.tobytes() if value.dtype != object else b"|".join(value) for name, value in found.items()}  # type: ignore[attr-defined]
+    return {name: value.tobytes() if value.dtype != object else b"|".join(value) for name, value in found.items()}
 
 
 def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:

@@ -13,7 +13,7 @@ import pytest
 from dm_driver.electronics import BACK_ENDS, DriveElectronics, ElectronicsSettings, make_electronics
 from dm_driver.electronics.base import CodeError, LinkError, NotOpenError
 from drive_unit_servers import UNITS, DriveUnit, Edac40TcpUnit, Edac40UdpUnit
-from support import wait_until
+from waiting import wait_until
 
 CHANNELS = 40
 

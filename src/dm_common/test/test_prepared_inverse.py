@@ -10,7 +10,7 @@ import pytest
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.prepared_inverse import EXACT, PreparedInverse
-from hysteresis_models import plays, rich
+from example_hysteresis import plays, rich
 
 ACTUATORS = 37
 

@@ -7,19 +7,16 @@ Each actuator raises the deflection of an infinite plate on an elastic foundatio
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import kei
 
-from dm_common.mirror import NEIGHBOUR_REACH, Mirror
+from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points
 from dm_common.optics.zernike import basis
-
-if TYPE_CHECKING:
-    from dm_controller.planning.mirror_model import InfluenceModel
 
 Floats = NDArray[np.float64]
 
@@ -29,28 +26,18 @@ RADIUS = 11e-3
 
 def hexagon(rings: int = 3, pitch: float = PITCH, start_deg: float = 0.0) -> tuple[Floats, Floats]:
     """Positions (m) of a hexagonal layout numbered ring by ring, counter-clockwise from `start_deg`."""
-    x, y = [0.0], [0.0]
-    for ring in range(1, rings + 1):
-        corners = ring * np.exp(1j * np.radians(start_deg + 60.0 * np.arange(7)))
-        for side in range(6):
-            for k in range(ring):
-                at = corners[side] + (corners[side + 1] - corners[side]) * k / ring
-                x.append(pitch * at.real)
-                y.append(pitch * at.imag)
-    return np.array(x), np.array(y)
+    return hexagonal_positions(1 + 3 * rings * (rings + 1), pitch, np.radians(start_deg))
 
 
 def make_mirror(rings: int = 3, neighbour_difference_max: float = 2.0, serial: str = "T-1") -> Mirror:
     x, y = hexagon(rings)
-    points = np.column_stack((x, y))
-    near = np.triu(cdist(points, points) < NEIGHBOUR_REACH * PITCH, 1)
     return Mirror(
         "PDM30-37",
         serial,
         x,
         y,
         RADIUS,
-        neighbours=np.argwhere(near),
+        neighbours=np.column_stack(neighbour_pairs(x, y)),
         neighbour_difference_max=neighbour_difference_max,
     )
 
@@ -94,21 +81,3 @@ class LinearMirror:
         z = self.modes @ ((1.0 + drift) * self.figure_coefficients) + self.influence @ signals
         z = z + self.noise * self.random.standard_normal(z.size)
         return np.asarray(z + self.modes[:, :3] @ (self.piston_tilt * self.random.standard_normal(3)))
-
-    def model(self, held_out: float = 1e-10) -> InfluenceModel:
-        """What a perfect calibration would say of this mirror, with a held-out error (m) of choice."""
-        # Here, because the tests of dm_calibration use this module too, and that package must do without dm_controller.
-        from dm_controller.planning.mirror_model import InfluenceModel
-
-        return InfluenceModel(
-            aperture_radius=RADIUS,
-            influence_zernike=self.fit_terms(self.influence.T).T,
-            zernike_offset=self.figure_coefficients,
-            sample_x=self.points.x,
-            sample_y=self.points.y,
-            sample_weight=self.points.weight,
-            influence_sag=self.influence,
-            sag_offset=self.modes @ self.figure_coefficients,
-            held_out_rms=held_out,
-            held_out_max_zernike=held_out,
-        )
