@@ -32,4 +32,6 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_the_readme_leads_to_every_page() -> None:
     readme = (ROOT / "README.md").read_text()
     for page in PAGES:
-        assert page.name == "README.md" or f"docs/{page.name}" in readme, f"README.md does not mention {page.name}"
+        assert page.name == "README.md" or f"({page.relative_to(ROOT)})" in readme, (
+            f"README.md does not lead to {page.name}"
+        )

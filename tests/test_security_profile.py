@@ -20,7 +20,7 @@ from dm_tools.security.keystore import check_keystore, keys_missing
 from dm_tools.security.policy import Profile, dds_topics, write_profile
 from support import wait_until
 
-PROFILE = Profile(twin=True)
+PROFILE = Profile(simulation=True)
 #: Nodes that live for a moment only.
 SHORT_LIVED = {"calibration_exit"}
 
@@ -47,7 +47,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
             side.close()
 
 
-DECLARED = [node for node in interfaces(twin=True) if node.name not in SHORT_LIVED]
+DECLARED = [node for node in interfaces(simulation=True) if node.name not in SHORT_LIVED]
 
 
 @pytest.mark.parametrize("declared", DECLARED, ids=[node.name for node in DECLARED])
@@ -69,10 +69,10 @@ def test_the_policy_is_what_the_node_uses_and_nothing_more(bench: DeformableMirr
         raise AssertionError(f"{name}: {found}") from None
 
 
-def test_nobody_but_the_twin_may_set_the_time() -> None:
+def test_nobody_but_the_simulation_may_set_the_time() -> None:
     for profile in (Profile(), PROFILE):
         may = [enclave for enclave in profile.enclaves() if "rt/clock" in dds_topics(profile, enclave)["publish"]]
-        assert may == (["virtual_bench"] if profile.twin else [])
+        assert may == (["virtual_bench"] if profile.simulation else [])
 
 
 def test_only_the_controller_may_publish_commands_and_nobody_may_set_parameters() -> None:

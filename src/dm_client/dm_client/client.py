@@ -213,7 +213,7 @@ class DeformableMirrorClient:
         return self.call(SetSignals, "set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait))
 
     def degauss(self, timeout_s: float = 120.0) -> Degauss.Response:
-        """Wipe the hysteresis memory and end at mid range."""
+        """Remove the hysteresis and end at mid range."""
         return self.call(Degauss, "degauss", Degauss.Request(), timeout_s)
 
     def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:

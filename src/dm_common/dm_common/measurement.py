@@ -74,7 +74,7 @@ class Bench(Protocol):
     """What the procedure drives."""
 
     def degauss(self) -> None:
-        """Wipe the hysteresis memory and end at rest. Raises Refusal."""
+        """Remove the hysteresis and end at rest. Raises Refusal."""
 
     def apply(self, signals: Floats) -> Floats:
         """Command `signals` (N,), wait until they stand, return what was written (N,). Raises Refusal."""

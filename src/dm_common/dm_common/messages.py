@@ -97,7 +97,7 @@ def measurement_from(response: Any) -> Measurement:
 
 
 def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None:
-    """The law in a message; None when no memory was identified.
+    """The hysteresis model in a message; None when none was identified.
 
     Raises:
         ValueError: naming the field that makes no sense.

@@ -1,8 +1,8 @@
 """Recipes: what makes a shape from a defined condition (the control-parameter database of [1]).
 
 The condition is a mirror degaussed over the full range about mid range. What a recipe keeps is the *effective* signals
-under which the surface was the wanted one: the command that brings them about follows from the memory law, at any later
-time and creep. On a mirror without an identified memory they are the signals themselves.
+under which the surface was the wanted one: the command that brings them about follows from the hysteresis model, at any
+later time and creep. On a mirror without an identified model they are the signals themselves.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
 
 
 class Hysteresis(StrEnum):
-    """Laws of the twin's piezo actuators."""
+    """Hysteresis of the simulated actuators."""
 
     off = "off"
     prandtl_ishlinskii = "prandtl_ishlinskii"
@@ -132,7 +132,7 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
 
 
 def remember(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str, Any]]]:
-    """Identify hysteresis and creep, wipe the memory, sweep again; returns the result of the run and the rows."""
+    """Identify hysteresis and creep, degauss, sweep again; returns the result of the run and the rows."""
     from dm_msgs.action import Calibrate
 
     from dm_tools.verbs.calibrate import run_calibration, show_result
@@ -164,12 +164,12 @@ def rows_for_json(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def demo(
     hysteresis: Annotated[
-        Hysteresis, typer.Option(help="Law of the twin's actuators; `off` = ideal ones, without creep too.")
+        Hysteresis, typer.Option(help="Hysteresis of the simulated actuators; `off` = ideal ones, without creep too.")
     ] = Hysteresis.prandtl_ishlinskii,
     creep: Annotated[
         float | None, typer.Option(min=0.0, max=0.2, help="Creep per decade of time; default 0.01.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the twin.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the simulation.")] = 1,
     speed: Annotated[float, typer.Option(min=0.0, help="How much faster than real time; 0 = real time.")] = 20.0,
     hysteresis_maps: Annotated[
         int, typer.Option(min=0, help="Maps to identify hysteresis and creep from; 0 = leave that out.")
@@ -246,7 +246,7 @@ def demo(
     show_sweep(
         rows, fitting_limit, "hysteresis and creep inverted" if without_hysteresis else "influence function alone"
     )
-    title = f"{name} twin, hysteresis: {hysteresis.value}"
+    title = f"simulated {name}, hysteresis: {hysteresis.value}"
     picture = save_sweep_figure(rows, folder / "demo.png", title, mirror, without_hysteresis)
     console.print(f"picture: {os.path.relpath(picture)}")
     if not keep_maps:

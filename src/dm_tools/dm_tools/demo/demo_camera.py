@@ -239,7 +239,7 @@ def demo_camera(
                 suite.check()
                 raise
     show(found, reach.curvature_tolerance)
-    title = f"autofocus through a PDM30-37 twin, hysteresis: {law}"
+    title = f"autofocus through a simulated PDM30-37, hysteresis: {law}"
     with console.status("writing the animation"):
         sheet = save_contact_sheet(found, folder / "camera.png", title)
         animation = save_animation(found, folder / "camera.gif", title)

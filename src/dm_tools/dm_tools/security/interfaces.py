@@ -36,7 +36,7 @@ _LIFECYCLE = frozenset(node.name for node in NODES if node.lifecycle)
 #: What an operator's program calls.
 _OPERATION = ("degauss", "flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
 _LONG_OPERATION = ("build_recipes", "calibrate", "converge", "move_focus")
-#: Enclaves of nodes that go by simulated time on a twin.
+#: Enclaves of nodes that go by simulated time.
 _TIMED = frozenset(node.name for node in NODES) - {"virtual_bench"}
 
 
@@ -127,8 +127,8 @@ _DECLARED = (
         call=_LONG_OPERATION,
     ),
 )
-#: Only where there is a twin instead of hardware: whoever holds this enclave sets the time of all others.
-_TWIN = NodeInterface(
+#: Only where there is a simulation instead of hardware: whoever holds this enclave sets the time of all others.
+_SIMULATION = NodeInterface(
     "virtual_bench",
     "virtual_bench",
     publish=(*_HEALTH, CLOCK, "image_raw", "~/endpoints"),
@@ -136,14 +136,14 @@ _TWIN = NodeInterface(
 )
 
 
-def interfaces(twin: bool = False) -> tuple[NodeInterface, ...]:
-    """The interfaces of all nodes, with what every node has; of a bench with a `twin`, its own and its clock's too."""
-    nodes = (*_DECLARED, _TWIN) if twin else _DECLARED
+def interfaces(simulation: bool = False) -> tuple[NodeInterface, ...]:
+    """The interfaces of all nodes, with what every node has; with `simulation`, the virtual bench and its clock too."""
+    nodes = (*_DECLARED, _SIMULATION) if simulation else _DECLARED
     return tuple(
         replace(
             node,
             publish=tuple(sorted({*node.publish, *LOGS, *(_TRANSITIONS if node.name in _LIFECYCLE else ())})),
-            subscribe=tuple(sorted({*node.subscribe, *((CLOCK,) if twin and node.enclave in _TIMED else ())})),
+            subscribe=tuple(sorted({*node.subscribe, *((CLOCK,) if simulation and node.enclave in _TIMED else ())})),
             reply=tuple(
                 sorted({*node.reply, *PARAMETER_SERVICES, *(LIFECYCLE_SERVICES if node.name in _LIFECYCLE else ())})
             ),

@@ -32,12 +32,12 @@ class Profile:
     Attributes:
         namespace: of the mirror, "" for none.
         domain: ROS domain.
-        twin: with the virtual bench and its clock.
+        simulation: with the virtual bench and its clock.
     """
 
     namespace: str = ""
     domain: int = 0
-    twin: bool = False
+    simulation: bool = False
 
     @property
     def ns(self) -> str:
@@ -51,7 +51,7 @@ class Profile:
     def enclaves(self) -> dict[str, list[NodeInterface]]:
         """The nodes of each enclave, by its last part."""
         found: dict[str, list[NodeInterface]] = {}
-        for node in interfaces(self.twin):
+        for node in interfaces(self.simulation):
             found.setdefault(node.enclave, []).append(node)
         return found
 

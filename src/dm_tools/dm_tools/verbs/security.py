@@ -15,7 +15,9 @@ def security(
     check: Annotated[Path | None, typer.Option(help="Compare this keystore with the profile.")] = None,
     namespace: Annotated[str, typer.Option(help="Namespace of the mirror.")] = "",
     domain: Annotated[int, typer.Option(min=0, max=232, help="ROS domain of the bench.")] = 0,
-    twin: Annotated[bool, typer.Option("--twin", help="With the virtual bench, which publishes the clock.")] = False,
+    simulation: Annotated[
+        bool, typer.Option("--simulation", help="With the virtual bench, which publishes the clock.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Generate or check least-privilege SROS 2 policies, one enclave per node; exit status 1 when the check fails."""
@@ -24,7 +26,7 @@ def security(
 
     if (out is None) == (check is None):
         raise typer.BadParameter("--out and --check: give one of them")
-    profile = Profile(namespace, domain, twin)
+    profile = Profile(namespace, domain, simulation)
     if out is not None:
         files = write_profile(profile, out)
         console.print(f"{len(files)} files in {out}: one policy per enclave, governance, and environment.sh")

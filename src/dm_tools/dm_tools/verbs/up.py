@@ -90,19 +90,19 @@ def configurations(files: list[Path], namespaces: list[str]) -> dict[str, Config
 def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
     """The shipped virtual bench for mirror `number` of several: ports, folders, serial and seed of its own."""
     own = copy.deepcopy(configuration)
-    twin, driver = own["virtual_bench"], own["pdm_driver"]
+    simulation, driver = own["virtual_bench"], own["pdm_driver"]
     shift = PORTS_APART * number
-    old_trigger = str(twin["trigger.port"])
+    old_trigger = str(simulation["trigger.port"])
     for key in ("electronics.tcp_port", "electronics.udp_port", "electronics.discovery_port", "trigger.port"):
-        twin[key] += shift
+        simulation[key] += shift
     driver["electronics.port"] += shift
-    twin["seed"] += number
+    simulation["seed"] += number
     driver["mirror.serial"] = f"virtual-{name}"
     folder = f"~/.ros/dm_bench/{name}"
-    twin["output_folder"] = own["interferometer"]["watch_folder"] = f"{folder}/maps"
+    simulation["output_folder"] = own["interferometer"]["watch_folder"] = f"{folder}/maps"
     own["calibration"]["calibration_folder"] = f"{folder}/calibrations"
     command = own["interferometer"]["trigger_command"]
     own["interferometer"]["trigger_command"] = [
-        str(twin["trigger.port"]) if part == old_trigger else part for part in command
+        str(simulation["trigger.port"]) if part == old_trigger else part for part in command
     ]
     return own
