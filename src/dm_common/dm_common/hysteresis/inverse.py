@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import comb
 
 import numpy as np
-from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.duhem import DuhemOperator
@@ -69,31 +69,34 @@ class Pieces:
 
     Attributes:
         radius: (R,) half-widths, rising.
-        polynomial: (D + 1, 2, R) coefficients by rising power of the sum over the operators 0 .. k that have set in, on
-            a falling [0] and on a rising [1] way.
-        single: (D + 1, R) the same of each operator alone, in its own value.
+        polynomial: (D + 1, 2, 1 or N, R) coefficients by rising power of the sum over the operators 0 .. k that have
+            set in, on a falling [0] and on a rising [1] way; of all actuators, or of each.
+        single: (D + 1, 1 or N, R) the same of each operator alone, in its own value.
         order: that sorts the law's operators; None = they are sorted.
-        duhem, duhem_weight, duhem_slope: the Duhem operator, None = none; its weight, and what its value's polynomial
-            adds to the slope.
+        duhem, duhem_weight, duhem_slope: the Duhem operator, None = none; its weight () or (N,), and the polynomial of
+            its slope in its value.
     """
 
     def __init__(self, law: HysteresisModel) -> None:
         order = np.argsort(law.play_radius, kind="stable")
         self.order = None if (np.diff(order) == 1).all() else order
-        self.radius, weight = law.play_radius[order], law.play_weight[order]
-        self.single = np.vstack((np.zeros(len(self.radius)), weight.T))
-        self.polynomial = np.zeros((len(self.single), 2, len(self.radius)))
+        self.radius = law.play_radius[order]
+        weight = np.moveaxis(law.play_weight.reshape(-1, *law.play_weight.shape[-2:])[:, order], 2, 0)
+        self.single = np.concatenate((np.zeros((1, *weight.shape[1:])), weight))
+        powers = len(self.single)
+        self.polynomial = np.zeros((powers, 2, *weight.shape[1:]))
         for way, sign in enumerate((-1.0, 1.0)):
-            for k, radius in enumerate(self.radius):
-                # What has set in follows the signal at the distance of its half-width.
-                shifted = Polynomial(self.single[:, k])(Polynomial([-sign * radius, 1.0])).coef
-                self.polynomial[: len(shifted), way, k] = shifted
-        self.polynomial = self.polynomial.cumsum(axis=2)
+            # What has set in follows the signal at the distance of its half-width: (s - sign r)^power.
+            for power in range(powers):
+                for low in range(power + 1):
+                    self.polynomial[low, way] += (
+                        comb(power, low) * (-sign * self.radius) ** (power - low) * self.single[power]
+                    )
+        self.polynomial = self.polynomial.cumsum(axis=-1)
         self.duhem = DuhemOperator(law.duhem_slope) if law.duhem_slope.size else None
-        self.duhem_weight = law.duhem_weight
-        self.duhem_slope = law.duhem_weight * np.concatenate(([1.0], -law.duhem_slope, [0.0]))
-
-        self.powers = np.arange(1.0, len(self.polynomial))[:, None]
+        self.duhem_weight = np.asarray(law.duhem_weight, dtype=np.float64)
+        self.duhem_slope = np.concatenate(([1.0], -law.duhem_slope, [0.0]))
+        self.powers = np.arange(1.0, powers)[:, None]
 
     def solve(self, state: HysteresisState, wanted: Floats, low: float, high: float) -> Inverted:
         """Signals for the static effective signals `wanted` (N,)."""
@@ -102,7 +105,7 @@ class Pieces:
         if len(self.radius) == 1 and self.radius[0] == 0.0:  # no play: one piece, which begins where the mirror stands
             start = np.minimum(np.maximum(state.signals + (wanted - state.position), low), high)
             near, far = np.where(rising, state.signals, low), np.where(rising, high, state.signals)
-            polynomial, none = self.polynomial[:, 0], np.zeros(1)
+            polynomial, none = self.polynomial[:, 0, :, 0], np.zeros(1)
             return self._newton(
                 state, wanted, sign, polynomial, none, start, np.maximum(near, low), np.minimum(far, high)
             )
@@ -110,16 +113,17 @@ class Pieces:
         value = horner(self.single, play)
         waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)  # operators that have not set in yet
         onset = play + sign[:, None] * self.radius
-        at_onset = horner(self.polynomial[:, way], onset) + waiting
+        rows = np.arange(len(wanted))
+        laws = rows if self.polynomial.shape[2] > 1 else np.zeros_like(rows)
+        at_onset = horner(self.polynomial[:, way, laws], onset) + waiting
         if self.duhem is not None:
             change = onset - state.signals[:, None]
-            at_onset += self.duhem_weight * self.duhem.move(state.fading[:, None], change)
+            at_onset += self.duhem_weight[..., None] * self.duhem.move(state.fading[:, None], change)
         still = sign[:, None] * (wanted[:, None] - at_onset)
         last = len(self.radius) - 1
         piece = np.maximum(np.count_nonzero(still >= 0.0, axis=1) - 1, 0)
         following = np.minimum(piece + 1, last)
-        rows = np.arange(len(wanted))
-        polynomial, fixed = self.polynomial[:, way, piece], waiting[rows, piece]
+        polynomial, fixed = self.polynomial[:, way, laws, piece], waiting[rows, piece]
         begin, end = onset[rows, piece], np.where(piece < last, onset[rows, following], np.where(rising, high, low))
         # The chord of a narrow piece comes close; beyond the last place the slope is about 1.
         before, after = still[rows, piece], still[rows, following]
@@ -148,7 +152,7 @@ class Pieces:
             if self.duhem is not None:
                 fading = self.duhem.move(state.fading, signals - state.signals)
                 value += self.duhem_weight * fading
-                slope = slope + horner(self.duhem_slope, sign * fading)
+                slope = slope + self.duhem_weight * horner(self.duhem_slope, sign * fading)
             gap = value - wanted
             below = gap < 0.0
             low, high = np.where(below, signals, low), np.where(below, high, signals)

@@ -9,14 +9,18 @@ the gains. Signals are normalised, so is the effective signal: it spans 2 over a
   of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
 * Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for memory that fades.
 * Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
-  grow by `creep_rate` of a step per decade [17].
+  grow by `creep_rate` of a step per decade [17]; a spectrum says how much more or less each of them does.
+
+The weights are those of all actuators, or each actuator has its own.
 
 Nothing here depends on how a straight way is cut into steps, so only turning points have to be known.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -53,15 +57,16 @@ class HysteresisState:
 
 @dataclass(frozen=True, eq=False)
 class HysteresisModel:
-    """The law, shared by all actuators of a mirror; gains are in the influence function.
+    """The law of the actuators of a mirror; gains are in the influence function.
 
     Attributes:
         play_radius: (R,) half-widths, normalised; 0 = the signal itself.
-        play_weight: (R, D) weights of the powers 1 .. D of each play operator's value.
+        play_weight: (R, D) weights of the powers 1 .. D of each play operator's value, or (N, R, D) for each actuator.
         duhem_slope: (A,) of the Duhem operator; empty = none.
-        duhem_weight: of the Duhem operator's value.
-        creep_rate: growth of a step per decade of time.
+        duhem_weight: () or (N,) of the Duhem operator's value.
+        creep_rate: growth of a step per decade of time, in the mean over actuators and elements.
         creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
+        creep_spectrum: (J,) or (N, J) weight of each creep element relative to an even spectrum; empty = even.
 
     Raises:
         ValueError: shapes, numbers that are not finite, or a law that cannot be inverted, naming the field.
@@ -70,18 +75,26 @@ class HysteresisModel:
     play_radius: Floats
     play_weight: Floats
     duhem_slope: Floats
-    duhem_weight: float
+    duhem_weight: float | Floats
     creep_rate: float
     creep_time: Floats
+    creep_spectrum: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if self.play_radius.ndim != 1 or not self.play_radius.size:
             raise ValueError(f"play_radius has the shape {self.play_radius.shape}: must be a list of half-widths")
-        if self.play_weight.ndim != 2 or len(self.play_weight) != len(self.play_radius):
+        if self.play_weight.ndim not in (2, 3) or self.play_weight.shape[-2] != len(self.play_radius):
             raise ValueError(
                 f"play_weight has the shape {self.play_weight.shape}: must be {len(self.play_radius)} rows"
             )
-        for name in ("play_radius", "play_weight", "duhem_slope", "duhem_weight", "creep_rate", "creep_time"):
+        if self.creep_spectrum.size and self.creep_spectrum.shape[-1] != len(self.creep_time):
+            raise ValueError(
+                f"creep_spectrum has the shape {self.creep_spectrum.shape}: must be {len(self.creep_time)} columns"
+            )
+        own = (self.play_weight.shape[:-2], np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1])
+        if len({shape for shape in own if shape}) > 1:
+            raise ValueError(f"play_weight, duhem_weight and creep_spectrum are of {own} actuators: must be of as many")
+        for name in (item.name for item in fields(self)):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} holds values that are not finite")
         if (self.play_radius < 0.0).any():
@@ -107,12 +120,19 @@ class HysteresisModel:
         return DuhemOperator(self.duhem_slope) if self.duhem_slope.size else None
 
     @cached_property
-    def creep_share(self) -> float:
-        """Weight of each creep element."""
+    def creep_share(self) -> Floats:
+        """(J,) or (N, J) weight of each creep element; zeros without creep."""
         count = len(self.creep_time)
-        if count < 2 or not self.creep_rate:
-            return 0.0
-        return self.creep_rate * float(np.log10(self.creep_time[-1] / self.creep_time[0])) / (count - 1)
+        if count < 2:
+            return np.zeros(count)
+        even = self.creep_rate * np.log10(self.creep_time[-1] / self.creep_time[0]) / (count - 1)
+        return np.asarray(even * (self.creep_spectrum if self.creep_spectrum.size else np.ones(count)))
+
+    @property
+    def actuators(self) -> int:
+        """Number of actuators that have laws of their own; 0 = one law for any number of them."""
+        own = (self.play_weight.shape[:-2], np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1])
+        return max(shape[0] if shape else 0 for shape in own)
 
     # --- states ---
 
@@ -137,7 +157,7 @@ class HysteresisModel:
         elapsed = time - state.time
         if not elapsed > 0.0:
             return state
-        if not self.creep_share:
+        if not self.creep_rate:
             return replace(state, time=time)
         rest = np.exp(-elapsed / self.creep_time)
         crept = state.position[:, None] + (state.crept - state.position[:, None]) * rest
@@ -155,13 +175,13 @@ class HysteresisModel:
 
     def creep(self, state: HysteresisState) -> Floats:
         """(N,) the part of the effective signal that changes by itself."""
-        return np.asarray(self.creep_share * state.crept.sum(axis=1))
+        return np.asarray((self.creep_share * state.crept).sum(axis=1))
 
     def position_for(self, state: HysteresisState, effective: Floats, ahead: float = 0.0) -> Floats:
         """(N,) static effective signals that, taken at the state's time, become `effective` (N,) `ahead` s later."""
         rest = np.exp(-ahead / self.creep_time)
-        faded = self.creep_share * (state.crept @ rest)
-        return np.asarray((effective - faded) / (1.0 + self.creep_share * float((1.0 - rest).sum())))
+        faded = (self.creep_share * state.crept) @ rest
+        return np.asarray((effective - faded) / (1.0 + self.creep_share @ (1.0 - rest)))
 
     def position_at(self, state: HysteresisState, signals: Floats) -> Floats:
         """(N,) static effective signal that a straight move from `state` to `signals` (N,) would lead to."""
@@ -176,10 +196,10 @@ class HysteresisModel:
         return play, self._duhem.move(state.fading, signals - state.signals)
 
     def _position(self, play: Floats, fading: Floats) -> Floats:
-        powers = self.play_weight.shape[1]
-        total = play * self.play_weight[:, powers - 1]
+        powers = self.play_weight.shape[-1]
+        total = play * self.play_weight[..., powers - 1]
         for power in range(powers - 2, -1, -1):  # Horner: ((w3 p + w2) p + w1) p
-            total = (total + self.play_weight[:, power]) * play
+            total = (total + self.play_weight[..., power]) * play
         result = total.sum(axis=1)
         if self._duhem is not None:
             result = result + self.duhem_weight * fading
@@ -194,30 +214,39 @@ class HysteresisModel:
         distance of its half-width. Those of half-width r have set in only where the turn can lie 2 r behind.
         """
         order = np.argsort(self.play_radius)
-        radius, weight = self.play_radius[order], self.play_weight[order]
+        radius, weight = self.play_radius[order], self.play_weight[..., order, :]
         signal, way = np.linspace(-span, span, 201)[:, None], np.array([1.0, -1.0])[:, None, None]
         value = signal - way * radius
-        slope = np.zeros_like(value)
-        for power in range(weight.shape[1], 0, -1):
-            slope = slope * value + power * weight[:, power - 1]
+        weight = weight[..., None, None, :, :]  # a row for each way and signal
+        slope = np.zeros(np.broadcast_shapes(value.shape, weight.shape[:-1]))
+        for power in range(weight.shape[-1], 0, -1):
+            slope = slope * value + power * weight[..., power - 1]
         slope = np.where(2.0 * radius <= span + way * signal, slope, 0.0)
-        smallest = float(np.cumsum(slope, axis=2).min())
+        smallest = np.cumsum(slope, axis=-1).min(axis=(-3, -2, -1))
         if self._duhem is not None:
             low, high = self._duhem.slope_range
-            smallest += min(self.duhem_weight * low, self.duhem_weight * high)
-        return smallest
+            smallest = smallest + np.minimum(self.duhem_weight * low, self.duhem_weight * high)
+        return float(np.min(smallest))
 
-    def span(self) -> float:
-        """Effective signal at +1 less that at -1 in a full cycle that closes."""
-        state = self.demagnetised(1, 0.0)
+    def span(self) -> Floats:
+        """Effective signal at +1 less that at -1 in a full cycle that closes, of each law: (1,) or (N,)."""
+        count = self.actuators or 1
+        state = self.demagnetised(count, 0.0)
         for turn in (1.0, -1.0, 1.0, -1.0):
-            state = self.move(state, np.array([turn]), 0.0)
+            state = self.move(state, np.full(count, turn), 0.0)
         low = state.position
-        return float((self.move(state, np.ones(1), 0.0).position - low)[0])
+        return np.asarray(self.move(state, np.ones(count), 0.0).position - low)
 
-    def scaled(self, factor: float) -> HysteresisModel:
-        """The same law with effective signals `factor` times as large."""
-        return replace(self, play_weight=factor * self.play_weight, duhem_weight=factor * self.duhem_weight)
+    def scaled(self, factor: float | Floats) -> HysteresisModel:
+        """The same law with effective signals `factor` times as large, a number or (N,)."""
+        factor = np.asarray(factor, dtype=np.float64)
+        if factor.shape == (1,):
+            factor = factor[0]
+        return replace(
+            self,
+            play_weight=factor[..., None, None] * self.play_weight,
+            duhem_weight=np.asarray(factor * self.duhem_weight),
+        )
 
 
 def follow(
@@ -247,8 +276,20 @@ def follow(
     return result, state
 
 
-#: Random histories that tell what is always within reach, and time between their moves, s.
+#: Random histories that tell what is always within reach, their moves, and the time between those, s.
 HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
+
+
+def random_histories(
+    law: HysteresisModel, low: float, high: float, rng: np.random.Generator, histories: int = HISTORIES
+) -> Iterator[HysteresisState]:
+    """States after random moves between `low` and `high`: of `histories` actuators, where each has its own law of some."""
+    count = law.actuators or histories
+    for _ in range(math.ceil(histories / count)):
+        state = law.demagnetised(count, 0.0, 0.5 * (low + high))
+        for _ in range(HISTORY_MOVES):
+            state = law.move(state, rng.uniform(low, high, count), state.time + HISTORY_PAUSE_S)
+        yield state
 
 
 def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float, float]:
@@ -256,9 +297,8 @@ def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float,
 
     The least of what random histories leave at either end.
     """
-    rng = np.random.default_rng(0)
-    state = law.demagnetised(HISTORIES, 0.0, 0.5 * (low + high))
-    for _ in range(HISTORY_MOVES):
-        state = law.move(state, rng.uniform(low, high, HISTORIES), state.time + HISTORY_PAUSE_S)
-    reached = [law.effective(law.move(state, np.full(HISTORIES, end), state.time)) for end in (low, high)]
-    return float(reached[0].max()), float(reached[1].min())
+    ends: dict[float, list[Floats]] = {low: [], high: []}
+    for state in random_histories(law, low, high, np.random.default_rng(0)):
+        for end, reached in ends.items():
+            reached.append(law.effective(law.move(state, np.full(len(state.signals), end), state.time)))
+    return float(np.max(ends[low])), float(np.min(ends[high]))

@@ -39,7 +39,9 @@ class PreparedInverse:
 
     def __init__(self, law: HysteresisModel, state: HysteresisState, low: float, high: float) -> None:
         self.state, self._low, self._high = state, low, high
-        self._share, self._rate = law.creep_share, -1.0 / law.creep_time
+        self._rate = -1.0 / law.creep_time
+        self._share = np.atleast_2d(law.creep_share)
+        self._creeps = bool(law.creep_rate)
         self._gap = self._share * (state.crept - state.position[:, None])
         self._rests: dict[float, tuple[Floats, float]] = {}
         parts = pieces(law)
@@ -56,13 +58,13 @@ class PreparedInverse:
         waiting = value.sum(axis=1)[:, None] - value.cumsum(axis=1)  # operators that have not set in yet
         sign = np.array([-1.0, 1.0])[:, None, None]
         begin = play + sign * parts.radius
-        curve = parts.polynomial[:, :, None, :]
+        curve = parts.polynomial
         first = horner(curve, begin) + waiting
         fading = None
         if parts.duhem is not None:
             start = np.broadcast_to(state.fading[:, None], begin.shape)
             fading = parts.duhem.move(start, begin - state.signals[:, None])
-            first += parts.duhem_weight * fading
+            first += parts.duhem_weight[..., None] * fading
         if len(curve) == 2 and fading is None:
             slope = 1.0 / np.broadcast_to(curve[1], begin.shape)
             self._table = np.stack((begin, first, slope), axis=-1).reshape(-1, 3)
@@ -78,7 +80,7 @@ class PreparedInverse:
         """Rows of: place, value there, and the powers 1 to 3 of the inverse from there; NaN where it is not exact."""
         duhem, sign = parts.duhem, np.array([-1.0, 1.0])[:, None, None]
         ends = np.array([[self._low], [self._high]])
-        curve = parts.polynomial[:, :, None, :]
+        curve = parts.polynomial
         slopes = curve[1:] * parts.powers[:, :, None, None]
         hysteresis = np.broadcast_to(self.state.fading[:, None], begin.shape)
         change = begin - self.state.signals[:, None]
@@ -95,8 +97,8 @@ class PreparedInverse:
             after[..., :-1] = fading[..., 1:]
             after[..., -1] = duhem.move(hysteresis[..., -1], ends - self.state.signals)
             last[..., -1] += parts.duhem_weight * after[..., -1]
-            steep_first += horner(parts.duhem_slope, sign * fading)
-            steep_last += horner(parts.duhem_slope, sign * after)
+            steep_first += parts.duhem_weight[..., None] * horner(parts.duhem_slope, sign * fading)
+            steep_last += parts.duhem_weight[..., None] * horner(parts.duhem_slope, sign * after)
         with np.errstate(divide="ignore", invalid="ignore"):  # pieces of no width, which hold no solution
             rise = last - first
             chord, one, two = (end - begin) / rise, 1.0 / steep_first, 1.0 / steep_last
@@ -106,7 +108,7 @@ class PreparedInverse:
             way = ((cube * middle + square) * middle + one) * middle
             error = horner(curve, begin + way) + waiting - first - middle
             if duhem is not None:
-                error += parts.duhem_weight * duhem.move(hysteresis, change + way)
+                error += parts.duhem_weight[..., None] * duhem.move(hysteresis, change + way)
         cube[~(np.abs(error) <= EXACT)] = np.nan
         return np.stack((begin, first, one, square, cube), axis=-1).reshape(-1, 5)
 
@@ -128,12 +130,12 @@ class PreparedInverse:
 
     def _static(self, time: float, effective: Floats, ahead: float) -> Floats:
         """What `HysteresisModel.position_for` gives for the state at `time`."""
-        if not self._share:
+        if not self._creeps:
             return effective
         elapsed = max(time - self.state.time, 0.0) + ahead
         known = self._rests.get(ahead)
         if known is None:
-            rest = float(np.exp(ahead * self._rate).sum())
-            known = self._share * rest * self.state.position, 1.0 + self._share * (len(self._rate) - rest)
+            rest = self._share @ np.exp(ahead * self._rate)
+            known = rest * self.state.position, 1.0 + self._share.sum(axis=1) - rest
             self._rests[ahead] = known
         return np.asarray((effective - known[0] - self._gap @ np.exp(elapsed * self._rate)) / known[1])
