@@ -106,15 +106,26 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     if not radius.size:
         return None
     weight = np.array(message.play_weight, dtype=np.float64)
-    if weight.size != radius.size * message.powers or not message.powers:
-        raise ValueError(f"hysteresis: play_weight has {weight.size} values, must be {radius.size} x {message.powers}")
+    one = radius.size * message.powers
+    if not one or not weight.size or weight.size % one:
+        raise ValueError(
+            f"hysteresis: play_weight has {weight.size} values, must be {radius.size} x {message.powers} (for each)"
+        )
+    duhem_weight = np.array(message.duhem_weight, dtype=np.float64)
+    creep_time = np.array(message.creep_time, dtype=np.float64)
+    spectrum = np.array(message.creep_spectrum, dtype=np.float64)
+    if spectrum.size and (not creep_time.size or spectrum.size % creep_time.size):
+        raise ValueError(
+            f"hysteresis: creep_spectrum has {spectrum.size} values, must be {creep_time.size} or for each"
+        )
     return HysteresisModel(
         radius,
-        weight.reshape(radius.size, message.powers),
+        weight.reshape((-1, radius.size, message.powers) if weight.size > one else (radius.size, message.powers)),
         np.array(message.duhem_slope, dtype=np.float64),
-        message.duhem_weight,
+        duhem_weight if duhem_weight.size > 1 else float(duhem_weight.sum()),
         message.creep_rate,
-        np.array(message.creep_time, dtype=np.float64),
+        creep_time,
+        spectrum.reshape(-1, creep_time.size) if spectrum.size > creep_time.size else spectrum,
     )
 
 

@@ -148,7 +148,7 @@ class HysteresisObserver:
 
 def same_model(one: HysteresisModel, other: HysteresisModel) -> bool:
     """Whether two laws are the same, number for number."""
-    names = ("play_radius", "play_weight", "duhem_slope", "duhem_weight", "creep_rate", "creep_time")
+    names = ("play_radius", "play_weight", "duhem_slope", "duhem_weight", "creep_rate", "creep_time", "creep_spectrum")
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
 
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.features import relaxation
 from dm_calibration.hysteresis.identify import CANDIDATES, Candidate, Identification, Run, identify
 from dm_calibration.hysteresis.responses import responses_of
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of
 from dm_calibration.influence.fit import PISTON_TILT
 from dm_calibration.influence.maps import CHECK, MapSet
-from dm_common.hysteresis.model import HysteresisModel, follow
+from dm_common.hysteresis.model import HysteresisModel, follow, random_histories
 from dm_common.optics.zernike import TERM_RMS
 
 Floats = NDArray[np.float64]
@@ -24,8 +23,6 @@ Floats = NDArray[np.float64]
 OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
 #: Draws for quantiles of the largest of many correlated errors.
 DRAWS = 4000
-#: Moves of the random histories that tell what not knowing the history means.
-HISTORY_MOVES = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +123,14 @@ def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
     if law.creep_rate:
         fading = np.zeros((len(maps), len(parts)))
         for number, part in enumerate(parts):
-            fading[part, number] = law.creep_rate * relaxation(time[part], start[number])
+            fading[part, number] = _fading(law, time[part] - start[number])
         effective += fading @ _crept_before(maps, effective, fading)
     return replace(maps, applied=effective)
+
+
+def _fading(law: HysteresisModel, elapsed: Floats) -> Floats:
+    """(M,) how much of an old displacement still shows `elapsed` (M,) s after it ended, in the mean over actuators."""
+    return np.asarray(np.exp(-elapsed[:, None] / law.creep_time) @ np.atleast_2d(law.creep_share).mean(axis=0))
 
 
 def _crept_before(maps: MapSet, effective: Floats, fading: Floats) -> Floats:
@@ -165,14 +167,12 @@ def _crept_before(maps: MapSet, effective: Floats, fading: Floats) -> Floats:
 def unknown_history_sigma(law: HysteresisModel, seed: int = 0, actuators: int = 500) -> float:
     """Standard deviation of the static effective signal at one signal over random histories."""
     rng = np.random.default_rng(seed)
-    signals = rng.uniform(-1.0, 1.0, actuators)
-    ends = []
-    for _ in range(2):
-        state = law.demagnetised(actuators, 0.0)
-        for _ in range(HISTORY_MOVES):
-            state = law.move(state, rng.uniform(-1.0, 1.0, actuators), 0.0)
-        ends.append(law.move(state, signals, 0.0).position)
-    return float(np.std(ends[1] - ends[0]) / np.sqrt(2.0))
+    still = replace(law, creep_rate=0.0)
+    differences = []
+    for one, other in zip(*(random_histories(still, -1.0, 1.0, rng, actuators) for _ in range(2)), strict=True):
+        signals = rng.uniform(-1.0, 1.0, len(one.signals))
+        differences.append(still.position_at(one, signals) - still.position_at(other, signals))
+    return float(np.std(differences) / np.sqrt(2.0))
 
 
 def _error_covariance(found: Identification, run: Run, terms: int) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,8 @@ def hysteresis_from(columns: Mapping[str, Column]) -> HysteresisFit | None:
         return None
     values: dict[str, Any] = {}
     for field in fields(HysteresisModel):
+        if f"memory/law/{field.name}" not in columns and field.default_factory is not MISSING:
+            continue  # a file older than this field
         value = np.asarray(columns[f"memory/law/{field.name}"], dtype=np.float64)
         values[field.name] = value if value.ndim else float(value)
     held_out, unknown, maps = np.asarray(columns["memory/figures"], dtype=np.float64)

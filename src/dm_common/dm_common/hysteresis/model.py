@@ -239,14 +239,11 @@ class HysteresisModel:
 
     def scaled(self, factor: float | Floats) -> HysteresisModel:
         """The same law with effective signals `factor` times as large, a number or (N,)."""
-        factor = np.asarray(factor, dtype=np.float64)
-        if factor.shape == (1,):
-            factor = factor[0]
-        return replace(
-            self,
-            play_weight=factor[..., None, None] * self.play_weight,
-            duhem_weight=np.asarray(factor * self.duhem_weight),
-        )
+        factors = np.asarray(factor, dtype=np.float64)
+        if factors.shape == (1,):
+            factors = factors[0]
+        duhem = factors * self.duhem_weight if self.duhem_slope.size else self.duhem_weight
+        return replace(self, play_weight=factors[..., None, None] * self.play_weight, duhem_weight=duhem)
 
 
 def follow(
@@ -283,7 +280,7 @@ HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
 def random_histories(
     law: HysteresisModel, low: float, high: float, rng: np.random.Generator, histories: int = HISTORIES
 ) -> Iterator[HysteresisState]:
-    """States after random moves between `low` and `high`: of `histories` actuators, where each has its own law of some."""
+    """States after random moves between `low` and `high`: of `histories` actuators, or of those of the law so often."""
     count = law.actuators or histories
     for _ in range(math.ceil(histories / count)):
         state = law.demagnetised(count, 0.0, 0.5 * (low + high))

@@ -59,7 +59,7 @@ def hysteresis_figures_of(calibration: Any) -> HysteresisFigures | None:
     try:
         law = hysteresis_model_from(hysteresis)
     except ValueError as error:
-        raise ValueError(f"hysteresis: {str(error).removeprefix('memory: ')}") from error
+        raise ValueError(f"hysteresis: {str(error).removeprefix('hysteresis: ')}") from error
     if law is None:
         return None
     slope = law.slope_min()
@@ -67,7 +67,12 @@ def hysteresis_figures_of(calibration: Any) -> HysteresisFigures | None:
         raise ValueError(
             f"hysteresis: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"
         )
-    span = law.span()
+    if law.actuators not in (0, calibration.actuators):
+        raise ValueError(
+            f"hysteresis: play_weight: laws of {law.actuators} actuators, must be of {calibration.actuators} or one"
+        )
+    spans = law.span()
+    span = spans[np.abs(spans - SPAN).argmax()]
     if not abs(span - SPAN) <= SPAN_TOLERANCE:
         raise ValueError(
             f"hysteresis: play_weight: effective signals span {span:.3g}, must be {SPAN:g}: a law of another scale"
