@@ -1,1 +1,1 @@
-"""Drive electronics, safety limiter and virtual bench for piezo deformable mirrors."""
+"""Drive electronics, safety limiter and node for piezo deformable mirrors."""

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dm_common.errors import ErrorCode
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.diagnostics import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
-from dm_driver.driver_messages import Complaint
 
 
-def driver_health(writer: ActuatorWriter | None, complaint: Complaint, refused: Mapping[str, int]) -> Health:
+def driver_health(writer: ActuatorWriter | None, refusal: Refusal | None, refused: Mapping[str, int]) -> Health:
     """Judge the driver: level, one line for a person, and the counts since the configuration.
 
     Args:
         writer: None when the driver is not configured.
-        complaint: about the last command or the configuration.
-        refused: refused commands by reason.
+        refusal: of the last command, or of the configuration.
+        refused: number of refused commands by the name of their code.
     """
     values: dict[str, object] = {f"refused {name}": count for name, count in sorted(refused.items())}
     if writer is None:
-        if complaint.error_code == ErrorCode.INVALID_ARGUMENT:
-            return Health(ERROR, complaint.message, values)
+        if refusal is not None and refusal.error_code == ErrorCode.INVALID_ARGUMENT:
+            return Health(ERROR, str(refusal), values)
         return Health(WARN, "not configured", values)
     state, counters = writer.state(), writer.counters
     values |= {
@@ -36,8 +35,8 @@ def driver_health(writer: ActuatorWriter | None, complaint: Complaint, refused: 
     }
     if not state.link_up:
         return Health(ERROR, f"link lost: {state.fault}", values)
-    if complaint.error_code != ErrorCode.OK:
-        return Health(WARN, f"the last command was refused: {complaint.message}", values)
+    if refusal is not None:
+        return Health(WARN, f"the last command was refused: {refusal}", values)
     if not state.enabled:
         return Health(WARN, "inactive: commands are refused", values)
     if not state.history_known:

@@ -4,25 +4,15 @@ from __future__ import annotations
 
 import array
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from dm_msgs.msg import ActuatorState, MirrorInfo
 from numpy.typing import NDArray
 
-from dm_common.errors import ErrorCode
+from dm_common.errors import ErrorCode, Refusal
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Kind, WriterState
-
-
-@dataclass(frozen=True)
-class Complaint:
-    """Why the last command was not carried out; code OK when it was."""
-
-    error_code: int = ErrorCode.OK
-    message: str = ""
-    actuators: NDArray[np.bool_] | None = None
 
 
 def _floats(values: NDArray[np.float64]) -> array.array[float]:
@@ -42,19 +32,23 @@ def driver_state(state: WriterState) -> int:
     return int(ActuatorState.STATE_ACTIVE if state.enabled else ActuatorState.STATE_INACTIVE)
 
 
-def unconfigured_message(frame_id: str, complaint: Complaint) -> ActuatorState:
+def unconfigured_message(frame_id: str, refusal: Refusal | None) -> ActuatorState:
     """The state of a driver that has no valid configuration."""
     message = ActuatorState(driver_state=ActuatorState.STATE_UNCONFIGURED)
     message.header.frame_id = frame_id
-    message.error_code = complaint.error_code
-    message.message = complaint.message
+    _set_error(message, refusal)
     return message
 
 
+def _set_error(message: ActuatorState, refusal: Refusal | None) -> None:
+    if refusal is not None:
+        message.error_code, message.message = refusal.error_code, str(refusal)
+
+
 def state_message(
-    state: WriterState, complaint: Complaint, configuration: DriverConfiguration, frame_id: str
+    state: WriterState, refusal: Refusal | None, configuration: DriverConfiguration, frame_id: str
 ) -> ActuatorState:
-    """The state of a configured driver."""
+    """The state of a configured driver; `refusal` of the last command, None when it was carried out."""
     message = ActuatorState(driver_state=driver_state(state))
     message.header.frame_id = frame_id
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(state.stamp_ns, 1_000_000_000)
@@ -63,13 +57,13 @@ def state_message(
     message.history_known = state.history_known
     message.degausses, message.turns = state.degausses, state.turns
     if state.link_up or not state.enabled:
-        message.error_code, message.message = complaint.error_code, complaint.message
+        _set_error(message, refusal)
     else:
         message.error_code, message.message = ErrorCode.ELECTRONICS_UNREACHABLE, state.fault
     flags = np.zeros(configuration.limiter.limits.actuators, dtype=np.uint8)
     flags[~configuration.output.connected] |= ActuatorState.FLAG_UNUSED
-    if complaint.actuators is not None:
-        flags[complaint.actuators] |= ActuatorState.FLAG_REFUSED
+    if refusal is not None and refusal.actuators is not None:
+        flags[refusal.actuators] |= ActuatorState.FLAG_REFUSED
     if state.requested is not None and state.applied is not None and state.volts is not None:
         message.requested = _floats(state.requested)
         message.applied = _floats(state.applied)

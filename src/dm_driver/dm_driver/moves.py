@@ -1,4 +1,4 @@
-"""What the actuator writer is asked to do, and what it tells about itself."""
+"""What the actuator writer is asked to do, and what it reports about itself."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Move:
         kind: what it is for.
         waypoints: shapes to pass; straight lines between them.
         target: the last of them.
-        wipes: a degauss over the full range, which leaves no memory.
+        wipes: a degauss over the full range, which wipes the hysteresis.
     """
 
     def __init__(self, kind: Kind, waypoints: Iterable[Shape], target: Shape, wipes: bool = False) -> None:
@@ -73,7 +73,7 @@ class Counters:
 
 @dataclass(frozen=True)
 class WriterState:
-    """One consistent look at the writer. Arrays are never changed after they were handed out.
+    """One consistent state of the writer. Arrays are never changed after they were handed out.
 
     Attributes:
         link_up: the electronics are open.
@@ -88,7 +88,7 @@ class WriterState:
         degausses: such degausses since the writer was enabled.
         turns: moves that ended or were left for another since the writer was enabled.
         turned_at: (N,) what was applied where that happened last; None before the first.
-        fault: why the link is down, in words; empty when it is up.
+        fault: reason why the link is down; empty when it is up.
     """
 
     link_up: bool

@@ -29,7 +29,7 @@ from dm_common.ros.worker import WorkerService
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.driver_configuration import DriverConfiguration, build_configuration
 from dm_driver.driver_health import driver_health
-from dm_driver.driver_messages import Complaint, mirror_info_message, state_message, unconfigured_message
+from dm_driver.driver_messages import mirror_info_message, state_message, unconfigured_message
 from dm_driver.driver_parameters import PARAMETERS
 from dm_driver.last_shape import LastShape, record_path
 from dm_driver.moves import Move, Outcome, WriterState
@@ -52,7 +52,7 @@ class PdmDriverNode(LifecycleNode):
     def __init__(self) -> None:
         super().__init__("pdm_driver")
         self._values: dict[str, Any] = {}
-        self._problem = ""  # what is wrong with the parameters, in words
+        self._problem = ""  # what is wrong with the parameters
         try:
             self._values = parameters.declare(self, PARAMETERS)
         except (parameters.ParameterError, ParameterException) as error:
@@ -61,9 +61,9 @@ class PdmDriverNode(LifecycleNode):
         self._configuration: DriverConfiguration | None = None
         self._writer: ActuatorWriter | None = None
         self._refused: Counter[str] = Counter()
-        # Guards complaint and publishing: state leaves the executor's, the writer's and the services' threads.
+        # Guards refusal and publishing: state leaves the executor's, the writer's and the services' threads.
         self._state_lock = threading.Lock()
-        self._complaint = Complaint()
+        self._refusal: Refusal | None = None  # of the last command, or of the configuration
         self._published_at = 0.0
         # Plain publishers: the state must be seen in every lifecycle state.
         self._state_publisher = self.create_publisher(ActuatorState, "actuator_state", qos.STATE)
@@ -95,10 +95,10 @@ class PdmDriverNode(LifecycleNode):
             configuration = build_configuration(self._values)
         except ValueError as error:
             self.get_logger().error(f"configuration refused: {error}")
-            self._complain(Complaint(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {error}"))
+            self._report(Refusal(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {error}"))
             return TransitionCallbackReturn.FAILURE
         self._configuration = configuration
-        self._complaint = Complaint()
+        self._refusal = None
         self._writer = ActuatorWriter(
             configuration.make_electronics(),
             configuration.output,
@@ -131,7 +131,7 @@ class PdmDriverNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         writer = self._writer
         assert writer is not None
-        self._complaint = Complaint()
+        self._refusal = None
         if writer.enable(MARGIN_S if writer.state().link_up else 0.0):
             self.get_logger().info("active; the mirror stands in the safe shape")
         else:
@@ -163,24 +163,25 @@ class PdmDriverNode(LifecycleNode):
         """Ramp to the safe shape and close the electronics; runs when the process ends (SIGINT, SIGTERM)."""
         self._release("end of the process")
 
-    def _to_safe_shape(self, why: str) -> None:
+    def _to_safe_shape(self, occasion: str) -> None:
         writer, configuration = self._writer, self._configuration
         if writer is None or configuration is None or not writer.state().enabled:
             return
         ramp_time = writer.ramp_time(configuration.safe_shape)
         outcome = writer.disable(ramp_time + self._values["electronics.timeout"] + MARGIN_S)
         if outcome is Outcome.REACHED:
-            self.get_logger().info(f"{why}: the mirror stands in the safe shape")
+            self.get_logger().info(f"{occasion}: the mirror stands in the safe shape")
         else:
             self.get_logger().error(
-                f"{why}: the safe shape was not reached ({outcome.value}); the outputs probably hold their last values"
+                f"{occasion}: the safe shape was not reached ({outcome.value}); the outputs probably hold their last"
+                " values"
             )
 
-    def _release(self, why: str) -> None:
-        self._to_safe_shape(why)
+    def _release(self, occasion: str) -> None:
+        self._to_safe_shape(occasion)
         writer, self._writer, self._configuration = self._writer, None, None
         if writer is not None and not writer.stop():
-            self.get_logger().error(f"{why}: the electronics' thread hangs; it ends with the process")
+            self.get_logger().error(f"{occasion}: the electronics' thread hangs; it ends with the process")
         self._publish_state()
 
     # Commands
@@ -225,10 +226,10 @@ class PdmDriverNode(LifecycleNode):
         carry_out: Callable[[ActuatorWriter, DriverConfiguration], Move | None],
         dry_run: bool = False,
     ) -> Move | Refusal | None:
-        """Carry out a request, or return and report why not. A refused dry run is the caller's business only."""
+        """Carry out a request, or return and report its refusal. A refused dry run is the caller's business only."""
         writer, configuration = self._writer, self._configuration
         if not dry_run:
-            self._complaint = Complaint()  # before the writer's thread tells of the first write
+            self._refusal = None  # before the writer's thread publishes the first write
         try:
             if writer is None or configuration is None:
                 raise Refusal(
@@ -239,7 +240,7 @@ class PdmDriverNode(LifecycleNode):
             if not dry_run:
                 self._refused[ErrorCode(refusal.error_code).name] += 1
                 self.get_logger().warning(f"{source} refused: {refusal}", throttle_duration_sec=1.0)
-                self._complain(Complaint(refusal.error_code, f"{source} refused: {refusal}", refusal.actuators))
+                self._report(Refusal(refusal.error_code, f"{source} refused: {refusal}", refusal.actuators))
             return refusal
         return move
 
@@ -261,24 +262,24 @@ class PdmDriverNode(LifecycleNode):
         if edge or time.monotonic() - self._published_at >= STATE_INTERVAL_S:
             self._publish_state()
 
-    def _complain(self, complaint: Complaint) -> None:
-        self._complaint = complaint
+    def _report(self, refusal: Refusal) -> None:
+        self._refusal = refusal
         self._publish_state()
 
     def _publish_state(self) -> None:
         with self._state_lock:
-            if not self.context.ok():  # on the way out there is nobody left to tell
+            if not self.context.ok():  # on the way out nobody is left to publish to
                 return
             writer, configuration = self._writer, self._configuration
             if writer is None or configuration is None:
-                message = unconfigured_message(self._frame_id, self._complaint)
+                message = unconfigured_message(self._frame_id, self._refusal)
             else:
-                message = state_message(writer.state(), self._complaint, configuration, self._frame_id)
+                message = state_message(writer.state(), self._refusal, configuration, self._frame_id)
             self._state_publisher.publish(message)
             self._published_at = time.monotonic()
 
     def _health(self) -> diagnostics.Health:
-        return driver_health(self._writer, self._complaint, self._refused)
+        return driver_health(self._writer, self._refusal, self._refused)
 
 
 def main(args: Sequence[str] | None = None) -> int:

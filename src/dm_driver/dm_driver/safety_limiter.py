@@ -94,10 +94,10 @@ class SafetyLimiter:
             finite = np.isfinite(shape)
             if not finite.all():
                 raise Refusal(
-                    ErrorCode.NOT_FINITE, self._words(name, shape, ~finite, "must be a finite number"), ~finite
+                    ErrorCode.NOT_FINITE, self._text(name, shape, ~finite, "must be a finite number"), ~finite
                 )
             raise Refusal(
-                ErrorCode.OUT_OF_RANGE, self._words(name, shape, ~inside, f"must be {low:g} to {high:g}"), ~inside
+                ErrorCode.OUT_OF_RANGE, self._text(name, shape, ~inside, f"must be {low:g} to {high:g}"), ~inside
             )
         self._check_neighbours(shape, name, SLACK)
         return np.clip(shape, low, high, out=shape)
@@ -122,7 +122,7 @@ class SafetyLimiter:
             )
 
     def check_write(self, previous: Shape | None, shape: Shape) -> None:
-        """The last look before a write: a legal shape, and no step larger than allowed.
+        """The last check before a write: a legal shape, and no step larger than allowed.
 
         `previous` is what was written before; None when the outputs are unknown, so that no step can be judged.
 
@@ -135,7 +135,7 @@ class SafetyLimiter:
         outside = ~((shape >= limits.signal_min) & (shape <= limits.signal_max))
         if outside.any():
             rule = f"must be {limits.signal_min:g} to {limits.signal_max:g}"
-            raise Refusal(ErrorCode.INTERNAL, self._words("signals", shape, outside, rule), outside)
+            raise Refusal(ErrorCode.INTERNAL, self._text("signals", shape, outside, rule), outside)
         self._check_neighbours(shape, "signals", SLACK + _ROUNDING)
         if previous is not None:
             change = np.abs(shape - previous)
@@ -143,7 +143,7 @@ class SafetyLimiter:
             if too_large.any():
                 raise Refusal(
                     ErrorCode.INTERNAL,
-                    self._words("step", change, too_large, f"must be at most {limits.step:g} (limits.step)"),
+                    self._text("step", change, too_large, f"must be at most {limits.step:g} (limits.step)"),
                     too_large,
                 )
 
@@ -199,7 +199,7 @@ class SafetyLimiter:
         )
 
     @staticmethod
-    def _words(name: str, values: NDArray[np.float64], at_fault: NDArray[np.bool_], rule: str) -> str:
+    def _text(name: str, values: NDArray[np.float64], at_fault: NDArray[np.bool_], rule: str) -> str:
         first = int(at_fault.argmax())
         others = int(at_fault.sum()) - 1
         return f"{name} of actuator {first + 1} = {values[first]:.6g}: {rule}" + (

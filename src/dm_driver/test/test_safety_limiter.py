@@ -96,12 +96,12 @@ def test_age_of_commands() -> None:
     limiter = SafetyLimiter(Limits(37, command_age=0.5, command_lead=0.2))
     for fresh in (0.0, 0.499, -0.199):
         limiter.check_age(fresh)
-    for stale, words in (
+    for stale, text in (
         (0.51, "0.510 s old: must be at most 0.5 s"),
         (-0.21, "0.210 s in the future"),
         (math.nan, "nan s old"),
     ):
-        with pytest.raises(Refusal, match=words) as caught:
+        with pytest.raises(Refusal, match=text) as caught:
             limiter.check_age(stale)
         assert caught.value.error_code is ErrorCode.STALE
 

@@ -31,7 +31,7 @@ def test_first_and_last_channels_of_the_tables() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "custom", "actuators", "words"),
+    ("name", "custom", "actuators", "text"),
     [
         ("hexagon", [], 37, "'hexagon': unknown; must be one of trihex, 37ch_30mm, 37ch_30mm_v2005, custom"),
         ("trihex", [], 19, "lists 37 channels: must be 19"),
@@ -43,8 +43,8 @@ def test_first_and_last_channels_of_the_tables() -> None:
         ("custom", [-1, -1], 2, "no actuator has a channel"),
     ],
 )
-def test_wrong_wirings_are_refused(name: str, custom: Sequence[int], actuators: int, words: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(words)):
+def test_wrong_wirings_are_refused(name: str, custom: Sequence[int], actuators: int, text: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(text)):
         wiring_table(name, custom, actuators, 40)
 
 
@@ -169,7 +169,7 @@ def test_codes_of_illegal_signals_are_refused(bad: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "text"),
     [
         ((65535, -6, 6, 80, 0, 500), "volts.max = 500 V needs 6.25 V at the DAC, which reaches -6 to 6 V"),
         ((65535, 0, 6, 80, -10, 300), "volts.min = -10 V needs -0.125 V"),
@@ -180,6 +180,6 @@ def test_codes_of_illegal_signals_are_refused(bad: float) -> None:
         ((65535, -6, 6, 800000, 0, 300), "spans only 2 of 65535 codes"),
     ],
 )
-def test_contradictory_voltages_are_refused(arguments: tuple[float, ...], words: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(words)):
+def test_contradictory_voltages_are_refused(arguments: tuple[float, ...], text: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(text)):
         VoltScale(int(arguments[0]), *arguments[1:])

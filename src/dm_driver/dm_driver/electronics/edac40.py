@@ -25,9 +25,9 @@ CHANNELS: Final = 40
 MAX_CODE: Final = 0xFFFF
 COMMAND_VALUE: Final = 0
 
-#: Between two looks for an acknowledgement; a direct cable takes 0.1 to 0.3 ms [s].
+#: Between two checks for an acknowledgement; a direct cable takes 0.1 to 0.3 ms [s].
 _ACKNOWLEDGEMENT_PERIOD_S: Final = 1e-4
-#: A frame over UDP is sent again at so many looks at the link after it, if it is still the last one.
+#: A frame over UDP is sent again at so many checks of the link after it, if it is still the last one.
 _REPEATS: Final = 2
 
 #: Connector channel -> physical channel, both 0-based. The permutation is its own inverse.

@@ -72,11 +72,11 @@ def wiring_table(name: str, custom: Sequence[int], actuators: int, channels: int
     counts = Counter(channel for channel in table if channel != NOT_WIRED)
     twice = {channel: count for channel, count in counts.items() if count > 1}
     if twice:
-        words = "; ".join(
+        text = "; ".join(
             f"channel {channel} by actuators {', '.join(str(i + 1) for i, c in enumerate(table) if c == channel)}"
             for channel in twice
         )
-        raise ValueError(f"{source}: used more than once: {words}")
+        raise ValueError(f"{source}: used more than once: {text}")
     if not counts:
         raise ValueError(f"{source}: no actuator has a channel")
     return np.array(table, dtype=np.intp)

@@ -1,1 +1,1 @@
-"""electronics of dm_simulation."""
+"""The drive electronics behind the wire."""

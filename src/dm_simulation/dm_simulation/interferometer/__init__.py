@@ -1,1 +1,1 @@
-"""interferometer of dm_simulation."""
+"""The interferometer: pictures of the plate, its files and its trigger."""

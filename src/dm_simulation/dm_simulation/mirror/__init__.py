@@ -1,1 +1,1 @@
-"""mirror of dm_simulation."""
+"""The mirror: piezo stacks under an elastic plate."""
