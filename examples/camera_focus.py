@@ -1,6 +1,6 @@
 """Focus a camera behind the mirror: by distance, by dioptre, and by its own images. See docs/camera.md."""
 
-from dm_autofocus.camera_client import CameraFocusClient
+from dm_autofocus import CameraFocusClient
 
 with CameraFocusClient() as camera:
     print("the camera focuses", camera.focus_range().message)

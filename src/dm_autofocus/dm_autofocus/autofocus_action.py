@@ -12,9 +12,9 @@ from dm_msgs.msg import Capabilities
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from dm_autofocus.autofocus_view import FocusedView, Look
+from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
-from dm_autofocus.search import TELLING, Peak, PeakSearch, Phase, SearchConfig
+from dm_autofocus.search import NOISE_POINTS, Peak, PeakSearch, Phase, SearchConfig
 from dm_autofocus.sharpness import Region, check_region
 from dm_autofocus.tracking import TrackConfig, Tracker
 from dm_common.errors import ErrorCode, Refusal
@@ -24,9 +24,9 @@ from dm_common.ros.worker import WorkerActionServer
 MARGIN = 0.002
 
 
-def ready_capabilities(view: FocusedView) -> Capabilities:
+def ready_capabilities(probe: FocusProbe) -> Capabilities:
     """The mirror's capabilities. Raises Refusal when it cannot be focused."""
-    capabilities = view.capabilities
+    capabilities = probe.capabilities
     if capabilities is None:
         raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
     if capabilities.quality == Capabilities.UNCALIBRATED:
@@ -45,21 +45,24 @@ class AutofocusAction:
 
     Args:
         node: hosts the action.
-        view: goes and looks.
+        probe: moves and measures.
         values: parameters of the node.
-        optics: to tell distances.
-        publish: (phase, look): tells others of an image that counted.
+        optics: from curvatures to distances.
+        publish: (phase, sample): publishes an image that counted.
     """
 
     def __init__(
         self,
         node: Node,
-        view: FocusedView,
+        probe: FocusProbe,
         values: Mapping[str, Any],
         optics: FocusOptics,
-        publish: Callable[[Phase, Look], None],
+        publish: Callable[[Phase, SharpnessSample], None],
     ) -> None:
-        self._view, self._values, self._optics, self._publish = view, values, optics, publish
+        self._probe = probe
+        self._values = values
+        self._optics = optics
+        self._publish = publish
         self._server = WorkerActionServer(node, Autofocus, "autofocus", self._run, exclusive="preempt")
 
     @property
@@ -68,30 +71,30 @@ class AutofocusAction:
         return self._server.busy
 
     def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
-        started, view, result = time.monotonic(), self._view, Autofocus.Result()
-        view.start()
+        started, result = time.monotonic(), Autofocus.Result()
+        self._probe.start()
         try:
             config, region = self._config(goal_handle.request)
             peak, config = self._search(goal_handle, config, region)
-            self._tell(result, peak)
+            self._fill(result, peak)
             if goal_handle.request.track:
                 self._track(goal_handle, config, region, peak, result)
             outcome, result.error_code = "succeed", ErrorCode.OK
-            result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_in_words(result.dioptre)}"
+            result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}"
             if peak.at_limit:
                 result.message += "; at the end of the range: the object may lie beyond it"
         except Refusal as error:
             outcome = "canceled" if error.error_code == ErrorCode.CANCELED else "abort"
             result.error_code, result.message = error.error_code, str(error)
         finally:
-            view.release()
-        result.images, result.images_dropped = view.counted, view.dropped
+            self._probe.release()
+        result.images, result.images_dropped = self._probe.counted, self._probe.dropped
         result.duration = time.monotonic() - started
         return outcome, result
 
     def _config(self, goal: Any) -> tuple[SearchConfig, Region]:
         """The search that a goal asks for. Raises Refusal."""
-        values, capabilities = self._values, ready_capabilities(self._view)
+        values, capabilities = self._values, ready_capabilities(self._probe)
         margin = MARGIN * (capabilities.curvature_max - capabilities.curvature_min)
         low, high = capabilities.curvature_min + margin, capabilities.curvature_max - margin
         if goal.curvature_min != 0 or goal.curvature_max != 0:
@@ -110,7 +113,7 @@ class AutofocusAction:
                 low,
                 high,
                 tolerance,
-                max(TELLING, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance))),
+                max(NOISE_POINTS, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance))),
                 values["search.fine_points"],
                 values["search.approach"],
                 values["search.least_contrast"],
@@ -124,23 +127,25 @@ class AutofocusAction:
         Returns:
             The peak, and the search with the range that was possible: it depends on the actuators' history too.
         """
-        before = self._view.curvature
+        before = self._probe.curvature
         search = PeakSearch(config)
         while not search.done:
             step = search.step
             try:
-                look = self._visit(goal_handle, step.curvature, region if step.measured else None)
+                sample = self._visit(goal_handle, step.curvature, region if step.measured else None)
             except Refusal as error:
                 if error.error_code != ErrorCode.UNREACHABLE:
                     raise
                 self._draw_in(search, error)
                 continue
-            if look is None:
+            if sample is None:
                 search.feed(None)
                 continue
             phase = search.phase
-            search.feed(look.sharpness)
-            self._report(goal_handle, phase, look, step.curvature, search.measured, max(config.steps, search.measured))
+            search.feed(sample.sharpness)
+            self._report(
+                goal_handle, phase, sample, step.curvature, search.measured, max(config.steps, search.measured)
+            )
         if search.peak is None:
             if math.isfinite(before):
                 self._visit(goal_handle, before, None)
@@ -165,40 +170,40 @@ class AutofocusAction:
         values = self._values
         trials = TrackConfig(values["track.dither"] * config.tolerance, values["track.drop"], values["track.patience"])
         tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
-        standing = peak.curvature
+        position = peak.curvature
         while True:
             wanted = tracker.step.curvature
-            if wanted != standing:
+            if wanted != position:
                 self._visit(goal_handle, wanted, None)
-                standing = wanted
-            look = self._look(goal_handle, region)
-            tracker.feed(look.sharpness)
-            self._report(goal_handle, Phase.TRACK, look, wanted, 0, 0)
+                position = wanted
+            sample = self._measure(goal_handle, region)
+            tracker.feed(sample.sharpness)
+            self._report(goal_handle, Phase.TRACK, sample, wanted, 0, 0)
             if tracker.lost:
                 try:
                     peak, config = self._search(goal_handle, config, region)
-                    standing = peak.curvature
+                    position = peak.curvature
                 except Refusal as error:
                     if error.error_code != ErrorCode.NOT_CONVERGED:
                         raise
                     # Nothing to see now: what is seen here from now on is the new normal.
-                    peak, standing = Peak(tracker.centre, look.sharpness, False), math.nan
+                    peak, position = Peak(tracker.centre, sample.sharpness, False), math.nan
                 tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
-            self._tell(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
+            self._fill(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
 
-    def _visit(self, goal_handle: ServerGoalHandle, curvature: float, region: Region | None) -> Look | None:
-        """Go to a curvature and, given a region, look."""
-        self._view.go(curvature, lambda: self._told_to_stop(goal_handle))
+    def _visit(self, goal_handle: ServerGoalHandle, curvature: float, region: Region | None) -> SharpnessSample | None:
+        """Go to a curvature and, given a region, measure there."""
+        self._probe.move(curvature, lambda: self._stopping(goal_handle))
         self._check_stop(goal_handle)
-        return None if region is None else self._look(goal_handle, region)
+        return None if region is None else self._measure(goal_handle, region)
 
-    def _look(self, goal_handle: ServerGoalHandle, region: Region) -> Look:
-        look = self._view.look(region, lambda: self._told_to_stop(goal_handle))
+    def _measure(self, goal_handle: ServerGoalHandle, region: Region) -> SharpnessSample:
+        sample = self._probe.measure(region, lambda: self._stopping(goal_handle))
         self._check_stop(goal_handle)
-        assert look is not None  # only a stop leaves without one
-        return look
+        assert sample is not None  # only a stop leaves without one
+        return sample
 
-    def _told_to_stop(self, goal_handle: ServerGoalHandle) -> bool:
+    def _stopping(self, goal_handle: ServerGoalHandle) -> bool:
         return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
 
     def _check_stop(self, goal_handle: ServerGoalHandle) -> None:
@@ -208,21 +213,29 @@ class AutofocusAction:
             raise Refusal(ErrorCode.PREEMPTED, "a newer goal took over")
 
     def _report(
-        self, goal_handle: ServerGoalHandle, phase: Phase, look: Look, curvature: float, step: int, steps: int
+        self,
+        goal_handle: ServerGoalHandle,
+        phase: Phase,
+        sample: SharpnessSample,
+        curvature: float,
+        step: int,
+        steps: int,
     ) -> None:
-        self._publish(phase, look)
+        self._publish(phase, sample)
         goal_handle.publish_feedback(
-            Autofocus.Feedback(phase=int(phase), step=step, steps=steps, curvature=curvature, sharpness=look.sharpness)
+            Autofocus.Feedback(
+                phase=int(phase), step=step, steps=steps, curvature=curvature, sharpness=sample.sharpness
+            )
         )
 
-    def _tell(self, result: Any, peak: Peak) -> None:
+    def _fill(self, result: Any, peak: Peak) -> None:
         result.curvature, result.power, result.at_limit = peak.curvature, 2 * peak.curvature, peak.at_limit
         result.dioptre = self._optics.dioptre_for(peak.curvature)
         result.distance = distance_of(result.dioptre)
         result.sharpness = peak.sharpness
 
 
-def _in_words(dioptre: float) -> str:
+def _distance_text(dioptre: float) -> str:
     """A focus distance for a person."""
     if math.isnan(dioptre):
         return "nearer than any object"

@@ -13,7 +13,7 @@ from rclpy.node import Node
 
 from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities, tolerance_of
 from dm_autofocus.autofocus_parameters import PARAMETERS
-from dm_autofocus.autofocus_view import FocusedView, Look
+from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import FocusOptics, OpticsError, dioptre_of, distance_of
 from dm_autofocus.search import Phase
 from dm_autofocus.sharpness import check_region
@@ -37,15 +37,15 @@ class AutofocusNode(Node):
             self._values["optics.incidence"],
             self._values["optics.pupil_offset"],
         )
-        self._view = FocusedView(self, self._values)
+        self._probe = FocusProbe(self, self._values)
         self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.STATE)
         self._set_focus = self.create_client(SetFocus, "set_focus")
-        self._action = AutofocusAction(self, self._view, self._values, self._optics, self._publish)
+        self._action = AutofocusAction(self, self._probe, self._values, self._optics, self._publish)
         WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance)
         answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
         self.create_service(GetFocusRange, "get_focus_range", answer)
         self._watched: Any = None
-        self._trouble = ""
+        self._image_problem = ""
         if self._values["monitor_rate"] > 0:
             period = 1 / self._values["monitor_rate"]
             self.create_timer(period, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -72,8 +72,8 @@ class AutofocusNode(Node):
             answer = call(self._set_focus, wanted, self._values["move_timeout"])
             response.state = answer.state
             response.error_code, response.message = answer.error_code, answer.message
-            if answer.error_code == ErrorCode.UNREACHABLE and self._view.capabilities is not None:
-                response.message += f"; the camera focuses {self._range_in_words(self._view.capabilities)}"
+            if answer.error_code == ErrorCode.UNREACHABLE and self._probe.capabilities is not None:
+                response.message += f"; the camera focuses {self._range_text(self._probe.capabilities)}"
         except OpticsError as error:
             response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
         except Refusal as error:
@@ -86,7 +86,7 @@ class AutofocusNode(Node):
         self, _request: GetFocusRange.Request, response: GetFocusRange.Response
     ) -> GetFocusRange.Response:
         try:
-            capabilities = ready_capabilities(self._view)
+            capabilities = ready_capabilities(self._probe)
         except Refusal as error:
             response.error_code, response.message = error.error_code, str(error)
             return response
@@ -95,7 +95,7 @@ class AutofocusNode(Node):
         response.distance_far = distance_of(response.dioptre_min)
         response.distance_near = distance_of(response.dioptre_max) if response.dioptre_max > 0 else math.nan
         response.curvature_tolerance = tolerance_of(self._values, capabilities)
-        response.message = self._range_in_words(capabilities)
+        response.message = self._range_text(capabilities)
         return response
 
     def _dioptres(self, capabilities: Capabilities) -> tuple[float, float]:
@@ -103,44 +103,44 @@ class AutofocusNode(Node):
         low, high = (self._optics.dioptre_for(c) for c in (capabilities.curvature_min, capabilities.curvature_max))
         return low, math.inf if math.isnan(high) else high
 
-    def _range_in_words(self, capabilities: Capabilities) -> str:
+    def _range_text(self, capabilities: Capabilities) -> str:
         low, high = self._dioptres(capabilities)
         if high <= 0:
             return f"beyond infinity only ({low:+.4f} to {high:+.4f} dioptre): check optics.rest_distance"
         far = f"{1 / low:.2f} m" if low > 0 else "infinity"
         return f"from {1 / high:.2f} m to {far} ({low:+.4f} to {high:+.4f} dioptre)"
 
-    # --- what this node says ---
+    # --- state ---
 
-    def _publish(self, phase: Phase, look: Look) -> None:
-        curvature = self._view.curvature
-        state = AutofocusState(phase=int(phase), sharpness=look.sharpness, curvature=curvature, power=2 * curvature)
-        state.header = look.header
+    def _publish(self, phase: Phase, sample: SharpnessSample) -> None:
+        curvature = self._probe.curvature
+        state = AutofocusState(phase=int(phase), sharpness=sample.sharpness, curvature=curvature, power=2 * curvature)
+        state.header = sample.header
         state.dioptre = self._optics.dioptre_for(curvature) if math.isfinite(curvature) else math.nan
         state.distance = distance_of(state.dioptre)
         self._state.publish(state)
 
     def _watch(self) -> None:
         """While idle, a figure of the newest image now and then."""
-        image = self._view.newest
+        image = self._probe.newest
         if self._action.busy or image is None or image is self._watched:
             return
         self._watched = image
         try:
-            self._publish(Phase.IDLE, self._view.judge(image, check_region(self._values["region"])))
-            self._trouble = ""
+            self._publish(Phase.IDLE, self._probe.sharpness_of(image, check_region(self._values["region"])))
+            self._image_problem = ""
         except (Refusal, ValueError) as error:
-            self._trouble = str(error)
-            self.get_logger().warning(self._trouble, throttle_duration_sec=5.0)
+            self._image_problem = str(error)
+            self.get_logger().warning(self._image_problem, throttle_duration_sec=5.0)
 
     def _health(self) -> diagnostics.Health:
-        values = {"images_counted": self._view.counted, "images_dropped": self._view.dropped}
+        values = {"images_counted": self._probe.counted, "images_dropped": self._probe.dropped}
         try:
-            ready_capabilities(self._view)
-            if self._view.newest is None:
+            ready_capabilities(self._probe)
+            if self._probe.newest is None:
                 raise Refusal(ErrorCode.TIMEOUT, f"no image on {self.resolve_topic_name('image_raw')} yet")
-            if self._trouble:
-                raise Refusal(ErrorCode.INVALID_ARGUMENT, self._trouble)
+            if self._image_problem:
+                raise Refusal(ErrorCode.INVALID_ARGUMENT, self._image_problem)
         except Refusal as error:
             return diagnostics.Health(diagnostics.WARN, str(error), values)
         return diagnostics.Health(diagnostics.OK, "searching or tracking" if self._action.busy else "ready", values)

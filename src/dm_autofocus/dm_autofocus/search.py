@@ -1,4 +1,4 @@
-"""Search of the sharpest focus: a state machine that is fed sharpness and says where to look next.
+"""Search of the sharpest focus: a state machine that is fed sharpness and says where to measure next.
 
 It knows nothing of cameras, mirrors or time. Whoever drives it goes to `step.curvature`, takes an image there when
 `step.measured` says so, and calls `feed`.
@@ -7,7 +7,7 @@ Coarse to fine [23, 25]: a sweep over the whole range finds the hill, sweeps ove
 a parabola through the best points of the last gives its top. Every sweep, and the final move to the top, first goes to
 the same turning point below: by default the low end of the range. Hysteresis forgets what lies between two turning
 points once it is passed again, so that all of them rise on the same branch. Without that the hill that a long sweep saw
-is not where a short one looks for it. A sweep that sees the hill rise beyond its own end is repeated around that end.
+is not where a short one expects it. A sweep that sees the hill rise beyond its own end is repeated around that end.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 SIGNIFICANCE = 6.0
 #: Standard errors of its mean that the sweep after it must stand above that median, too.
 CONFIRMATION = 3.0
-#: Points from which on noise can be told from a hill.
-TELLING = 11
+#: Points from which on noise can be distinguished from a hill.
+NOISE_POINTS = 11
 #: Sweeps that may be repeated around their own end, per search.
 MOST_SHIFTS = 8
 #: Share of the range that is given up where the mirror refuses its end, and how often.
@@ -116,7 +116,7 @@ class PeakSearch:
     """One search from beginning to end.
 
     Attributes:
-        step: where to look next; after the end, the curvature to stand at.
+        step: where to measure next; after the end, the curvature to stand at.
         config: as given, the range as far as it was not refused.
         phase: COARSE or FINE.
         done: nothing more is to be fed.
@@ -227,13 +227,13 @@ class PeakSearch:
 def _is_hill(seen: np.ndarray, least_contrast: float) -> bool:
     """Whether a sweep rises by the least contrast, and by more than noise does.
 
-    The noise is told from the second differences: those of a hill are small, or large at a few points only, which the
-    median passes over. The top of n points of white noise lies some two standard deviations above their median. Of
-    fewer than TELLING points a hill may take most, and only the contrast counts.
+    The noise is estimated from the second differences: those of a hill are small, or large at a few points only, which
+    the median passes over. The top of n points of white noise lies some two standard deviations above their median. Of
+    fewer than NOISE_POINTS points a hill may take most, and only the contrast counts.
     """
     top = float(seen.max())
     rise = top - float(np.median(seen))
-    significant = len(seen) < TELLING or rise > SIGNIFICANCE * _noise(seen)
+    significant = len(seen) < NOISE_POINTS or rise > SIGNIFICANCE * _noise(seen)
     return float(np.ptp(seen)) > least_contrast * abs(top) and significant
 
 
@@ -243,7 +243,7 @@ def _is_seen_again(coarse: np.ndarray, fine: np.ndarray) -> bool:
     From some ten points the noise comes out far too small now and then: of 1000 sweeps over nothing, five to eight pass
     for a hill, and hardly one of these does so a second time.
     """
-    if len(coarse) < TELLING:
+    if len(coarse) < NOISE_POINTS:
         return True
     above = float(fine.mean()) - float(np.median(coarse))
     return above > CONFIRMATION * _noise(coarse, fine) / math.sqrt(len(fine))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Region = tuple[float, float, float, float]
 WHOLE: Region = (0.0, 0.0, 1.0, 1.0)
 
-#: Pixels that enter one figure at most; of larger regions only every n-th row is looked at.
+#: Pixels that enter one figure at most; of larger regions only every n-th row counts.
 PIXEL_BUDGET = 400_000
 #: Smallest region [px along a side] that has a gradient.
 SMALLEST = 3

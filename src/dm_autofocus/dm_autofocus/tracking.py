@@ -44,7 +44,7 @@ class Tracker:
         centre: where the peak is believed to be [1/m].
         sharpness: the normal sharpness there.
         low, high: range of curvatures [1/m].
-        step: where to look next.
+        step: where to measure next.
         lost: search again.
     """
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dm_tools.output import console, progress_bar, write_json
 
 if TYPE_CHECKING:  # both are slow to import, and `dm --help` needs neither
-    from dm_autofocus.camera_client import CameraFocusClient
+    from dm_autofocus import CameraFocusClient
     from dm_tools.demo.demo import Hysteresis
 
 #: The scene, from left to right [m]. Rest distance and range: between 5 m and infinity for +-0.05 1/m.
@@ -182,7 +182,7 @@ def demo_camera(
     """Calibrate in fast time, then start again in real time with a camera and focus on every object."""
     from dm_msgs.action import Calibrate
 
-    from dm_autofocus.camera_client import CameraFocusClient
+    from dm_autofocus import CameraFocusClient
     from dm_bringup.suite import Suite, own_domain
     from dm_client import STARTING_S, DeformableMirrorClient
     from dm_tools.demo.demo import bench_config

@@ -1,4 +1,4 @@
-"""What `autofocus` does to the mirror and sees of it: go to a curvature, look at it there."""
+"""What `autofocus` does at one curvature: move the focus there and measure the sharpness of the images."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=Reliab
 
 
 @dataclass(frozen=True)
-class Look:
+class SharpnessSample:
     """Sharpness of an image and the header it came with."""
 
     sharpness: float
@@ -40,8 +40,8 @@ def seconds(stamp: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
-class FocusedView:
-    """Moves by `focus_request` and looks through `image_raw`. `go` and `look` wait: call them from a worker thread.
+class FocusProbe:
+    """Moves by `focus_request` and measures on `image_raw`; `move` and `measure` wait: call them from a worker thread.
 
     Args:
         node: hosts the topics.
@@ -50,14 +50,14 @@ class FocusedView:
     Attributes:
         capabilities: the latest; None before the first.
         curvature: as taken last, whoever asked for it [1/m]; NaN before.
-        target: as asked for by `go` last [1/m]; NaN after `release`.
+        target: as asked for by `move` last [1/m]; NaN after `release`.
         newest: the latest image; None before the first.
         counted, dropped: images since `start`.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._values = values
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._gate = SettledGate(values["settle_time"], values["stamp_lead"])
         self.capabilities: Capabilities | None = None
         self.curvature = math.nan
@@ -66,9 +66,9 @@ class FocusedView:
         self._driver: ActuatorState | None = None
         self._answer: FocusState | None = None
         self.target = math.nan
-        self._asked: deque[float] = deque(maxlen=8)  # answers to these are no intrusion, however late
-        self._intruder: float | None = None
-        self._looking = False
+        self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
+        self._other_request: float | None = None  # of another node, since `start` [1/m]
+        self._measuring = False
         self._fresh: Image | None = None
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self._topic = node.resolve_topic_name("image_raw")
@@ -77,23 +77,23 @@ class FocusedView:
         node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         node.create_subscription(Capabilities, "capabilities", self._on_capabilities, qos.LATCHED)
 
-    # --- what comes in ---
+    # --- messages ---
 
     def _on_capabilities(self, message: Capabilities) -> None:
         self.capabilities = message
 
     def _on_image(self, message: Image) -> None:
-        with self._news:
+        with self._changed:
             self.newest = message
-            if not (self._looking and self._gate.open_for(seconds(message.header.stamp))):
+            if not (self._measuring and self._gate.open_for(seconds(message.header.stamp))):
                 self.dropped += 1
                 return
             self.dropped += self._fresh is not None
             self._fresh = message
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def _on_focus_state(self, message: FocusState) -> None:
-        with self._news:
+        with self._changed:
             if message.applied:
                 self.curvature = message.curvature
             if math.isnan(self.target):
@@ -101,16 +101,16 @@ class FocusedView:
             if message.curvature == self.target:
                 self._answer = self._answer or message
             elif message.applied and message.curvature not in self._asked:
-                self._intruder = message.curvature
-            self._news.notify_all()
+                self._other_request = message.curvature
+            self._changed.notify_all()
 
     def _on_actuator_state(self, message: ActuatorState) -> None:
-        with self._news:
+        with self._changed:
             self._driver = message
-            self._tell_gate()
-            self._news.notify_all()
+            self._update_gate()
+            self._changed.notify_all()
 
-    def _tell_gate(self) -> None:
+    def _update_gate(self) -> None:
         answer, driver = self._answer, self._driver
         if answer is None or driver is None or not answer.applied:
             return
@@ -118,20 +118,20 @@ class FocusedView:
         reached = len(driver.requested) == len(wanted) and bool(np.allclose(driver.requested, wanted, atol=1e-9))
         self._gate.written(seconds(driver.header.stamp), driver.moving, reached)
 
-    # --- what is done ---
+    # --- moving and measuring ---
 
     def start(self) -> None:
         """The mirror is this node's until `release`; count images from here."""
-        self._intruder = None
+        self._other_request = None
         self.counted = self.dropped = 0
 
-    def go(self, curvature: float, stop: Callable[[], bool] = lambda: False) -> None:
+    def move(self, curvature: float, stop: Callable[[], bool] = lambda: False) -> None:
         """Ask for a curvature [1/m] and wait until its shape stands. Returns early when `stop()`.
 
         Raises:
             Refusal: refused, no answer, another node moves the mirror, or the move does not end.
         """
-        with self._news:
+        with self._changed:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
             self._answer, self.target = None, curvature
             self._asked.append(curvature)
@@ -146,41 +146,41 @@ class FocusedView:
             return
         if not answer.applied:
             raise Refusal(answer.error_code or ErrorCode.INTERNAL, answer.message)
-        with self._news:
+        with self._changed:
             self._gate.sent(seconds(answer.header.stamp), answer.predicted_duration)
-            self._tell_gate()
+            self._update_gate()
         if not self._wait(lambda: math.isfinite(self._gate.settled_at), limit, stop):
             reason = self._driver.message if self._driver is not None else "no actuator_state from pdm_driver"
             raise Refusal(ErrorCode.TIMEOUT, f"the move did not end within {limit:g} s: {reason}")
 
     def release(self) -> None:
         """The mirror may be moved by others from here on."""
-        self.target, self._intruder = math.nan, None
+        self.target, self._other_request = math.nan, None
 
-    def look(self, region: Region, stop: Callable[[], bool] = lambda: False) -> Look | None:
+    def measure(self, region: Region, stop: Callable[[], bool] = lambda: False) -> SharpnessSample | None:
         """Median sharpness of the next images that show the settled shape; None when `stop()`.
 
         Raises:
             Refusal: no such image came in time, or it cannot be used.
         """
-        looks: list[Look] = []
-        with self._news:
-            self._fresh, self._looking = None, True
+        samples: list[SharpnessSample] = []
+        with self._changed:
+            self._fresh, self._measuring = None, True
         try:
-            while len(looks) < self._values["images_per_step"]:
+            while len(samples) < self._values["images_per_step"]:
                 if not self._wait(lambda: self._fresh is not None, self._values["image_timeout"], stop):
-                    raise Refusal(ErrorCode.TIMEOUT, self._why_no_image())
-                with self._news:
+                    raise Refusal(ErrorCode.TIMEOUT, self._no_image_reason())
+                with self._changed:
                     message, self._fresh = self._fresh, None
                 if message is None:
                     return None
-                looks.append(self.judge(message, region))
+                samples.append(self.sharpness_of(message, region))
                 self.counted += 1
         finally:
-            self._looking = False
-        return Look(statistics.median(look.sharpness for look in looks), looks[-1].header)
+            self._measuring = False
+        return SharpnessSample(statistics.median(sample.sharpness for sample in samples), samples[-1].header)
 
-    def judge(self, message: Image, region: Region) -> Look:
+    def sharpness_of(self, message: Image, region: Region) -> SharpnessSample:
         """Sharpness of an image in a region.
 
         Raises:
@@ -190,24 +190,24 @@ class FocusedView:
             sharpness = METRICS[self._values["metric"]](cut(grey(message), region))
         except (ImageError, ValueError) as error:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self._topic}: {error}") from error
-        return Look(sharpness, message.header)
+        return SharpnessSample(sharpness, message.header)
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
         """Wait for a condition or `stop()`; False when neither came in time. Raises Refusal on another's move."""
         deadline = time.monotonic() + timeout_s
-        with self._news:
+        with self._changed:
             while not (condition() or stop()):
-                if self._intruder is not None:
+                if self._other_request is not None:
                     raise Refusal(
                         ErrorCode.PREEMPTED,
-                        f"another node asked for a curvature of {self._intruder:+.4f} 1/m meanwhile",
+                        f"another node asked for a curvature of {self._other_request:+.4f} 1/m meanwhile",
                     )
                 if time.monotonic() > deadline:
                     return False
-                self._news.wait(0.05)  # `stop` gives no notice
+                self._changed.wait(0.05)  # `stop` gives no notice
         return True
 
-    def _why_no_image(self) -> str:
+    def _no_image_reason(self) -> str:
         text = f"no image of the settled focus on {self._topic} within {self._values['image_timeout']:g} s: "
         if self.newest is None:
             return text + "none came at all; is the camera running?"
