@@ -39,12 +39,3 @@ def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., NodeProcess]]:
     for process in reversed(started):
         if process.running:
             process.stop()
-
-
-@pytest.fixture(scope="session")
-def samples() -> Path:
-    """The folder of real ZYGO maps beside the checkout; tests that need it are skipped where it is absent."""
-    folder = Path(__file__).resolve().parents[2] / "shared" / "samples"
-    if not folder.is_dir():
-        pytest.skip("no folder of real sample maps beside the checkout")
-    return folder

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, datx, read_map
-from map_fixtures import ATTRIBUTES_PATH, SURFACE_PATH, WAVELENGTH, write_datx
+from map_fixtures import ATTRIBUTES_PATH, NO_DATA, ORACLE_MISSING, SURFACE_PATH, WAVELENGTH, disc_counts, write_datx
 
 INVALID = 1.7976931348623157e308
 FRINGES = np.array([[0.0, 0.25, INVALID], [-1.5, 2.0, 0.125]])
@@ -50,6 +50,19 @@ def test_lengths_are_not_scaled_again(tmp_path: Path, unit: str, metres: float) 
     values = np.where(FRINGES < INVALID, FRINGES, 3.2e38).astype("f4")
     write_datx(path, values, unit, attributes={"No Data": np.array([3.0e38])})
     np.testing.assert_allclose(read_map(path).sag, SAG * metres, rtol=1e-7)
+
+
+def test_an_independent_reader_agrees(tmp_path: Path) -> None:
+    """The file made here is legal: a program that shares nothing with this suite reads the same heights."""
+    topography = pytest.importorskip("SurfaceTopography", reason=ORACLE_MISSING)
+    path = tmp_path / "a.datx"
+    counts = disc_counts(64)
+    values = np.where(counts < NO_DATA, 0.25 * counts, INVALID)
+    converter = np.dtype([("Category", h5py.string_dtype()), ("BaseUnit", h5py.string_dtype()), ("P", "f8", (4,))])
+    height = np.array([(b"HeightCat", b"NanoMeters", [0, WAVELENGTH, 0.5, 1.0])], dtype=converter)
+    write_datx(path, values, "NanoMeters", attributes={"Z Converter": height})
+    other = topography.read_topography(str(path), format="datx").to_unit("m").heights()
+    np.testing.assert_allclose(read_map(path).sag, np.ma.filled(other.astype(float), np.nan).T, rtol=1e-12)
 
 
 def test_pitch_from_the_attributes_when_the_converters_are_not_calibrated(tmp_path: Path) -> None:
