@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
-from dm_calibration.hysteresis.identify import CANDIDATES
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.event_frames import map_hashes, record_hash

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
-from dm_calibration.hysteresis.identify import CANDIDATES
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure

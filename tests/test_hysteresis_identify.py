@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import expected_accuracy
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
 from dm_calibration.hysteresis.excitation import excitation
-from dm_calibration.hysteresis.identify import CANDIDATES, ExcitationError, Identification, Run, identify
+from dm_calibration.hysteresis.identify import ExcitationError, Identification, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from linear_mirror import make_mirror

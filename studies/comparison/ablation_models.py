@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import fit_remembering
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
-from dm_calibration.hysteresis.identify import CANDIDATES
 from dm_calibration.influence.fit import FitOptions
 from dm_common.hysteresis.tracker import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook

@@ -36,7 +36,7 @@ class Memory:
     def __init__(self, samples: Samples) -> None:
         maps, fit, config = samples.calibration.maps, samples.fit, samples.bench.config
         run = RunHistory(maps, maps.applied @ fit.influence_sag.T + fit.sag_offset)
-        self._weights = run.fit(run.usable).weights[1 : 1 + len(PLAY_RADII)]
+        self._weights = run.fit(run.usable).hysteresis.play_weight[1:, 0]
         self._radius = np.array(PLAY_RADII)[:, None]
         self._share, self._age = config.creep, config.settle_time + config.exposure
         count = maps.applied.shape[1]

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from dm_calibration.influence import quality
-from dm_calibration.influence.drift import drift_columns
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import METHODS, TooFewMapsError, make_design
+from dm_calibration.influence.regression import METHODS, TooFewMapsError, drift_columns, make_design
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror

@@ -9,13 +9,8 @@ import pytest
 import statsmodels.api as sm
 
 from dm_calibration.regression.f_statistic import adjusted_r2_of_f, p_of_f
-from dm_calibration.regression.stepwise import (
-    CollinearError,
-    SelectionOptions,
-    TooFewSamplesError,
-    leave_one_out,
-    stepwise,
-)
+from dm_calibration.regression.sample_checks import CollinearError, TooFewSamplesError
+from dm_calibration.regression.stepwise import SelectionOptions, leave_one_out, stepwise
 
 NAMES = [f"x{k}" for k in range(58)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOpt
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.hysteresis.model import follow
 from dm_common.messages import hysteresis_model_from, recipe_book_from
-from dm_common.mirror import NEIGHBOUR_REACH, Mirror
+from linear_mirror import make_mirror
 
 Floats = NDArray[np.float64]
 
@@ -107,10 +108,7 @@ def test_a_run_that_was_cut_off_goes_on(store: CalibrationStore) -> None:
         shutil.copyfile(STORED / name, folder / name)
     os.utime(folder / "events")
     linear = store.load("linear")
-    places = np.column_stack((linear.actuator_x, linear.actuator_y))
-    distance = np.linalg.norm(places[:, None] - places, axis=2)
-    neighbours = np.argwhere(np.triu(distance < NEIGHBOUR_REACH * 4.3e-3, 1))
-    mirror = Mirror(linear.mirror_name, linear.mirror_serial, *places.T, linear.aperture_radius, neighbours=neighbours)
+    mirror = replace(make_mirror(rings=1), x=linear.actuator_x, y=linear.actuator_y)  # to the last bit
     plan = make_plan(PlanKind.POKES, mirror)
     identity = identity_of(plan, PlanOptions(), mirror, {"settle_time_s": 0.5}, {"wiring": "w"})
     with UnfinishedRuns(store.folder) as runs:

@@ -7,20 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dm_calibration.hysteresis.features import play_features
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.regression.f_statistic import adjusted_r2_of_f, p_of_f
 from dm_calibration.regression.predictor import fit_predictor
-from dm_calibration.regression.sag_history import CREEP_TIMES, PLAY_RADII, RunHistory, effective_signals
-from dm_calibration.regression.stepwise import SelectionOptions, TooFewSamplesError
-from dm_calibration.regression.surface_error import (
-    MODEL,
-    TEST_SET,
-    Reading,
-    SurfaceErrors,
-    regress_surface_errors,
-    surface_errors,
-    surface_weights,
-)
+from dm_calibration.regression.sag_history import RunHistory
+from dm_calibration.regression.sample_checks import TooFewSamplesError
+from dm_calibration.regression.stepwise import SelectionOptions
+from dm_calibration.regression.surface_error import MODEL, TEST_SET, Reading, regress_surface_errors
+from dm_calibration.regression.surface_samples import SurfaceErrors, surface_errors, surface_weights
 from dm_common.names import UnknownNameError
 from dm_common.optics.sag import remove_piston_tilt
 from dm_common.optics.zernike import basis
@@ -133,17 +128,12 @@ def test_bad_input_is_refused_in_words() -> None:
         SurfaceErrors(("p01",), np.zeros((1, 3)), np.zeros((1, 21)), np.full((1, 10), np.nan))
 
 
-def test_effective_signals_by_hand() -> None:
+def test_play_operators_by_hand() -> None:
     applied = np.array([[0.0], [1.0], [0.8], [-1.0]])
-    features = effective_signals(applied, np.array([0.0, 3.0, 6.0, 9.0]))[:, :, 0]
-    assert features.shape == (4, 1 + len(PLAY_RADII) + len(CREEP_TIMES))
+    features = play_features(applied, np.array([0.0, 0.05, 0.5]), 1)[:, :, 0]
     assert features[:, 0] == pytest.approx(applied[:, 0])
-    wide = 1 + PLAY_RADII.index(0.5)
-    assert features[:, wide] == pytest.approx([0.0, 0.5, 0.5, -0.5])  # 0.8 lies inside the play
-    narrow = 1 + PLAY_RADII.index(0.05)
-    assert features[:, narrow] == pytest.approx([0.0, 0.95, 0.85, -0.95])
-    quick = 1 + len(PLAY_RADII)
-    assert features[1, quick] == pytest.approx(1.0 - np.exp(-3.0 / CREEP_TIMES[0]))
+    assert features[:, 1] == pytest.approx([0.0, 0.95, 0.85, -0.95])
+    assert features[:, 2] == pytest.approx([0.0, 0.5, 0.5, -0.5])  # 0.8 lies inside the play
 
 
 def test_the_law_of_a_known_hysteresis_is_found() -> None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.identify import CANDIDATES, Candidate, Identification, Run, identify
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
+from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import responses_of
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of
 from dm_calibration.influence.fit import PISTON_TILT

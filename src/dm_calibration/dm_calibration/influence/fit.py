@@ -2,8 +2,8 @@
 
 The model is ``c = c0 + G s`` for the Zernike coefficients (Eq. 6 in [1]) and ``z = z0 + H s`` for the sag at the
 sampling points. Both are regressions on the same design: the applied signals and a figure that drifts from reference
-frame to reference frame (see :mod:`~dm_calibration.influence.drift`). An interferometer does not know piston and tilt,
-so they are removed, area-weighted, from every sag vector before the fit and from every residual that is reported.
+frame to reference frame (see :mod:`~dm_calibration.influence.regression`). An interferometer does not know piston and
+tilt, so they are removed, area-weighted, from every sag vector before the fit and from every residual that is reported.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence import quality, screening
 from dm_calibration.influence.gaps import regress, usable_sag
-from dm_calibration.influence.limitations import limitations
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GradeOptions
 from dm_calibration.influence.region_weighting import choose_weighting, weighted_coefficients
@@ -259,5 +258,5 @@ def _judge(
         signal_covariance=covariance,
         grades=grades,
         drift_rms=float(np.sqrt(np.mean(np.square(rms(figure_sag - figure_sag.mean(axis=0), weight))))),
-        limitations=(*limitations(good, design, grades, tilt_known, untested), *remarks),
+        limitations=(*quality.limitations(good, design, grades, tilt_known, untested), *remarks),
     )

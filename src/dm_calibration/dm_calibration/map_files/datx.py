@@ -10,7 +10,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.map_files.datx_structure import SIGNATURE, check_end, check_place, check_storage
+from dm_calibration.map_files.datx_structure import (
+    SIGNATURE,
+    as_text,
+    check_end,
+    check_place,
+    check_storage,
+    read_values,
+)
 from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
@@ -34,13 +41,8 @@ _NO_DATA_LEAST = 1e30
 #: Rows of /MetaData; real files have some dozens.
 _LINKS_MAX = 10_000
 
-#: Smaller values, in any unit, are no heights, by bytes per value: the shortest length in use, 1 pm, is 1e-12 m.
-_LEAST_HEIGHT = {4: 1e-30, 8: 1e-200}
-
 #: Two witnesses of one value may differ by this much (one is sometimes stored in single precision).
 _AGREEMENT = 1e-6
-
-_FILTER_NAMES = {h5py.h5z.FILTER_SZIP: "Szip", h5py.h5z.FILTER_DEFLATE: "gzip"}
 
 #: Pitches along x and y may differ by this much before pixels count as not square.
 _SQUARE_TOLERANCE = 0.01
@@ -97,7 +99,7 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     pitch = _pitch(surface, extra)
     _check_witnesses(surface, extra, wavelength)
 
-    sag = _read(surface)
+    sag = read_values(surface)
     invalid = ~np.isfinite(sag)
     if not math.isnan(no_data):
         with np.errstate(invalid="ignore"):
@@ -128,12 +130,6 @@ def _missing(where: Any, name: str) -> MapFileError:
     return MapFileError(f"{where.name}: the attribute '{name}' is missing")
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, bytes):
-        return value.decode("latin-1")
-    return str(value).encode("utf-8", "backslashreplace").decode()  # h5py marks bytes that are no text as surrogates
-
-
 def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
     """The table /MetaData as {(source, link): destination}."""
     table = _object(file, "/MetaData")
@@ -141,7 +137,7 @@ def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
         raise MapFileError("/MetaData: must be a table of Source, Link and Destination")
     if not 0 < (table.size or 0) <= _LINKS_MAX or table.external or table.is_virtual:
         raise MapFileError(f"/MetaData: {table.size} rows: must be 1 to {_LINKS_MAX}, stored in the file")
-    return {(_text(source), _text(link)): _text(destination) for source, link, destination in table[()]}
+    return {(as_text(source), as_text(link)): as_text(destination) for source, link, destination in table[()]}
 
 
 def _path(metadata: dict[tuple[str, str], str], what: str) -> str:
@@ -201,14 +197,14 @@ def _extra_number(extra: dict[str, Any], name: str) -> float | None:
 
 def _extra_text(extra: dict[str, Any], name: str) -> str:
     value = extra.get(name)
-    return _text(value[0]).strip() if value is not None and value.size == 1 else ""
+    return as_text(value[0]).strip() if value is not None and value.size == 1 else ""
 
 
 def _truth(value: NDArray[Any] | None) -> bool | None:
     """Yes or no from 0/1, a boolean or a word; None when it is neither."""
     if value is None or value.size != 1:
         return None
-    word = _text(value[0]).strip().lower()
+    word = as_text(value[0]).strip().lower()
     return {"0": False, "false": False, "off": False, "1": True, "true": True, "on": True}.get(word)
 
 
@@ -216,7 +212,7 @@ def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
     """m per stored unit: S O W for fringes, a plain length otherwise (already scaled by Mx)."""
     if "Unit" not in surface.attrs:
         raise _missing(surface, "Unit")
-    unit = _text(np.asarray(surface.attrs["Unit"]).ravel()[0])
+    unit = as_text(np.asarray(surface.attrs["Unit"]).ravel()[0])
     if unit.lower() in _LENGTHS:
         return _LENGTHS[unit.lower()]
     if unit.lower() != "fringes":
@@ -295,37 +291,3 @@ def _converter(surface: h5py.Dataset, name: str) -> list[float] | None:
         return [float(value) for value in np.asarray(surface.attrs[name]).ravel()[0][2]]
     except (IndexError, TypeError, ValueError):
         raise MapFileError(f"{surface.name}: attribute '{name}': must hold category, unit and parameters") from None
-
-
-def _read(surface: h5py.Dataset) -> NDArray[np.float64]:
-    """The stored values as (height, width) float64.
-
-    Raises:
-        MapFileError: a compression filter is not available.
-    """
-    properties = surface.id.get_create_plist()
-    for index in range(properties.get_nfilters()):
-        identifier, _flags, _values, name = properties.get_filter(index)
-        if not h5py.h5z.filter_avail(identifier):
-            label = _FILTER_NAMES.get(identifier) or _text(name) or f"number {identifier}"
-            raise MapFileError(
-                f"{surface.name}: compressed with the HDF5 filter {label}, which this h5py lacks; "
-                "save the map uncompressed or as .dat, or install an HDF5 library with that filter"
-            )
-    stored = surface[()]
-    _check_foreign(surface, stored)
-    return stored.astype(np.float64, copy=False)
-
-
-def _check_foreign(surface: h5py.Dataset, stored: NDArray[Any]) -> None:
-    """Refuse heights that are the file's own bookkeeping: the place of the data has no second witness.
-
-    A damaged address lets the data begin a little earlier or later, among counts and addresses. As floating-point
-    numbers these are smaller than any height could be.
-    """
-    if stored.dtype.kind != "f":
-        return
-    least = _LEAST_HEIGHT[stored.dtype.itemsize]
-    size = np.abs(stored)
-    if ((size < least) & (size > 0)).any():
-        raise MapFileError(f"{surface.name}: holds values smaller than {least:g} other than 0, which are no heights")

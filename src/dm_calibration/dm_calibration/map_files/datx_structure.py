@@ -1,13 +1,14 @@
-"""Checks of a `.datx` file's structure, before memory is claimed for what it promises."""
+"""The structure of a `.datx` file, checked before memory is claimed for what it promises, and its values."""
 
 from __future__ import annotations
 
 import math
 import struct
-from typing import Final
+from typing import Any, Final
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from dm_calibration.map_files.surface_map import MapFileError
 
@@ -20,6 +21,11 @@ _END_ADDRESS = {0: 40, 1: 44, 2: 28, 3: 28}
 
 #: Deflate, the densest filter that Mx uses, cannot shrink data further [bytes per byte].
 _DENSEST = 1032
+
+#: Smaller values, in any unit, are no heights, by bytes per value: the shortest length in use, 1 pm, is 1e-12 m.
+_LEAST_HEIGHT = {4: 1e-30, 8: 1e-200}
+
+_FILTER_NAMES = {h5py.h5z.FILTER_SZIP: "Szip", h5py.h5z.FILTER_DEFLATE: "gzip"}
 
 
 def check_end(content: bytes) -> None:
@@ -100,3 +106,43 @@ def _other_values(surface: h5py.Dataset, first: int, last: int) -> bool:
 
     surface.file.visititems(look)
     return any(found)
+
+
+def read_values(surface: h5py.Dataset) -> NDArray[np.float64]:
+    """The stored values as (height, width) float64.
+
+    Raises:
+        MapFileError: a compression filter is not available.
+    """
+    properties = surface.id.get_create_plist()
+    for index in range(properties.get_nfilters()):
+        identifier, _flags, _values, name = properties.get_filter(index)
+        if not h5py.h5z.filter_avail(identifier):
+            label = _FILTER_NAMES.get(identifier) or as_text(name) or f"number {identifier}"
+            raise MapFileError(
+                f"{surface.name}: compressed with the HDF5 filter {label}, which this h5py lacks; "
+                "save the map uncompressed or as .dat, or install an HDF5 library with that filter"
+            )
+    stored = surface[()]
+    _check_foreign(surface, stored)
+    return stored.astype(np.float64, copy=False)
+
+
+def _check_foreign(surface: h5py.Dataset, stored: NDArray[Any]) -> None:
+    """Refuse heights that are the file's own bookkeeping: the place of the data has no second witness.
+
+    A damaged address lets the data begin a little earlier or later, among counts and addresses. As floating-point
+    numbers these are smaller than any height could be.
+    """
+    if stored.dtype.kind != "f":
+        return
+    least = _LEAST_HEIGHT[stored.dtype.itemsize]
+    size = np.abs(stored)
+    if ((size < least) & (size > 0)).any():
+        raise MapFileError(f"{surface.name}: holds values smaller than {least:g} other than 0, which are no heights")
+
+
+def as_text(value: Any) -> str:
+    if isinstance(value, bytes):
+        return value.decode("latin-1")
+    return str(value).encode("utf-8", "backslashreplace").decode()  # h5py marks bytes that are no text as surrogates

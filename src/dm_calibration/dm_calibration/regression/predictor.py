@@ -17,9 +17,10 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.surfaces import MODEL_NAMES
 from dm_calibration.influence.weights import surface_control_error
-from dm_calibration.regression.sag_history import RunHistory, SagLaw, effective_signals
+from dm_calibration.regression.sag_history import RunHistory, SagModel
 from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import ErrorRegression, Reading, regress_surface_errors
+from dm_common.hysteresis.model import follow
 from dm_common.optics.sag import rms
 
 Floats = NDArray[np.float64]
@@ -37,13 +38,13 @@ class ErrorPredictor:
     Attributes:
         influence: the influence function that nominal surfaces come from.
         regression: of the reading HISTORY, fitted to all surfaces p01-p58.
-        law: of the sag, from all good maps.
+        sag: from commands, by all good maps.
         histories: (1 + COMMANDS, HISTORIES, N) normalised; the first is rest, for creep has died away there.
     """
 
     influence: InfluenceFit
     regression: ErrorRegression
-    law: SagLaw
+    sag: SagModel
     histories: Floats
 
     def predict(self, signals: Floats) -> tuple[float, float, float]:
@@ -63,13 +64,14 @@ class ErrorPredictor:
         commands, count, actuators = self.histories.shape
         applied = np.concatenate((self.histories, np.broadcast_to(signals, (1, count, actuators))))
         # Histories side by side, as if each had a mirror of its own.
-        features = effective_signals(applied.reshape(commands + 1, -1), DWELL * np.arange(commands + 1))[-1]
-        effective = (self.law.weights @ features).reshape(count, actuators)
-        sag = self.law.figure[-1] + effective @ self.law.influence
+        model = self.sag.hysteresis
+        rested = model.demagnetised(count * actuators, 0.0)
+        effective, _ = follow(model, rested, applied.reshape(commands + 1, -1), DWELL * np.arange(commands + 1))
+        sag = self.sag.figure[-1] + effective[-1].reshape(count, actuators) @ self.sag.influence
         same = np.broadcast_to(signals, (count, actuators))
         fit = self.influence
-        model = rms(surface_control_error(sag, same, fit.influence_zernike, fit.points), fit.points.weight)
-        mean, lower, upper = self.regression.fit.predict(np.column_stack((model, same)))
+        size = rms(surface_control_error(sag, same, fit.influence_zernike, fit.points), fit.points.weight)
+        mean, lower, upper = self.regression.fit.predict(np.column_stack((size, same)))
         return (
             max(float(mean.mean()), 0.0),
             max(float(np.percentile(lower, 2.5)), 0.0),
@@ -89,8 +91,8 @@ def fit_predictor(
         As :func:`~dm_calibration.regression.surface_error.regress_surface_errors`.
     """
     regression = regress_surface_errors(maps, influence, Reading.HISTORY, options, test_set=())
-    law = RunHistory(maps, influence.sag_offset + maps.applied @ influence.influence_sag.T).fit(influence.used)
-    return ErrorPredictor(influence, regression, law, _histories(maps, influence, np.random.default_rng(seed)))
+    sag = RunHistory(maps, influence.sag_offset + maps.applied @ influence.influence_sag.T).fit(influence.used)
+    return ErrorPredictor(influence, regression, sag, _histories(maps, influence, np.random.default_rng(seed)))
 
 
 def _histories(maps: MapSet, influence: InfluenceFit, rng: np.random.Generator) -> Floats:

@@ -20,31 +20,22 @@ import statsmodels.api as sm
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, stats
 
-from dm_common.errors import ErrorCode
+from dm_calibration.regression.sample_checks import (
+    CONSTANT,
+    TOLERANCE,
+    check_collinear,
+    check_freedom,
+    checked,
+    checked_weights,
+)
 
 Floats = NDArray[np.float64]
 
 P_ENTER = 0.05
 P_REMOVE = 0.10
-#: Share of a candidate's variation not explained by those selected, below which it brings nothing of its own.
-TOLERANCE = 1e-8
 #: Degrees of freedom that must be left for the residual: with more candidates than samples, a selection that runs on
 #: until none is left fits anything.
 FREEDOM_MIN = 10
-#: Spread of values, relative to their size, below which they count as constant.
-CONSTANT = 1e-12
-
-
-class CollinearError(ValueError):
-    """Candidates that cannot be told apart, or from the constant; the message names them."""
-
-    error_code = ErrorCode.TOO_FEW_MAPS
-
-
-class TooFewSamplesError(ValueError):
-    """Fewer samples than a regression needs."""
-
-    error_code = ErrorCode.TOO_FEW_MAPS
 
 
 @dataclass(frozen=True)
@@ -128,7 +119,7 @@ class StepwiseFit:
         if not 0.0 < level < 1.0:
             raise ValueError(f"level = {level:g}: must be above 0 and below 1; 0.95 is usual")
         design = np.column_stack((np.ones(len(x)), x[:, list(self.columns)]))
-        w = np.ones(len(x)) if weights is None else _checked_weights(weights, len(x))
+        w = np.ones(len(x)) if weights is None else checked_weights(weights, len(x))
         mean = design @ self.parameters
         variance = 1.0 / w + np.einsum("ij,jk,ik->i", design, self.covariance, design)
         reach = stats.t.ppf(0.5 + 0.5 * level, self.n - self.k - 1) * self.residual_sd * np.sqrt(variance)
@@ -158,9 +149,9 @@ def stepwise(
         ValueError: shapes that disagree, values that are not finite, a constant response, weights not above 0.
     """
     options = options or SelectionOptions()
-    x, y, w = _checked(candidates, response, names, weights)
-    _check_freedom(len(y), options)
-    _check_collinear(x, names)
+    x, y, w = checked(candidates, response, names, weights)
+    check_freedom(len(y), options.freedom_min)
+    check_collinear(x, names)
     return _fit(x, y, w, names, _select(x, y, w, options), weights is not None)
 
 
@@ -177,8 +168,8 @@ def leave_one_out(
         TooFewSamplesError: as :func:`stepwise`, for one sample fewer.
     """
     options = options or SelectionOptions()
-    x, y, w = _checked(candidates, response, names, weights)
-    _check_freedom(len(y) - 1, options)
+    x, y, w = checked(candidates, response, names, weights)
+    check_freedom(len(y) - 1, options.freedom_min)
     predicted = np.empty(len(y))
     for row in range(len(y)):
         keep = np.arange(len(y)) != row
@@ -188,75 +179,6 @@ def leave_one_out(
         parameters = np.linalg.lstsq(root[:, np.newaxis] * design[keep], root * y[keep], rcond=None)[0]
         predicted[row] = design[row] @ parameters
     return predicted
-
-
-def _checked(
-    candidates: ArrayLike, response: ArrayLike, names: Sequence[str], weights: ArrayLike | None
-) -> tuple[Floats, Floats, Floats]:
-    x, y = np.asarray(candidates, dtype=float), np.asarray(response, dtype=float)
-    if x.ndim != 2 or y.shape != (len(x),) or x.shape[1] != len(names):
-        raise ValueError(
-            f"candidates {x.shape}, response {y.shape}, {len(names)} names: must be (n, C), (n,) and C names"
-        )
-    if len(set(names)) != len(names):
-        raise ValueError("names of candidates must be unique")
-    bad = np.argwhere(~np.isfinite(x))
-    if len(bad):
-        raise ValueError(f"candidate {names[bad[0, 1]]}, sample {bad[0, 0] + 1}: not finite; leave the sample out")
-    if not np.isfinite(y).all():
-        raise ValueError(f"response of sample {int(np.argmin(np.isfinite(y))) + 1}: not finite; leave the sample out")
-    if not y.size or np.ptp(y) <= CONSTANT * np.abs(y).max():
-        raise ValueError(
-            "the response is the same for all samples, so there is nothing to explain: use samples that differ"
-        )
-    return x, y, np.ones(len(y)) if weights is None else _checked_weights(weights, len(y))
-
-
-def _checked_weights(weights: ArrayLike, n: int) -> Floats:
-    w = np.asarray(weights, dtype=float)
-    if w.shape != (n,) or not (np.isfinite(w) & (w > 0.0)).all():
-        raise ValueError(f"weights: must be {n} finite numbers above 0, one per sample")
-    return w
-
-
-def _check_freedom(n: int, options: SelectionOptions) -> None:
-    needed = options.freedom_min + 2
-    if n < needed:
-        raise TooFewSamplesError(
-            f"{n} samples: a constant, one variable and {options.freedom_min} degrees of freedom for the residual need "
-            f"at least {needed}; measure more surfaces"
-        )
-
-
-def _check_collinear(x: Floats, names: Sequence[str]) -> None:
-    if not x.shape[1]:
-        return
-    centred = x - x.mean(axis=0)
-    size = np.linalg.norm(centred, axis=0)
-    constant = np.flatnonzero(size <= CONSTANT * np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny))
-    if constant.size:
-        raise CollinearError(
-            f"candidate {names[constant[0]]} is the same for all samples, which the constant says already: "
-            "leave it out, or add samples in which it differs"
-        )
-    unit = centred / size
-    likeness = np.triu(np.abs(unit.T @ unit), 1)
-    alike = np.argwhere(likeness > 1.0 - 0.5 * TOLERANCE)
-    if len(alike):
-        one, other = alike[0]
-        raise CollinearError(
-            f"candidates {names[one]} and {names[other]} are proportional over all samples: leave one of them out, or "
-            "add samples in which they differ"
-        )
-    if len(x) > x.shape[1] + 1:
-        _, r, order = linalg.qr(unit, mode="economic", pivoting=True)
-        diagonal = np.abs(np.diag(r))
-        dependent = order[diagonal < np.sqrt(TOLERANCE)]
-        if dependent.size:
-            listed = ", ".join(sorted(names[column] for column in dependent))
-            raise CollinearError(
-                f"the other candidates determine {listed}: leave out as many, or add samples that tell them apart"
-            )
 
 
 def _select(x: Floats, y: Floats, w: Floats, options: SelectionOptions) -> list[int]:

@@ -49,27 +49,29 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.surfaces import TABLE_1
-from dm_calibration.influence.weights import region_weights, surface_control_error
+from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.stepwise import (
     P_ENTER,
     P_REMOVE,
     SelectionOptions,
     StepwiseFit,
-    TooFewSamplesError,
     leave_one_out,
     stepwise,
 )
+from dm_calibration.regression.surface_samples import (
+    SURFACES,
+    SurfaceErrors,
+    surface_errors,
+    surface_rows,
+    surface_weights,
+)
 from dm_common.names import unknown_name
 from dm_common.optics.sag import rms
-from dm_common.optics.sample_regions import regional_rms
 from dm_common.optics.zernike import TERM_RMS, basis
 
 Floats = NDArray[np.float64]
 
-#: p01 to p58; the Zernike surfaces are not part of the regression.
-SURFACES = tuple(name for name in TABLE_1 if not name.startswith("pz"))
 #: Test set of [1].
 TEST_SET = ("p04", "p09", "p16", "p34", "p44", "p47", "p51", "p55")
 #: Folds in which the training surfaces are left out of the fits that `model` comes from.
@@ -85,35 +87,6 @@ class Reading(Enum):
     COMMAND = "command"
     MEASURED = "measured"
     HISTORY = "history"
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceErrors:
-    """The sample surfaces of a calibration with their errors.
-
-    Attributes:
-        labels: (M,) of p01-p58.
-        signals: (M, N) as applied.
-        coefficients: (M, 21) m, as measured.
-        regional: (M, R) m, rms surface control error inside concentric regions, the whole aperture last.
-    """
-
-    labels: tuple[str, ...]
-    signals: Floats
-    coefficients: Floats
-    regional: Floats
-
-    def __post_init__(self) -> None:
-        count = len(self.labels)
-        for name in ("signals", "coefficients", "regional"):
-            value = getattr(self, name)
-            if value.ndim != 2 or len(value) != count or not np.isfinite(value).all():
-                raise ValueError(f"{name} has the shape {value.shape}: must be {count} rows of finite numbers")
-
-    @property
-    def response(self) -> Floats:
-        """(M,) m, rms surface control error over the whole aperture."""
-        return np.asarray(self.regional[:, -1])
 
 
 @dataclass(frozen=True)
@@ -177,38 +150,6 @@ class ErrorRegression:
     table3: tuple[Table3Row, ...]
 
 
-def surface_errors(maps: MapSet, fit: InfluenceFit) -> SurfaceErrors:
-    """Errors of the surfaces p01-p58 among `maps` that entered `fit`, from their sag samples.
-
-    Raises:
-        EmptyRegionError: a surface has no sample in some region.
-        TooFewSamplesError: there is none of these surfaces.
-        ValueError: other than 21 terms.
-    """
-    rows = _rows(maps, fit)
-    labels = tuple(maps.label[row] for row in rows)
-    error = surface_control_error(maps.sag[rows], maps.applied[rows], fit.influence_zernike, maps.points)
-    regional = regional_rms(error, maps.points, labels=labels)
-    return SurfaceErrors(labels, maps.applied[rows], maps.coefficients[rows], regional)
-
-
-def surface_weights(errors: SurfaceErrors) -> Floats:
-    """(M,) weights of the surfaces for AZWreg: Eq. (8) with r the variance of a surface's regional errors, m^2.
-
-    Scaled such that a surface of weight 1 has the average variance: that is what a new one, whose regional errors
-    nobody has measured, counts as.
-
-    Raises:
-        ValueError: the errors of all surfaces are the same in all regions, so that Eq. (8) gives no weights.
-    """
-    variance = errors.regional.var(axis=1, ddof=1)
-    epsilon = float(np.median(variance))
-    if epsilon <= 0.0:
-        raise ValueError("the errors do not differ from region to region: Eq. (8) gives no weights; use AZreg")
-    weights = region_weights(variance, epsilon)
-    return weights * np.mean(1.0 / weights)
-
-
 def regress_surface_errors(
     maps: MapSet,
     fit: InfluenceFit,
@@ -242,13 +183,6 @@ def regress_surface_errors(
     return _judge(errors, test, names, candidates, weights, reading, fit.method, options)
 
 
-def _rows(maps: MapSet, fit: InfluenceFit) -> NDArray[np.int64]:
-    rows = np.array([k for k, label in enumerate(maps.label) if label in SURFACES and fit.used[k]], dtype=np.int64)
-    if not rows.size:
-        raise TooFewSamplesError("none of the surfaces p01 to p58 is among the good maps: calibrate with the plan FULL")
-    return rows
-
-
 def _candidates(
     maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, test: NDArray[np.bool_], reading: Reading
 ) -> tuple[tuple[str, ...], Floats]:
@@ -271,7 +205,7 @@ def _candidates(
 
 def _cross_fitted(maps: MapSet, fit: InfluenceFit, test: NDArray[np.bool_], hysteresis: bool) -> Floats:
     """(M, P) error surfaces of the sample surfaces, each from a fit that has not seen it, m."""
-    rows = _rows(maps, fit)
+    rows = surface_rows(maps, fit)
     history = RunHistory(maps, fit.sag_offset + maps.applied @ fit.influence_sag.T, hysteresis)
     fold = np.full(len(rows), FOLDS)
     fold[~test] = np.arange((~test).sum()) % FOLDS

@@ -1,0 +1,216 @@
+"""One class of hysteresis models fitted to the maps of a calibration run.
+
+``response = figure(t) + e H`` with the effective signal ``e = sum_f w_f x_f`` of features x (play operators, Duhem
+operator, each with its creep), one set of weights w for all actuators and the gains in H. It is bilinear: H and w are
+least-squares solutions in turn. The few numbers that enter otherwise (slope of the Duhem operator, creep rate) are
+found by Gauss-Newton around that (variable projection [14]).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from dm_calibration.hysteresis.features import crept, fading_feature, play_features
+from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of
+from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+#: Ridge on the weights, relative to their mean evidence: keeps neighbours alike where the data do not tell them apart.
+RIDGE = 1e-6
+#: Rounds of alternating solutions.
+ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A choice of features.
+
+    Attributes:
+        name: of the class of laws.
+        plays: number of play operators beside the signal itself.
+        powers: of their values.
+        slopes: coefficients of the Duhem operator's slope; 0 = no such operator.
+    """
+
+    name: str
+    plays: int
+    powers: int
+    slopes: int
+
+
+CANDIDATES = (
+    Candidate("linear", 0, 1, 0),
+    Candidate("Prandtl-Ishlinskii", 20, 1, 0),
+    Candidate("Preisach", 20, 3, 0),
+    Candidate("Duhem", 0, 3, 4),
+    Candidate("Preisach and Duhem", 20, 3, 4),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """The commands and responses of one calibration run, in order, from a degauss at mid range on.
+
+    Attributes:
+        signals: (M, N) as applied.
+        time: (M,) s, of the maps, rising.
+        responses: what was measured.
+        start: s, when the degauss had ended; None = just before the first map.
+        moved: (M,) s, when the mirror took each shape; None = right after the map before.
+        segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
+    """
+
+    signals: Floats
+    time: Floats
+    responses: Responses
+    start: float | None = None
+    moved: Floats | None = None
+    segment: NDArray[np.int64] | None = None
+
+    def __post_init__(self) -> None:
+        if (np.diff(self.time) < 0.0).any():
+            row = int(np.flatnonzero(np.diff(self.time) < 0.0)[0]) + 1
+            back = self.time[row - 1] - self.time[row]
+            raise ValueError(f"time stamps: map {row + 1} is {back:.3f} s before the map before it; was the clock set?")
+
+    @property
+    def began(self) -> float:
+        return float(self.time[0]) - 1.0 if self.start is None else min(self.start, float(self.time[0]))
+
+    @property
+    def parts(self) -> list[slice]:
+        """Rows of each part of the run, from one degauss to the next."""
+        return parts_of(np.zeros(len(self.time), dtype=np.int64) if self.segment is None else self.segment)
+
+
+@dataclass(frozen=True, eq=False)
+class LawFit:
+    """A candidate fitted to some rows of a run.
+
+    Attributes:
+        candidate: which.
+        law: with effective signals that span 2 in a full cycle.
+        residual: (M, D) of all rows, those left out included; units of `Responses.values`.
+        weight_covariance: (F, F) of the features' weights, relative to the signal's, for the scatter of the fit.
+    """
+
+    candidate: Candidate
+    law: HysteresisModel
+    residual: Floats
+    weight_covariance: Floats
+
+
+class CandidateProblem:
+    """One candidate on one run: features once, then fits to any rows."""
+
+    def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
+        self.run, self.candidate, self._scatter = run, candidate, scatter
+        self.radius = np.concatenate(([0.0], (np.arange(candidate.plays) + 0.5) / max(candidate.plays, 1)))
+        self._parts = run.parts
+        self._starts = [run.began, *starts_of(self._parts, run.time, run.moved)]
+        powers = candidate.powers
+        self._plays = in_parts(self._parts, lambda part: play_features(run.signals[part], self.radius, powers))
+        self._plays_crept = self._crept(self._plays)
+        self._measured = run.responses.values / scatter
+        self._figure = figure_columns(run.time, self._parts, self._starts)
+
+    def _crept(self, features: Floats) -> Floats:
+        """What creep adds to `features` (M, F, N) per unit of creep rate; each part begins rested."""
+        time, moved = self.run.time, self.run.moved
+        start = {part.start: start for part, start in zip(self._parts, self._starts, strict=True)}
+        return in_parts(
+            self._parts,
+            lambda part: crept(features[part], time[part], start[part.start], None if moved is None else moved[part]),
+        )
+
+    def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int = 20) -> LawFit:
+        """Fit to the rows in `keep` (M,)."""
+        slopes = self.candidate.slopes
+        if start is None:
+            guess = np.concatenate((np.full(min(slopes, 1), 1.5), np.zeros(max(slopes - 1, 0)), [0.01]))
+        else:
+            guess = np.concatenate((start.law.duhem_slope, [start.law.creep_rate]))
+        weights: list[Floats | None] = [None]
+
+        def residual(nonlinear: Floats) -> Floats:
+            try:
+                features = self._features(nonlinear)
+            except ValueError:  # a Duhem operator that leads nowhere
+                return np.full(int(keep.sum()) * self._measured.shape[1], 1e3)
+            weights[0], left, _ = self._solve(features, keep, weights[0])
+            return np.asarray(left[keep].ravel())
+
+        low = np.concatenate((np.full(slopes, -30.0), [0.0]))
+        high = np.concatenate((np.full(slopes, 30.0), [0.2]))
+        scale = np.concatenate((np.ones(slopes), [0.01]))
+        found = least_squares(
+            residual, guess, bounds=(low, high), x_scale=scale, diff_step=1e-3, max_nfev=evaluations, xtol=1e-5,
+            ftol=1e-6,
+        )  # fmt: skip
+        features = self._features(found.x)
+        solved, left, covariance = self._solve(features, keep, weights[0])
+        return LawFit(self.candidate, self._law(solved, found.x), left * self._scatter, covariance)
+
+    def _features(self, nonlinear: Floats) -> Floats:
+        rate, slope = nonlinear[-1], nonlinear[:-1]
+        features = self._plays + rate * self._plays_crept
+        if not self.candidate.slopes:
+            return features
+        operator = DuhemOperator(slope)
+        fading = in_parts(self._parts, lambda part: fading_feature(self.run.signals[part], operator))
+        fading = fading + rate * self._crept(fading)
+        return np.concatenate((features, fading), axis=1)
+
+    def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats, Floats]:
+        """Weights (F,), residual (M, D) in units of the scatter, covariance of the weights."""
+        measured, figure = self._measured[keep], self._figure[keep]
+        free = basis_of(figure)
+        kept = features[keep]
+        without_figure = measured - free @ (free.T @ measured)
+        count = features.shape[1]
+        if weights is None:
+            weights = np.eye(count)[0]
+        covariance = np.zeros((count, count))
+        rows, actuators = len(kept), kept.shape[2]
+        flat = kept.reshape(rows, -1)
+        projected = (flat - free @ (free.T @ flat)).reshape(kept.shape)
+        for _ in range(ROUNDS if count > 1 else 1):
+            design = np.hstack((figure, np.einsum("f,mfn->mn", weights, kept)))
+            solution = np.linalg.lstsq(design, measured, rcond=1e-10)[0]
+            influence = solution[figure.shape[1] :]
+            if count == 1:
+                break
+            # Least squares over responses equals least squares over displacements, weighted by H H'.
+            gram = influence @ influence.T
+            root = np.linalg.cholesky(gram + 1e-9 * np.trace(gram) * np.eye(actuators))
+            columns = np.einsum("mfn,nk->fmk", projected, root, optimize=True).reshape(count, -1)
+            seen = np.linalg.solve(root, influence @ without_figure.T).T.ravel()
+            normal = columns @ columns.T
+            ridge = RIDGE * np.trace(normal) / count * np.eye(count)
+            ridge[0, 0] = 0.0
+            inverse = np.linalg.inv(normal + ridge)
+            weights = inverse @ (columns @ seen)
+            covariance = inverse
+            weights = weights / weights[0]
+        design = np.hstack((self._figure, np.einsum("f,mfn->mn", weights, features)))
+        return weights, self._measured - design @ solution, covariance
+
+    def _law(self, weights: Floats, nonlinear: Floats) -> HysteresisModel:
+        plays = len(self.radius) * self.candidate.powers
+        law = HysteresisModel(
+            self.radius,
+            weights[:plays].reshape(len(self.radius), self.candidate.powers),
+            nonlinear[:-1].copy(),
+            float(weights[plays]) if self.candidate.slopes else 0.0,
+            float(nonlinear[-1]),
+            CREEP_TIMES,
+        )
+        return law.scaled(2.0 / law.span())
