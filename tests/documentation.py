@@ -138,7 +138,7 @@ PARSED = {
     "./dm paper --out runs/paper": _LONG + "test_paper.py runs it",
     "./dm paper --out runs/paper --json runs/paper.json": _LONG + "test_paper.py runs it",
     "./dm doctor --config my_bench.yaml": "must complain while the scene runs; test_doctor.py runs it",
-    "./dm exec python -m dm_simulation.plot --output simulation.png": "draws for a minute",
+    "./dm exec python -m studies.simulation_plot --output simulation.png": "draws for a minute",
     "./dm exec python -m pytest -q src/dm_driver/test/test_electronics_contract.py": "is a test of its own",
 }
 #: Need another machine, its package manager or the network; what is named in them is checked by hand.

@@ -15,7 +15,6 @@ import pytest
 from numpy.typing import NDArray
 
 import dm_simulation
-from dm_simulation import plot
 from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
 from dm_simulation.electronics.drive_unit import TRIHEX, DriveConfig
 from dm_simulation.electronics.monitor import MonitorConfig
@@ -207,11 +206,3 @@ def test_the_twin_imports_nothing_of_what_it_judges() -> None:
             for name in names:
                 if name.startswith("dm_"):
                     assert name.startswith(allowed), (module, name)
-
-
-def test_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = tmp_path / "bench.png"
-    assert plot.main(["--output", str(picture), "--poke", "37", "--law", "bouc_wen", "--curvature", "-0.02"]) == 0
-    assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert plot.main(["--output", str(picture), "--poke", "38"]) == 1
-    assert "--poke 38: must be 1 to 37" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A picture of what the virtual bench simulates: `python -m dm_simulation.plot --output bench.png`."""
+"""A picture of what the virtual bench simulates: `python -m studies.simulation_plot --output bench.png`."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def draw(output: Path, poke: int, curvature: float, config: PiezoConfig, seed: i
 def main(arguments: list[str] | None = None) -> int:
     """Command line; exit status 0 when the picture is written."""
     standard = PiezoConfig()
-    parser = argparse.ArgumentParser(prog="python -m dm_simulation.plot", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m studies.simulation_plot", description=__doc__)
     parser.add_argument("--output", type=Path, required=True, help="picture file (.png, .svg, .pdf)")
     parser.add_argument("--poke", type=int, default=1, help="actuator whose influence function is shown, 1 to 37")
     parser.add_argument(
