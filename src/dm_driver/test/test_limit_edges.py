@@ -24,7 +24,7 @@ def limiter(**limits: float) -> SafetyLimiter:
 def reason(action: object, *arguments: object) -> ErrorCode:
     with pytest.raises(Refusal) as caught:
         action(*arguments)  # type: ignore[operator]
-    return caught.value.error_code
+    return ErrorCode(caught.value.error_code)
 
 
 @given(low=st.floats(-1.0, -0.01), high=st.floats(0.01, 1.0), actuator=st.integers(0, 6))
