@@ -196,7 +196,7 @@ def test_parameter_table_builds_the_standard_bench() -> None:
         parameter.check(parameter.default)
 
 
-def test_the_twin_imports_nothing_of_what_it_judges() -> None:
+def test_the_simulation_imports_nothing_of_what_it_judges() -> None:
     """Only the node's own module may use what all nodes share; the simulated physics knows parameter tables alone."""
     for module in FOLDER.rglob("*.py"):
         allowed = ("dm_simulation", "dm_common.ros" if module.stem.endswith("_node") else "dm_common.ros.parameters")

@@ -12,12 +12,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from dm_bringup.nodes import NAMES
+from dm_bringup.nodes import NAMES, NODES
 from dm_tools.doctor.finding import Check, Finding
 
-MODULES = ("rclpy", "dm_msgs.msg", "dm_driver", "dm_calibration", "numpy", "scipy", "statsmodels", "h5py", "serial")
+MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
 #: Each node takes a segment of 16 MB in /dev/shm, see config/fastdds.xml.
-SHARED_HYSTERESIS_MIN = 128e6
+SHARED_MEMORY_MIN = 128e6
 DISK_MIN = 1e9
 #: DDS takes its ports from the domain; above this they run into those that the system hands out.
 DOMAIN_MAX = 101
@@ -43,7 +43,7 @@ def machine_checks(namespace: str = "") -> list[Check]:
 
 
 def packages() -> Finding | None:
-    for name in MODULES:
+    for name in (*MODULES, *dict.fromkeys(node.package for node in NODES)):
         try:
             importlib.import_module(name)
         except ImportError as error:
@@ -66,7 +66,7 @@ def profile() -> Finding | None:
     if missing := {"segment_size", "maxInitialPeersRange"} - names:
         return Finding(
             f"the Fast DDS profile {path} does not set {', '.join(sorted(missing))}",
-            "take over these settings from config/fastdds.xml of dm_controller",
+            "take over these settings from config/fastdds.xml of dm_bringup",
             note=True,
         )
     return None
@@ -75,7 +75,7 @@ def profile() -> Finding | None:
 def shared_memory() -> Finding | None:
     folder = Path("/dev/shm")
     free = shutil.disk_usage(folder).free if folder.is_dir() else 0
-    if free < SHARED_HYSTERESIS_MIN:
+    if free < SHARED_MEMORY_MIN:
         return Finding(
             f"/dev/shm has {free / 1e6:.0f} MB free; each node takes 17 MB",
             "remove stale fastrtps_* files from /dev/shm (fastdds shm clean); in a container raise --shm-size",
