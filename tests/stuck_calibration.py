@@ -8,8 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from dm_calibration import calibration_action, calibration_node
-from dm_calibration import calibration_manager as calibration_desk
+from dm_calibration import calibration_action, calibration_manager, calibration_node
 from dm_calibration.procedure import run_journal
 from dm_calibration.store import calibration_store as store
 
@@ -60,13 +59,13 @@ half_a_frame.frames = 0  # type: ignore[attr-defined]
 def main(place: str) -> int:
     match place:
         case "fit":
-            calibration_action.evaluate = before(place, calibration_action.evaluate)
+            calibration_action.calibrate = before(place, calibration_action.calibrate)
         case "before_store":
             store.write_whole = before(place, store.write_whole)
         case "after_store":
             store.write_whole = after(place, store.write_whole)
         case "read_back":
-            calibration_desk.map_hashes = before(place, calibration_desk.map_hashes)
+            calibration_manager.map_hashes = before(place, calibration_manager.map_hashes)
         case "frame":
             run_journal.os = type("Os", (), {**vars(os), "pwrite": staticmethod(half_a_frame)})  # type: ignore[assignment]
     return calibration_node.main()

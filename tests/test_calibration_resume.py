@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
@@ -105,7 +105,7 @@ def test_what_is_read_back_is_bit_for_bit_what_was_measured(tmp_path: Path) -> N
     again = read_run(run.journal.folder).outcome
     assert map_hashes(again.maps()) == map_hashes(live.maps())
     assert np.array_equal(again.centres, live.centres, equal_nan=True)
-    calibration, _ = evaluate(again, MIRROR, FitOptions(), Provenance("resumed", 1))
+    calibration = calibrate(again, mirror=MIRROR, options=FitOptions(), provenance=Provenance("resumed", 1))
     store = CalibrationStore(tmp_path)
     store.save(calibration)
     assert map_hashes(store.load("resumed").maps) == [record_hash(record) for record in live.records]

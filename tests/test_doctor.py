@@ -18,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
 from dm_bringup.suite import load_config
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -133,7 +133,7 @@ def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
     none = doctor_bench.stored_calibration(tmp_path, "T-1")
     assert none is not None and none.note and "no calibration of the mirror T-1" in none.problem
     outcome = recorded(PlanKind.POKES, PlanOptions())[1]
-    calibration, _check = evaluate(outcome, MIRROR, FitOptions(), Provenance("PDM_1", 10**18, ""))
+    calibration = calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("PDM_1", 10**18, ""))
     CalibrationStore(tmp_path).save(calibration)
     serial = calibration.mirror_serial
     foreign = doctor_bench.stored_calibration(tmp_path, "other")

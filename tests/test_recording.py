@@ -20,7 +20,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rclpy.serialization import deserialize_message, serialize_message
 
 from dm_calibration.calibration_messages import calibration_message
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
@@ -116,7 +116,7 @@ def session_messages(run: RecordedRun) -> list[tuple[str, Any]]:
 def run_and_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[RecordedRun, Any, BagReader]:
     """A run, the message it ended with live, and its recording."""
     run, outcome = recorded(PlanKind.FULL, PlanOptions(poke_amplitude=0.4))
-    live = evaluate(outcome, run.mirror, FitOptions(), Provenance("live", 1))[0]
+    live = calibrate(outcome, mirror=run.mirror, options=FitOptions(), provenance=Provenance("live", 1))
     message = calibration_message(live, None, "mirror", 32e-9)
     folder = tmp_path_factory.mktemp("bag") / "session"
     bag = write_bag(folder, [*session_messages(run), ("/calibration", message)], {"poke_amplitude": 0.4})

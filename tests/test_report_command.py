@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -22,7 +22,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> CalibrationStore:
     """An older and a newer calibration."""
     store = CalibrationStore(tmp_path_factory.mktemp("store"))
     outcome = recorded(PlanKind.POKES, PlanOptions())[1]
-    older = evaluate(outcome, MIRROR, FitOptions(), Provenance("older", 10**18))[0]
+    older = calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("older", 10**18))
     store.save(older)
     store.save(replace(older, id="newer", created_ns=2 * 10**18))
     return store

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibrator import fit_remembering
+from dm_calibration.calibrator import fit_effective
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions
@@ -63,7 +63,7 @@ def _recipes(bench: SimulatedBench, loop: Planner) -> RecipeBook:
 def _variant(
     name: str, bench: SimulatedBench, calibration: Calibration, hysteresis: HysteresisFit | None, holds: bool
 ) -> Variant:
-    fit = fit_remembering(calibration.maps, hysteresis, FitOptions(), bench.mirror)
+    fit = fit_effective(calibration.maps, hysteresis, FitOptions(), bench.mirror)
     mirror = CalibratedMirror(influence_model(fit, calibration.aperture_radius), bench.limits)
     if hysteresis is None:
         return Variant(name, Planner(mirror, slew_rate=bench.slew_rate), holds)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.surfaces import LinearModel
 from dm_calibration.optics.aperture import Aperture, configured_aperture
@@ -274,7 +274,7 @@ class SimulatedBench:
         finally:
             self.apply(self.mirror.rest)
         provenance = Provenance(f"{self.mirror.serial}-{self.config.law}", round(self.time * 1e9))
-        return evaluate(procedure.outcome, self.mirror, options.fit, provenance)[0]
+        return calibrate(procedure.outcome, mirror=self.mirror, options=options.fit, provenance=provenance)
 
 
 def plan_steps(kind: PlanKind = PlanKind.FULL, options: PlanOptions | None = None) -> int:

@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
-from dm_calibration.calibrator import Provenance, check_fit, dropped_maps, evaluate
+from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_maps
 from dm_calibration.hysteresis.forecast import forecast
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.procedure.event_frames import Storing
@@ -242,8 +242,15 @@ class CalibrateAction:
                 provenance = self._desk.provenance(mirror.name, mirror.serial, goal.note)
                 if run.storing is not None:  # killed while storing: the same calibration again, not another one
                     provenance = Provenance(run.storing.id, run.storing.created_ns, provenance.note)
-                calibration, check = evaluate(outcome, mirror, fit_options(self._values), provenance, remarks)
+                calibration = calibrate(
+                    outcome,
+                    mirror=mirror,
+                    options=fit_options(self._values),
+                    provenance=provenance,
+                    run_limitations=remarks,
+                )
                 fit = calibration.fit
+                check = check_fit(fit, mirror)
         except ValueError as error:
             # The next goal would end in the same way; what was measured stays at hand.
             run.journal.close()

@@ -1,13 +1,16 @@
-"""From the maps of a run, or of a stored calibration, to a calibration: fit, poke check, limitations in words."""
+"""From maps, or a stored calibration, to a calibration: fit, poke check, limitations as sentences."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from dm_calibration.acquisition.ingest import IngestSettings
+from dm_calibration.acquisition.map_sources import Maps, outcome_of
 from dm_calibration.calibration import Calibration, software_version
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
@@ -16,7 +19,8 @@ from dm_calibration.influence.poke_check import PokeCheck, check_pokes
 from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
 from dm_calibration.influence.region_weighting import weighting_of
 from dm_calibration.influence.regression import TooFewMapsError
-from dm_calibration.procedure.procedure import Outcome
+from dm_calibration.procedure.outcome import Outcome
+from dm_calibration.store.calibration_store import new_id
 from dm_common.mirror import Mirror
 
 Floats = NDArray[np.float64]
@@ -43,18 +47,85 @@ def check_fit(fit: InfluenceFit, mirror: Mirror) -> PokeCheck:
     )
 
 
-def evaluate(
-    outcome: Outcome, mirror: Mirror, options: FitOptions, provenance: Provenance, run_limitations: Collection[str] = ()
-) -> tuple[Calibration, PokeCheck]:
-    """Fit the maps of a run and compare the responses with the layout; where it holds excitation, the memory first.
+def calibrate(
+    maps: Maps | Outcome,
+    commands: ArrayLike | None = None,
+    times: ArrayLike | None = None,
+    *,
+    mirror: Mirror,
+    options: FitOptions | None = None,
+    settings: IngestSettings | None = None,
+    hysteresis: bool = False,
+    provenance: Provenance | None = None,
+    run_limitations: Collection[str] = (),
+) -> Calibration:
+    """Make a calibration: influence function, hysteresis model where the maps show it, poke check, limitations.
 
-    Raises:
-        TooFewMapsError: the good maps do not determine the unknowns, or do not show the memory.
-        ValueError: time stamps that run backwards where the memory is to be identified.
+    The node `calibration` calls this with what its run has measured; a notebook needs no ROS::
+
+        from dm_calibration import calibrate
+        calibration = calibrate("maps/", commands, mirror=mirror)
+
+    Parameters
+    ----------
+    maps
+        A folder of map files, a list of map files, sag as an array (M, height, width) in m (NaN = no data; give
+        ``settings`` with the pitch), a list of :class:`~dm_common.measurement.Measurement`, or the
+        :class:`~dm_calibration.procedure.outcome.Outcome` of a run, which holds its commands and times.
+    commands : array_like (M, N)
+        Normalised signals that stood at the mirror, one row for each map.
+    times : array_like (M,), optional
+        When the maps were taken, s. As the files say where not given. Hysteresis needs them.
+    mirror
+        Positions of the actuators, working aperture and limits.
+    options
+        Method and thresholds of the fit.
+    settings
+        Pitch, orientation and aperture of the maps; by default the mirror's aperture in the centre of each map.
+    hysteresis
+        Whether the commands show hysteresis and creep, beginning from a degauss: some hundred random shapes (see
+        :func:`~dm_calibration.hysteresis.excitation.excitation`). The last fifth of the maps tests the model found.
+    provenance
+        Id, time and note; by default the mirror's names, now, none.
+    run_limitations
+        Sentences to add to those of the result.
+
+    Returns
+    -------
+    Calibration
+        Store it with :class:`~dm_calibration.store.calibration_store.CalibrationStore`.
+
+    Raises
+    ------
+    MapFileError, MapRejectedError, InsufficientDataError
+        A file or array is no good.
+    MeasurementError
+        A map cannot be compared with those before it.
+    TooFewMapsError
+        The good maps do not determine the unknowns, or do not show hysteresis.
+    ValueError
+        Commands or times that do not belong to the maps, or time stamps that run backwards where hysteresis is to be
+        identified.
     """
+    if not isinstance(maps, Outcome):
+        if commands is None:
+            raise ValueError("commands: must be given, (M, N) signals, one row for each map")
+        maps = outcome_of(maps, commands, times, mirror, settings, hysteresis)
+    return _evaluated(maps, mirror, options or FitOptions(), provenance or _provenance(mirror), run_limitations)
+
+
+def _provenance(mirror: Mirror) -> Provenance:
+    now = time.time_ns()
+    return Provenance(new_id(mirror.name, mirror.serial, now), now)
+
+
+def _evaluated(
+    outcome: Outcome, mirror: Mirror, options: FitOptions, provenance: Provenance, run_limitations: Collection[str]
+) -> Calibration:
+    """Fit the maps of a run and compare the responses with the layout; where it holds excitation, hysteresis first."""
     maps = outcome.maps()
     hysteresis = fit_hysteresis(maps) if EXCITATION in maps.kind else None
-    fit = fit_remembering(maps, hysteresis, options, mirror)
+    fit = fit_effective(maps, hysteresis, options, mirror)
     check = check_fit(fit, mirror)
     limitations = [*fit.limitations, *(hysteresis.remarks if hysteresis else ()), *run_limitations]
     if not outcome.radius_known:
@@ -68,7 +139,7 @@ def evaluate(
         limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")
     limitations += [f"Poke check: {finding}." for finding in check.findings]
     limitations += [f"Measured differently: {remark}." for remark in outcome.remarks]
-    calibration = Calibration(
+    return Calibration(
         id=provenance.id,
         mirror_name=mirror.name,
         mirror_serial=mirror.serial,
@@ -87,7 +158,6 @@ def evaluate(
         hysteresis=hysteresis,
         region_weights=_region_weights(maps, fit, options),
     )
-    return calibration, check
 
 
 def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Floats:
@@ -100,10 +170,10 @@ def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Flo
         return np.zeros(0)
 
 
-def fit_remembering(
+def fit_effective(
     maps: MapSet, hysteresis: HysteresisFit | None, options: FitOptions, mirror: Mirror, exclude: Collection[str] = ()
 ) -> InfluenceFit:
-    """The influence function of `maps`, of effective signals when a memory is known.
+    """The influence function of `maps`, of effective signals when hysteresis is known.
 
     Raises:
         As :func:`~dm_calibration.influence.fit.fit_influence`.
@@ -124,7 +194,7 @@ def refit(stored: Calibration, options: FitOptions, exclude: Collection[str], pr
     mirror = Mirror(
         stored.mirror_name, stored.mirror_serial, stored.actuator_x, stored.actuator_y, stored.aperture_radius
     )
-    fit = fit_remembering(stored.maps, stored.hysteresis, options, mirror, exclude)
+    fit = fit_effective(stored.maps, stored.hysteresis, options, mirror, exclude)
     of_the_run = [sentence for sentence in stored.limitations if sentence not in stored.fit.limitations]
     without = f" without {', '.join(exclude)}" if exclude else ""
     return replace(

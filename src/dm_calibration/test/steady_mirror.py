@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.applied_history import Standing
@@ -75,7 +75,7 @@ class SteadyMirror:
             self.clock_ns = stamp_ns - 2 * 10**9 * len(plan.steps)
         outcome = Procedure(plan, self.mirror, self).run()
         provenance = Provenance("steady", self.clock_ns)
-        return evaluate(outcome, self.mirror, FitOptions(), provenance)[0]
+        return calibrate(outcome, mirror=self.mirror, options=FitOptions(), provenance=provenance)
 
 
 def without_effect(error: float = 1e-10) -> HysteresisFit:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
@@ -41,7 +41,7 @@ PLAY = HysteresisModel(
 def calibration() -> Calibration:
     _run, outcome = recorded(PlanKind.FULL, PlanOptions(), failing=frozenset({"poke+03"}))
     provenance = Provenance("bench_3", 1_700_000_000 * 10**9, "cold <morning> & windy")
-    return evaluate(outcome, MIRROR, FitOptions(), provenance)[0]
+    return calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=provenance)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_a_mirror_of_nineteen_actuators_has_a_report(tmp_path: Path) -> None:
     mirror = SmallBench.mirror
     plan = make_plan(PlanKind.POKES, mirror, PlanOptions())
     outcome = Procedure(plan, mirror, SmallBench(), ProcedureOptions()).run()
-    small = evaluate(outcome, mirror, FitOptions(), Provenance("small", 10**18))[0]
+    small = calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance("small", 10**18))
     written = write_report(small, tmp_path)
     text = written.html.read_text()
     actuators = text[text.index("<caption>Actuators") :]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibrator import Provenance, evaluate, refit
+from dm_calibration.calibrator import Provenance, calibrate, refit
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.region_weighting import (
@@ -352,7 +352,7 @@ def make_calibration(identifier: str = "one") -> Calibration:
                 applied=s,
             )
         )
-    return evaluate(outcome, mirror, FitOptions(), Provenance(identifier, 1))[0]
+    return calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance(identifier, 1))
 
 
 def test_a_stored_calibration_is_fitted_again_with_either_method() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.report.report_writer import ReportingStore, ReportWriter
@@ -21,7 +21,7 @@ PATIENCE_S = 200.0
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     outcome = recorded(PlanKind.POKES, PlanOptions())[1]
-    return evaluate(outcome, MIRROR, FitOptions(), Provenance("c1", 10**18))[0]
+    return calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("c1", 10**18))
 
 
 def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration, tmp_path: Path) -> None:

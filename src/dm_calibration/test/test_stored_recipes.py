@@ -14,7 +14,7 @@ import pytest
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_manager import CalibrationManager
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -30,7 +30,7 @@ ACTUATORS = MIRROR.actuators
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
     outcome = Procedure(make_plan(PlanKind.POKES, MIRROR), MIRROR, RememberingBench()).run()
-    return evaluate(outcome, MIRROR, FitOptions(), Provenance("known", 10**18))[0]
+    return calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("known", 10**18))
 
 
 class Stand:

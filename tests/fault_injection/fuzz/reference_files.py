@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Outcome
@@ -213,7 +213,7 @@ def _calibration() -> ReferenceFile:
             applied=step.signals,
         )
         outcome.records.append(record)
-    calibration, _check = evaluate(outcome, mirror, FitOptions(), Provenance(CALIBRATION_ID, 10**18))
+    calibration = calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance(CALIBRATION_ID, 10**18))
     with tempfile.TemporaryDirectory() as folder:
         content = CalibrationStore(Path(folder)).save(calibration).read_bytes()
     return ReferenceFile("calibration", ".h5", content)

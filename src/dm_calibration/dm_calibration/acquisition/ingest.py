@@ -74,11 +74,12 @@ class Ingest:
         with self._turn:
             source = read_map(path, xyz_unit=settings.xyz_unit or None)
             try:
-                return self._measure(source, settings)
+                return self.measure(source, settings)
             except (InsufficientDataError, MapRejectedError) as error:
                 raise type(error)(f"{path}: {error}") from error
 
-    def _measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
+    def measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
+        """Orient and fit a map that was read; not for two threads at a time. Raises as :meth:`read`."""
         difference = abs(source.wavelength - settings.wavelength)
         if settings.wavelength and difference > settings.wavelength_tolerance:
             raise MapRejectedError(

@@ -71,10 +71,14 @@ class RunHistory:
         self._radius = np.array((0.0, *PLAY_RADII)) if hysteresis else np.zeros(1)
         parts = parts_of(maps.segment)
         self._plays = in_parts(parts, lambda part: play_features(maps.applied[part], self._radius, 1))
-        time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))
-        self._crept = in_parts(
-            parts, lambda part: crept(self._plays[part], time[part], float(time[part][0]) - BEFORE_FIRST_MAP_S)
-        )
+        time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
+        moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
+
+        def creep_of(part: slice) -> Floats:
+            start = float(moved[part][0]) - BEFORE_FIRST_MAP_S
+            return crept(self._plays[part], time[part], start, moved[part])
+
+        self._crept = in_parts(parts, creep_of)
 
     def fit(self, keep: NDArray[np.bool_]) -> SagModel:
         """The model that explains the maps in `keep` (M,) best."""

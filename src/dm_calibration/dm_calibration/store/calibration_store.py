@@ -40,6 +40,13 @@ class Entry:
     remark: str
 
 
+def new_id(mirror_name: str, serial: str, created_ns: int) -> str:
+    """An id of mirror, serial number and time (UTC)."""
+    parts = [re.sub(r"[^A-Za-z0-9]+", "-", part).strip("-")[:32] for part in (mirror_name, serial)]
+    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(created_ns * 1e-9))
+    return "_".join([part for part in parts if part] + [stamp])
+
+
 class CalibrationStore:
     """Calibrations of one folder, one file ``<id>.h5`` each."""
 
@@ -48,9 +55,7 @@ class CalibrationStore:
 
     def new_id(self, mirror_name: str, serial: str, created_ns: int) -> str:
         """An id that no file of the folder has: mirror, serial number, time (UTC), and a number when needed."""
-        parts = [re.sub(r"[^A-Za-z0-9]+", "-", part).strip("-")[:32] for part in (mirror_name, serial)]
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(created_ns * 1e-9))
-        stem = "_".join([part for part in parts if part] + [stamp])
+        stem = new_id(mirror_name, serial, created_ns)
         number = 1
         while True:
             identifier = stem if number == 1 else f"{stem}-{number}"

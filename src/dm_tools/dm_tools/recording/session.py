@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options, procedure_options
-from dm_calibration.calibrator import Provenance, evaluate
+from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.surfaces import LinearModel
 from dm_calibration.procedure.plan import PlanOptions
 from dm_calibration.procedure.recorded_run import Move, RecordedRun, RecordingError, maps_per_state, repeat_run
@@ -143,7 +143,7 @@ def recalibrate(session: Session, identifier: str, created_ns: int) -> Calibrati
     options = procedure_options(values, maps_per_state(run))
     _plan, outcome = repeat_run(run, options, configured)
     provenance = Provenance(identifier, created_ns, "made again from a recording")
-    return evaluate(outcome, run.mirror, fit_options(values), provenance)[0]
+    return calibrate(outcome, mirror=run.mirror, options=fit_options(values), provenance=provenance)
 
 
 def differences(calibration: Calibration, published: Any) -> list[str]:

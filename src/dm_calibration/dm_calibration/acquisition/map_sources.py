@@ -1,0 +1,121 @@
+"""Maps that were not measured by a run of this suite: files, arrays or measurements, with the commands they show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
+from dm_calibration.hysteresis.excitation import CHECK_SHARE
+from dm_calibration.influence.maps import CHECK, EXCITATION, POKE, REFERENCE, SURFACE
+from dm_calibration.map_files import SurfaceMap
+from dm_calibration.procedure.map_acquisition import ProcedureOptions, check_comparable
+from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup
+from dm_common.errors import MeasurementError
+from dm_common.measurement import Measurement
+from dm_common.mirror import Mirror
+
+Floats = NDArray[np.float64]
+
+#: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
+Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
+
+#: Endings of the map files that are taken from a folder.
+SUFFIXES = (".dat", ".datx", ".asc", ".xyz")
+
+
+def outcome_of(
+    maps: Maps,
+    commands: ArrayLike,
+    times: ArrayLike | None,
+    mirror: Mirror,
+    settings: IngestSettings | None = None,
+    hysteresis: bool = False,
+) -> Outcome:
+    """The maps as if a run had measured them, in their order.
+
+    Args:
+        maps: see `Maps`; the files of a folder count in the order of their names.
+        commands: (M, N) normalised signals that stood at the mirror, one row for each map.
+        times: (M,) s at which the maps were taken; None = as the files say, else one second apart.
+        settings: how files and arrays are read; None = with the mirror's aperture in the centre of the map.
+        hysteresis: the commands show hysteresis: the last fifth of the maps tests the model found from the others.
+
+    Raises:
+        MapFileError, MapRejectedError, InsufficientDataError: a file or array is no good.
+        MeasurementError: a map cannot be compared with those before it.
+        ValueError: commands or times of another shape or not finite, or no map.
+    """
+    measured = _measured(maps, settings or IngestSettings(aperture_radius=mirror.working_radius))
+    count = len(measured)
+    signals = np.asarray(commands, dtype=np.float64)
+    if signals.shape != (count, mirror.actuators) or not np.isfinite(signals).all():
+        raise ValueError(
+            f"commands has the shape {signals.shape}: must be ({count}, {mirror.actuators}) finite numbers, a row for "
+            "each map and a column for each actuator"
+        )
+    if times is not None:
+        taken = np.asarray(times, dtype=np.float64)
+        if taken.shape != (count,) or not np.isfinite(taken).all():
+            raise ValueError(f"times has the shape {taken.shape}: must be ({count},) finite numbers, s")
+        measured = [replace(one, stamp_ns=round(1e9 * at)) for one, at in zip(measured, taken, strict=True)]
+    elif not all(one.stamp_ns for one in measured):
+        if hysteresis:
+            raise ValueError("times: hysteresis and creep cannot be told apart without; give s, one for each map")
+        measured = [replace(one, stamp_ns=number * 10**9) for number, one in enumerate(measured)]
+    outcome, options = Outcome(), ProcedureOptions()
+    steps = np.cumsum(np.abs(np.diff(signals, axis=0, prepend=signals[:1])).any(axis=1))
+    for number, (one, row, kind) in enumerate(zip(measured, signals, _kinds(signals, mirror, hysteresis), strict=True)):
+        label = f"{number + 1} {Path(one.file).name}" if one.file else f"map {number + 1}"
+        try:
+            check_comparable(
+                one, outcome, mirror.working_radius, options.aperture_tolerance, options.wavelength_tolerance
+            )
+        except MeasurementError as error:
+            raise MeasurementError(error.error_code, f"{label}: {error}") from error
+        if outcome.points is None:
+            outcome.take(Setup.of(one))
+        one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
+        outcome.take(MapTaken(one, one.radius > 0.0))
+    return outcome
+
+
+def _measured(maps: Maps, settings: IngestSettings) -> list[Measurement]:
+    """One measurement a map; those from files with their time and digest."""
+    if isinstance(maps, str | Path):
+        folder = Path(maps)
+        maps = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not maps:
+            raise ValueError(f"{folder}: holds no map file ({', '.join(SUFFIXES)})")
+    ingest, found = Ingest(), []
+    for one in maps:
+        if isinstance(one, Measurement):
+            found.append(one)
+        elif isinstance(one, str | Path):
+            surface, measured = ingest.read(Path(one), settings)
+            at = surface.time_stamp or Path(one).stat().st_mtime
+            found.append(replace(measured, stamp_ns=round(1e9 * at), sha256=surface.sha256))
+        else:
+            sag = np.asarray(one, dtype=np.float64)
+            if sag.ndim != 2:
+                raise ValueError(f"a map has the shape {sag.shape}: must be (height, width), m")
+            found.append(ingest.measure(SurfaceMap(sag, settings.wavelength, None, "array"), settings)[1])
+    if not found:
+        raise ValueError("maps: there is none")
+    return found
+
+
+def _kinds(signals: Floats, mirror: Mirror, hysteresis: bool) -> list[str]:
+    """(M,) kinds of the maps, as a run would have called them."""
+    away = np.abs(signals - mirror.rest) > 1e-9
+    if hysteresis:
+        tested = round((1.0 - CHECK_SHARE) * len(signals))
+        kinds = [EXCITATION if number < tested else CHECK for number in range(len(signals))]
+        if not away[0].any():
+            kinds[0] = REFERENCE
+        return kinds
+    return [{0: REFERENCE, 1: POKE}.get(int(count), SURFACE) for count in away.sum(axis=1)]

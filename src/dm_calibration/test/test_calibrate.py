@@ -1,0 +1,136 @@
+"""`calibrate` without ROS: from files and from arrays, with the examples, and what it refuses."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dm_calibration import calibrate
+from dm_calibration.acquisition.ingest import IngestSettings
+from dm_calibration.hysteresis.excitation import excitation
+from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.errors import MeasurementError
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, follow
+from dm_common.mirror import Mirror
+from dm_common.optics.sampling import SamplePoints
+from linear_mirror import RADIUS, LinearMirror, make_mirror
+from map_fixtures import NO_DATA, dat_bytes
+
+Floats = NDArray[np.float64]
+
+EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
+SIZE = 61
+PITCH = 2.0 * RADIUS / (SIZE - 1)
+COUNT = 0.5 * 632.8e-9 / 32768.0  # m per count of a .dat file of the fixtures
+
+
+def plant_on_pixels(mirror: Mirror) -> tuple[LinearMirror, NDArray[np.bool_]]:
+    """A mirror whose sag is known at every pixel, and the pixels of its aperture."""
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    x, y = (columns - 30.0) / 30.0, (30.0 - rows) / 30.0
+    inside = np.hypot(x, y) <= 1.0
+    points = SamplePoints(x.ravel(), y.ravel(), inside.ravel() / inside.sum())
+    return LinearMirror(mirror.x, mirror.y, points=points), inside
+
+
+def seen(plant: LinearMirror, inside: NDArray[np.bool_], signals: Floats) -> Floats:
+    """(M, height, width) m, NaN outside the aperture."""
+    return np.stack([np.where(inside, plant.sag(row).reshape(inside.shape), np.nan) for row in signals])
+
+
+def pokes(mirror: Mirror) -> Floats:
+    plan = make_plan(PlanKind.POKES, mirror, PlanOptions(degauss=False))
+    return np.stack([step.signals for step in plan.steps if step.signals is not None])
+
+
+def run_example(name: str, argument: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    monkeypatch.setattr(sys, "argv", [name, str(argument)])
+    return runpy.run_path(str(EXAMPLES / name))
+
+
+def test_a_folder_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    mirror = make_mirror()
+    plant, inside = plant_on_pixels(mirror)
+    commands = pokes(mirror)
+    for number, sag in enumerate(seen(plant, inside, commands)):
+        counts = np.where(inside, np.rint(sag / COUNT), NO_DATA).astype(np.int64)
+        (tmp_path / f"{number:03d}.dat").write_bytes(dat_bytes(counts, pitch=PITCH, time=1_700_000_000 + 5 * number))
+    np.savetxt(tmp_path / "commands.csv", commands, delimiter=",")
+    made = run_example("calibrate_folder.py", tmp_path, monkeypatch)
+    (file,) = tmp_path.glob("*.h5")
+    calibration = CalibrationStore(tmp_path).load(file.stem)
+    assert f"stored as {file}" in capsys.readouterr().out
+    assert calibration.id == made["calibration"].id  # type: ignore[attr-defined]
+    assert calibration.limitations == (calibration.limitations[0],)  # no findings of the poke check among them
+    np.testing.assert_allclose(np.diff(calibration.maps.stamp_ns), 5e9)
+    assert all(len(digest) == 64 for digest in calibration.maps.sha256)
+    true = plant.fit_terms(plant.influence.T).T
+    np.testing.assert_allclose(calibration.fit.influence_zernike[3:], true[3:], atol=0.01 * np.abs(true).max())
+
+
+def test_arrays_of_commands_times_and_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mirror = make_mirror(rings=1)
+    plant, inside = plant_on_pixels(mirror)
+    weight = np.array([[0.7], [0.2], [0.1]])
+    law = HysteresisModel(np.array([0.0, 0.225, 0.475]), weight, np.zeros(0), 0.0, 0.01, CREEP_TIMES)
+    moves = excitation(mirror, 80)
+    times = np.cumsum(1.0 + moves.dwell)
+    effective, _ = follow(law, law.demagnetised(mirror.actuators, 0.0), moves.signals, times)
+    file = tmp_path / "run.npz"
+    np.savez(
+        file,
+        x=mirror.x,
+        y=mirror.y,
+        radius=RADIUS,
+        pitch=PITCH,
+        commands=moves.signals,
+        times=times,
+        sag=seen(plant, inside, effective),
+    )
+    made = run_example("calibrate_arrays.py", file, monkeypatch)
+    known = made["calibration"].hysteresis  # type: ignore[attr-defined]
+    assert known.held_out_max_zernike < 3e-9
+    assert known.law.creep_rate == pytest.approx(0.01, rel=0.2)
+    left = made["left"]
+    assert isinstance(left, np.ndarray)
+    assert np.sqrt(np.mean(left**2)) < 3e-9
+    assert f"{known.name}: coefficients right to" in capsys.readouterr().out
+
+
+def test_measurements_and_what_is_refused() -> None:
+    mirror = make_mirror(rings=1)
+    plant, inside = plant_on_pixels(mirror)
+    commands = pokes(mirror)
+    sag, settings = seen(plant, inside, commands), IngestSettings(pitch=PITCH, aperture_radius=RADIUS)
+    calibration = calibrate(sag, commands, mirror=mirror, settings=settings)
+    again = calibrate(calibration.maps.measurements(), commands, mirror=mirror)
+    np.testing.assert_array_equal(again.fit.influence_sag, calibration.fit.influence_sag)
+    assert calibration.maps.kind[:2] == ("reference", "poke")
+
+    with pytest.raises(ValueError, match=r"commands: must be given"):
+        calibrate(sag, mirror=mirror)
+    with pytest.raises(ValueError, match=r"commands has the shape \(3, 7\): must be \(\d+, 7\) finite numbers"):
+        calibrate(sag, commands[:3], mirror=mirror, settings=settings)
+    with pytest.raises(ValueError, match=r"times has the shape \(2,\)"):
+        calibrate(sag, commands, [0.0, 1.0], mirror=mirror, settings=settings)
+    with pytest.raises(ValueError, match="times: hysteresis and creep"):
+        calibrate(sag, commands, mirror=mirror, settings=settings, hysteresis=True)
+    with pytest.raises(TooFewMapsError, match="good maps for"):
+        calibrate(sag[:2], commands[:2], mirror=mirror, settings=settings)
+    with pytest.raises(MeasurementError, match=r"map 1: aperture radius 8\.000 mm"):
+        calibrate(sag, commands, mirror=mirror, settings=replace(settings, aperture_radius=8e-3))
+
+
+def test_an_empty_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="holds no map file"):
+        calibrate(tmp_path, np.zeros((1, 7)), mirror=make_mirror(rings=1))
