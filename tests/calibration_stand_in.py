@@ -52,11 +52,11 @@ class StandIn:
         message = MirrorInfo(name=mirror.name, serial=mirror.serial, actuators=mirror.actuators)
         message.header.frame_id = "mirror"
         message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
-        message.neighbour_a = array("I", mirror.neighbours[:, 0].astype(np.uint32).tobytes())
-        message.neighbour_b = array("I", mirror.neighbours[:, 1].astype(np.uint32).tobytes())
+        message.neighbour_a = array("I", mirror.limits.pairs[:, 0].astype(np.uint32).tobytes())
+        message.neighbour_b = array("I", mirror.limits.pairs[:, 1].astype(np.uint32).tobytes())
         message.working_aperture_diameter = 2.0 * mirror.working_radius
-        message.signal_min, message.signal_max = mirror.signal_min, mirror.signal_max
-        message.neighbour_difference_max = mirror.neighbour_difference_max
+        message.signal_min, message.signal_max = mirror.limits.low, mirror.limits.high
+        message.neighbour_difference_max = mirror.limits.neighbour_difference
         self.info.publish(message)
 
     def publish_state(self, driver_state: int | None = None) -> None:

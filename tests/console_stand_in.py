@@ -66,7 +66,7 @@ class StandIn:
 
 
 def mirror_info(x: NDArray[np.float64], y: NDArray[np.float64]) -> MirrorInfo:
-    a, b = neighbour_pairs(x, y)
+    a, b = neighbour_pairs(x, y).T
     return MirrorInfo(
         name="MIRROR", serial="7", actuators=x.size, actuator_x=array("d", x), actuator_y=array("d", y),
         neighbour_a=array("I", a.tolist()), neighbour_b=array("I", b.tolist()), working_aperture_diameter=2 * RADIUS,

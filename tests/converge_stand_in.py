@@ -99,7 +99,7 @@ def calibration() -> Calibration:
 
 
 def mirror_info() -> MirrorInfo:
-    pairs = make_mirror().neighbours
+    pairs = make_mirror().limits.pairs
     return MirrorInfo(
         actuators=37, actuator_x=doubles(X), actuator_y=doubles(Y), signal_min=-1.0, signal_max=1.0,
         neighbour_a=[int(a) for a, _b in pairs], neighbour_b=[int(b) for _a, b in pairs], neighbour_difference_max=2.0,

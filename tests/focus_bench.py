@@ -37,7 +37,7 @@ REPORT_PERIOD = 0.5
 
 def mirror_info(serial: str = "T-1") -> MirrorInfo:
     x, y = hexagon()
-    pairs = make_mirror().neighbours
+    pairs = make_mirror().limits.pairs
     return MirrorInfo(
         name="PDM30-37",
         serial=serial,

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dm_common.limits import Limits
 from dm_common.optics.zernike import TERMS
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import Limits
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
 
 @pytest.fixture(scope="module")
 def mirror() -> CalibratedMirror:
-    limits = Limits(-1.0, 1.0, np.array(make_mirror().neighbours), 2.0)
+    limits = Limits(-1.0, 1.0, np.array(make_mirror().limits.pairs), 2.0)
     return CalibratedMirror(perfect_model(LinearMirror(*hexagon())), limits)
 
 

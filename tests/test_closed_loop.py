@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from dm_common.errors import Refusal
+from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
 from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.base import Shape, Solver
-from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.registry import make_solver
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
-LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().neighbours, dtype=np.intp), 2.0)
+LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().limits.pairs, dtype=np.intp), 2.0)
 MIRROR = LinearMirror(*hexagon())
 MODEL = perfect_model(MIRROR)
 

@@ -35,7 +35,7 @@ LAW = HysteresisModel(np.array([0.0, 0.1, 0.3]), np.array([[0.8], [0.1], [0.1]])
 
 def mirror_info() -> MirrorInfo:
     x, y = hexagonal_positions(COUNT)
-    a, b = neighbour_pairs(x, y)
+    a, b = neighbour_pairs(x, y).T
     return MirrorInfo(
         name="T", serial="1", actuators=COUNT, actuator_x=x.tolist(), actuator_y=y.tolist(),
         neighbour_a=a.tolist(), neighbour_b=b.tolist(), working_aperture_diameter=2 * RADIUS,

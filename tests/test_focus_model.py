@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
+from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget, TargetError
-from dm_controller.solvers.bounded import Limits
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
-PAIRS = np.asarray(make_mirror().neighbours, dtype=np.intp)
+PAIRS = np.asarray(make_mirror().limits.pairs, dtype=np.intp)
 
 
 @pytest.fixture(scope="module")

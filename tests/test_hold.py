@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.limits import Limits
 from dm_controller.creep_hold import PERIOD_S, CreepHold
 from dm_controller.hysteresis_observer import Look
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import Limits
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
@@ -28,7 +28,7 @@ class Shape:
     def __init__(self, values: Mapping[str, Any] = {}, creep_rate: float = 0.01, known: bool = True) -> None:
         law = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.9], [0.1]]), np.zeros(0), 0.0, creep_rate, CREEP_TIMES)
         mirror = CalibratedMirror(
-            perfect_model(LinearMirror(*hexagon())), Limits(-1.0, 1.0, make_mirror().neighbours, 2.0)
+            perfect_model(LinearMirror(*hexagon())), Limits(-1.0, 1.0, make_mirror().limits.pairs, 2.0)
         )
         self.loop = Planner(mirror, HysteresisFigures(law, np.full(21, 3e-10), 1e-9, 0.05))
         self.hold = CreepHold(DEFAULTS | dict(values))

@@ -11,6 +11,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS
 from dm_common.recipes import Recipe, RecipeError
@@ -25,13 +26,12 @@ from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import find
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import Limits
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 from studies.comparison.compare import true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
-LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().neighbours, dtype=np.intp), 2.0)
+LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().limits.pairs, dtype=np.intp), 2.0)
 WAVELENGTH = 632.8e-9
 
 

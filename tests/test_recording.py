@@ -61,12 +61,12 @@ def mirror_message(run: RecordedRun) -> MirrorInfo:
         actuators=mirror.actuators,
         actuator_x=doubles(mirror.x),
         actuator_y=doubles(mirror.y),
-        neighbour_a=array("I", mirror.neighbours[:, 0].tolist()),
-        neighbour_b=array("I", mirror.neighbours[:, 1].tolist()),
+        neighbour_a=array("I", mirror.limits.pairs[:, 0].tolist()),
+        neighbour_b=array("I", mirror.limits.pairs[:, 1].tolist()),
         working_aperture_diameter=2.0 * mirror.working_radius,
-        signal_min=mirror.signal_min,
-        signal_max=mirror.signal_max,
-        neighbour_difference_max=mirror.neighbour_difference_max,
+        signal_min=mirror.limits.low,
+        signal_max=mirror.limits.high,
+        neighbour_difference_max=mirror.limits.neighbour_difference,
     )
 
 

@@ -22,11 +22,11 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.surface_samples import SURFACES
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.prediction import ForecastClient, hysteresis_share, surface_control_error_rms
-from dm_controller.solvers.bounded import Limits
 from hysteretic_mirror import MIRROR, calibrated, calibrated_by_pokes
 from linear_mirror import RADIUS
 from studies.comparison.simulated_bench import influence_model

@@ -15,12 +15,12 @@ from scipy.optimize import lsq_linear
 
 from dm_bringup.suite import Suite, own_domain
 from dm_client import DeformableMirrorClient, DeformableMirrorError
+from dm_common.limits import Limits
 from dm_common.optics.sag import remove_piston_tilt
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import Limits
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
 from dm_tools.demo.demo import bench_config
 from dm_tools.verbs.up import shared_config

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dm_common.limits import Limits
 from dm_common.names import UnknownNameError
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import FREE, Shape, Solver, rms_sag, target_shape
-from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.iterative_learning import IterativeLearning
 from dm_controller.solvers.pseudo_inverse import PseudoInverse
 from dm_controller.solvers.region_weighted import AZWreg
@@ -24,7 +24,7 @@ from studies.solvers.registry import SOLVERS, MirrorFacts, check_method, make_so
 from studies.solvers.sparse import SparseSampling
 from studies.solvers.steepest_descent import SteepestDescent
 
-PAIRS = np.asarray(make_mirror().neighbours, dtype=np.intp)
+PAIRS = np.asarray(make_mirror().limits.pairs, dtype=np.intp)
 X, Y = hexagon()
 FACTS = MirrorFacts(X, Y)
 #: Methods that meet the 21 coefficients exactly as long as no limit is in the way.

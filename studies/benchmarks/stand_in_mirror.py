@@ -20,6 +20,7 @@ from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_common.geometry import hexagonal_positions, neighbour_pairs, ring_count
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.limits import Limits
 from dm_common.messages import doubles
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
@@ -51,7 +52,7 @@ SERIAL = "bench"
 def identified_law(name: str) -> HysteresisModel:
     """The law of class `name` (of TWIN_LAWS), fitted to actuators of the twin that follow a like one."""
     x, y = hexagonal_positions(ACTUATORS, PITCH)
-    mirror = Mirror("hexagon", "", x, y, WORKING_RADIUS, neighbours=np.column_stack(neighbour_pairs(x, y)))
+    mirror = Mirror("hexagon", "", x, y, WORKING_RADIUS, Limits(pairs=neighbour_pairs(x, y)))
     generator = np.random.default_rng(ACTUATORS)
     piezo = PiezoActuators(PiezoConfig(law=TWIN_LAWS[name]), generator, np.zeros(ACTUATORS))
     commands = excitation(mirror, MAPS)
@@ -103,7 +104,7 @@ def influence_model(actuators: int = 37) -> InfluenceModel:
 def mirror_info() -> MirrorInfo:
     """The mirror as the driver announces it."""
     x, y = hexagonal_positions(37, PITCH)
-    first, second = neighbour_pairs(x, y)
+    first, second = neighbour_pairs(x, y).T
     return MirrorInfo(
         name="PDM30-37",
         serial=SERIAL,

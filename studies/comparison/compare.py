@@ -23,11 +23,12 @@ from dm_calibration.influence.maps import SURFACE
 from dm_calibration.influence.region_weighting import choose_weighting
 from dm_calibration.influence.regression import least_squares, make_design
 from dm_calibration.procedure.procedure import Progress
+from dm_common.bounded import BoundedProgramme
+from dm_common.limits import Limits
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Solver, target_shape
-from dm_controller.solvers.bounded import BoundedProgramme, Limits
 from dm_controller.solvers.pseudo_inverse import PseudoInverse
 from dm_tools.verify import SurfaceError, surface_error
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, influence_model, plan_steps

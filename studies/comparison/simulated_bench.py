@@ -21,15 +21,14 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
 from dm_common.hysteresis.tracker import Applied
+from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points, sample_map
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.bounded import Limits
 from dm_driver.degauss import degauss_waypoints
 from dm_driver.output.volts import VoltScale
-from dm_driver.safety_limiter import Limits as DriverLimits
-from dm_driver.safety_limiter import SafetyLimiter
+from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
 from dm_simulation.electronics.drive_unit import EDAC40_FULL_SCALE, DriveConfig, DriveUnit
 from dm_simulation.electronics.frames import EDAC40_VALUE, EdacFrame
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
@@ -83,12 +82,7 @@ class SimulatedBench:
         self._points = edge_clustered_points(config.samples)
         pairs = neighbour_pairs(self.plate.x, self.plate.y)
         self._limiter = SafetyLimiter(
-            DriverLimits(
-                actuators=len(self.plate.x),
-                neighbour_difference=config.neighbour_difference,
-                neighbour_a=pairs[:, 0],
-                neighbour_b=pairs[:, 1],
-            )
+            DriverLimits(actuators=len(self.plate.x), pairs=pairs, neighbour_difference=config.neighbour_difference)
         )
         self._fitter: MapFitter | None = None
         self._written: Floats = self._drive.signals()
@@ -100,16 +94,10 @@ class SimulatedBench:
         self.maps = 0
         self.reports: list[Applied] = []
         self._report()
-        self.mirror = Mirror(
-            "PDM30-37",
-            f"twin-{config.seed}",
-            self.plate.x,
-            self.plate.y,
-            camera.field_diameter / 2,
-            neighbours=pairs,
-            neighbour_difference_max=config.neighbour_difference,
-        )
         self.limits = Limits(-1.0, 1.0, pairs, config.neighbour_difference)
+        self.mirror = Mirror(
+            "PDM30-37", f"twin-{config.seed}", self.plate.x, self.plate.y, camera.field_diameter / 2, self.limits
+        )
 
     def fork(self) -> SimulatedBench:
         """A second bench in exactly this state, noise to come included, so that methods can be compared."""
@@ -280,10 +268,8 @@ class SimulatedBench:
 def plan_steps(kind: PlanKind = PlanKind.FULL, options: PlanOptions | None = None) -> int:
     """Steps of a plan on the twin's mirror, for progress bars."""
     plate = Plate(PlateConfig())
-    mirror = Mirror(
-        "PDM30-37", "", plate.x, plate.y, InterferometerConfig().field_diameter / 2,
-        neighbours=neighbour_pairs(plate.x, plate.y),
-    )  # fmt: skip
+    limits = Limits(pairs=neighbour_pairs(plate.x, plate.y))
+    mirror = Mirror("PDM30-37", "", plate.x, plate.y, InterferometerConfig().field_diameter / 2, limits)
     return len(make_plan(kind, mirror, options).steps)
 
 

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.bounded import BoundedProgramme
+from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import FREE_TERMS
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import BoundedProgramme, Limits
 from studies.comparison.simulated_bench import SimulatedBench
 
 Floats = NDArray[np.float64]

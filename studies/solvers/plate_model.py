@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from dm_common.limits import Limits
 from dm_common.optics.sag import remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import FREE, Floats, Shape, Solver, normalised_terms, points_of
-from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.pseudo_inverse import CUTOFF
 
 

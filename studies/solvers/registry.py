@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Solver
-from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.registry import SOLVERS as OFFERED
 from dm_controller.solvers.registry import Factory, MirrorFacts, named
 from studies.solvers.plate_model import PlateModel

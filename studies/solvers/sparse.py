@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linprog
 
+from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import FREE, Command, Floats, Shape, Solver, normalised_terms
-from dm_controller.solvers.bounded import Limits
 
 #: What a unit of coefficient error (in units of the strongest pattern) costs against a unit of θ. An L1 penalty is
 #: exact: above a certain price the coefficients are met to the last digit whenever the limits permit.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import FREE, Command, Floats, Shape, Solver, normalised_terms
-from dm_controller.solvers.bounded import Limits
 
 #: Iterations on the model in an open-loop solve: with the condition number of such mirrors (10 to 13) the error of the
 #: worst mode falls by 2 % an iteration.

@@ -14,6 +14,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import kei
 
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points
 from dm_common.optics.zernike import basis
@@ -37,8 +38,7 @@ def make_mirror(rings: int = 3, neighbour_difference_max: float = 2.0, serial: s
         x,
         y,
         RADIUS,
-        neighbours=np.column_stack(neighbour_pairs(x, y)),
-        neighbour_difference_max=neighbour_difference_max,
+        Limits(pairs=neighbour_pairs(x, y), neighbour_difference=neighbour_difference_max),
     )
 
 

@@ -8,20 +8,27 @@ import numpy as np
 import pytest
 
 from dm_calibration.hysteresis.excitation import CHECK_SHARE, MAPS_MIN, excitation
+from dm_common.limits import Limits
+from dm_common.mirror import Mirror
 from linear_mirror import make_mirror
+
+
+def limited(difference: float, low: float = -1.0, high: float = 1.0) -> Mirror:
+    mirror = make_mirror(rings=1)
+    return replace(mirror, limits=Limits(low, high, mirror.limits.pairs, difference))
 
 
 @pytest.mark.parametrize("difference", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-0.4, 0.8)])
 def test_commands_keep_the_limits(difference: float, low: float, high: float) -> None:
-    mirror = replace(make_mirror(rings=1), neighbour_difference_max=difference, signal_min=low, signal_max=high)
+    mirror = limited(difference, low, high)
     commands = excitation(mirror, 200)
-    assert not any(mirror.breaks_limits(signals) for signals in commands.signals)
+    assert all(mirror.limits.allow(signals) for signals in commands.signals)
 
 
 @pytest.mark.parametrize("difference", [0.5, 1.0, 2.0])
 def test_every_actuator_turns_over_a_wide_swing(difference: float) -> None:
-    signals = excitation(replace(make_mirror(rings=1), neighbour_difference_max=difference), 150).signals
+    signals = excitation(limited(difference), 150).signals
     change = np.diff(signals, axis=0)
     assert ((change[1:] * change[:-1] < 0.0).sum(axis=0) >= 50).all()
     assert (np.ptp(signals, axis=0) > 1.5).all()

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dm_calibration.influence import surfaces
-from dm_common.mirror import Mirror, rings, scale_to_limits
+from dm_common.mirror import Mirror
 from dm_common.names import UnknownNameError
 from dm_common.optics.zernike import TERMS, index_of
-from linear_mirror import LinearMirror, hexagon, make_mirror
+from linear_mirror import LinearMirror, make_mirror
 
 
 class Model:
@@ -55,15 +53,6 @@ def test_signal_surfaces_are_those_of_the_table(mirror: Mirror) -> None:
         assert signals(f"p{46 + k}") == [value] + [-1.0] * 36
 
 
-def test_rings_come_from_positions() -> None:
-    assert rings(*hexagon(3)).tolist() == [0] + [1] * 6 + [2] * 12 + [3] * 18
-    shuffled = np.random.default_rng(0).permutation(37)
-    x, y = hexagon(3)
-    assert (rings(x[shuffled], y[shuffled]) == rings(x, y)[shuffled]).all()
-    assert rings(np.zeros(1), np.zeros(1)).tolist() == [0]
-    assert rings(np.array([0.0, 1.0, -1.0, 9.0]), np.zeros(4)).max() >= 1
-
-
 def test_unknown_names_are_refused_with_near_ones() -> None:
     with pytest.raises(UnknownNameError, match=r"surface 'pz12' is unknown; did you mean .*pz1"):
         surfaces.check_names(["p01", "pz12"])
@@ -92,20 +81,6 @@ def test_neighbour_limit_scales_about_the_mean_and_says_so() -> None:
     assert surfaces.signal_surface("p06", make_mirror()).remark == ""
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    st.lists(st.floats(-3.0, 3.0), min_size=37, max_size=37),
-    st.floats(0.05, 2.0),
-)
-def test_scaled_signals_keep_every_limit(values: list[float], limit: float) -> None:
-    mirror = make_mirror(neighbour_difference_max=limit)
-    signals, factor = scale_to_limits(np.array(values), mirror)
-    assert signals.min() >= -1.0 and signals.max() <= 1.0
-    a, b = mirror.neighbours.T
-    assert np.abs(signals[a] - signals[b]).max() <= limit
-    assert 0.0 <= factor <= 1.0
-
-
 @pytest.mark.parametrize(("name", "radius"), [("p55", 60.0), ("p56", -60.0), ("p57", 100.0), ("p58", -100.0)])
 def test_spheres_have_their_curvature(name: str, radius: float, mirror: Mirror, plant: LinearMirror) -> None:
     model = Model(plant)
@@ -115,7 +90,7 @@ def test_spheres_have_their_curvature(name: str, radius: float, mirror: Mirror, 
     assert surface.nominal[index_of(2, 0)] == pytest.approx(mirror.working_radius**2 / (4.0 * radius), rel=1e-4)
     reached = plant.fit_terms(model.influence_sag @ surface.signals + model.sag_offset)
     assert reached[3:] == pytest.approx(surface.nominal[3:], abs=20e-9)
-    assert not mirror.breaks_limits(surface.signals)
+    assert mirror.limits.allow(surface.signals)
 
 
 @pytest.mark.parametrize("name", [f"pz{k:02d}" for k in range(2, 12)])
@@ -147,7 +122,7 @@ def test_tilt_surface_moves_the_actuators_in_a_plane(mirror: Mirror, plant: Line
 def test_limited_spheres_record_what_they_became(plant: LinearMirror) -> None:
     limited = make_mirror(neighbour_difference_max=0.05)
     surface = surfaces.model_surface("p55", Model(plant), limited)
-    assert not limited.breaks_limits(surface.signals)
+    assert limited.limits.allow(surface.signals)
     assert "reduced to" in surface.remark
     free = surfaces.model_surface("p55", Model(plant), make_mirror())
     assert surface.nominal is not None and free.nominal is not None

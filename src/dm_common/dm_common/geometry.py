@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import shortest_path
+from scipy.spatial.distance import pdist
 
 #: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid the nearest six, whose
 #: next ones are sqrt(3) away.
@@ -62,8 +65,13 @@ def hexagonal_positions(
     return (-all_x if reflected else all_x), all_y
 
 
-def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return index arrays (a, b), a < b, of all pairs closer than 1.2 times the smallest distance.
+def pitch(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Smallest distance between two actuators, in the unit of the positions (N,)."""
+    return float(pdist(np.column_stack((x, y))).min())
+
+
+def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the (P, 2) indices, the smaller first, of all pairs closer than 1.2 times the smallest distance.
 
     Args:
         x, y: (N,) positions in m.
@@ -71,15 +79,24 @@ def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDA
     Raises:
         ValueError: two actuators at the same place.
     """
-    a, b = np.triu_indices(x.size, k=1)
-    if a.size == 0:
-        return a, b
-    distance = np.hypot(x[a] - x[b], y[a] - y[b])
+    pairs = np.column_stack(np.triu_indices(x.size, k=1))
+    if len(pairs) == 0:
+        return pairs
+    distance = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]] for places in (x, y)))
     smallest = distance.min()
     if smallest <= 0.0:
-        pair = int(distance.argmin())
-        raise ValueError(
-            f"mirror.actuator_x and mirror.actuator_y: actuators {a[pair] + 1} and {b[pair] + 1} are at the same place"
-        )
-    near = distance < NEIGHBOUR_DISTANCE_RATIO * smallest
-    return a[near], b[near]
+        a, b = pairs[distance.argmin()] + 1
+        raise ValueError(f"mirror.actuator_x and mirror.actuator_y: actuators {a} and {b} are at the same place")
+    return pairs[distance < NEIGHBOUR_DISTANCE_RATIO * smallest]
+
+
+def rings(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Ring of each actuator: steps from neighbour to neighbour from the actuator nearest to the centroid (ring 0).
+
+    Actuators that no chain of neighbours reaches get -1.
+    """
+    near = np.zeros((x.size, x.size))
+    near[tuple(neighbour_pairs(x, y).T)] = 1.0
+    centre = int(np.argmin(np.hypot(x - x.mean(), y - y.mean())))
+    steps = shortest_path(csr_array(near), directed=False, unweighted=True, indices=centre)
+    return np.where(np.isfinite(steps), steps, -1).astype(np.int64)

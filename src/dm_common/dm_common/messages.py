@@ -13,6 +13,7 @@ from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints
@@ -38,6 +39,18 @@ def stamp_ns(message: Time) -> int:
     return int(message.sec * 10**9 + message.nanosec)
 
 
+def limits_from(message: MirrorInfo) -> Limits:
+    """The limits of the mirror that the driver describes.
+
+    Raises:
+        ValueError: naming what makes no sense.
+    """
+    if len(message.neighbour_a) != len(message.neighbour_b):
+        raise ValueError(f"mirror_info: {len(message.neighbour_a)} neighbour_a, {len(message.neighbour_b)} neighbour_b")
+    pairs = np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.intp)
+    return Limits(message.signal_min, message.signal_max, pairs, message.neighbour_difference_max)
+
+
 def mirror_from(message: MirrorInfo) -> Mirror:
     """The mirror that the driver describes.
 
@@ -47,18 +60,13 @@ def mirror_from(message: MirrorInfo) -> Mirror:
     for name in ("actuator_x", "actuator_y"):
         if len(getattr(message, name)) != message.actuators:
             raise ValueError(f"mirror_info: {name} has {len(getattr(message, name))} values, not {message.actuators}")
-    if len(message.neighbour_a) != len(message.neighbour_b):
-        raise ValueError(f"mirror_info: {len(message.neighbour_a)} neighbour_a, {len(message.neighbour_b)} neighbour_b")
     return Mirror(
         name=message.name,
         serial=message.serial,
         x=np.array(message.actuator_x, dtype=np.float64),
         y=np.array(message.actuator_y, dtype=np.float64),
         working_radius=0.5 * message.working_aperture_diameter,
-        signal_min=message.signal_min,
-        signal_max=message.signal_max,
-        neighbours=np.column_stack((message.neighbour_a, message.neighbour_b)).astype(np.int64).reshape(-1, 2),
-        neighbour_difference_max=message.neighbour_difference_max,
+        limits=limits_from(message),
     )
 
 

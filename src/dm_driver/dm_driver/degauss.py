@@ -8,7 +8,7 @@ import numpy as np
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_driver.moves import Kind, Move
-from dm_driver.safety_limiter import Limits, Shape
+from dm_driver.safety_limiter import DriverLimits, Shape
 
 #: A degauss of at least this share of the full range leaves nothing of what was before.
 FULL_CYCLE = 0.999
@@ -33,7 +33,7 @@ def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: in
     yield end
 
 
-def degauss_move(limits: Limits, amplitude: float, steps: int, end: Shape) -> Move:
+def degauss_move(limits: DriverLimits, amplitude: float, steps: int, end: Shape) -> Move:
     """The decaying cycle about mid range, then the way to `end` (a legal shape).
 
     Args:
@@ -45,8 +45,8 @@ def degauss_move(limits: Limits, amplitude: float, steps: int, end: Shape) -> Mo
     Raises:
         Refusal: OUT_OF_RANGE.
     """
-    middle = 0.5 * (limits.signal_min + limits.signal_max)
-    largest = 0.5 * (limits.signal_max - limits.signal_min)
+    middle = limits.middle
+    largest = limits.half_range
     if not 0.0 <= amplitude <= largest:
         raise Refusal(ErrorCode.OUT_OF_RANGE, f"amplitude = {amplitude:g}: must be 0 to {largest:g}")
     if steps < 1:

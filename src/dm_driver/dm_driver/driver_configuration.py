@@ -18,7 +18,7 @@ from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import wiring_table
-from dm_driver.safety_limiter import Limits, SafetyLimiter, Shape
+from dm_driver.safety_limiter import DriverLimits, SafetyLimiter, Shape
 
 
 @dataclass(frozen=True)
@@ -82,14 +82,12 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
             f"mirror.working_aperture_diameter = {values['mirror.working_aperture_diameter']:g} m: must be at most"
             f" mirror.full_aperture_diameter = {values['mirror.full_aperture_diameter']:g} m"
         )
-    neighbour_a, neighbour_b = neighbour_pairs(x, y)
-    limits = Limits(
+    limits = DriverLimits(
         actuators=actuators,
-        signal_min=values["limits.signal_min"],
-        signal_max=values["limits.signal_max"],
+        low=values["limits.signal_min"],
+        high=values["limits.signal_max"],
         neighbour_difference=values["limits.neighbour_difference"],
-        neighbour_a=neighbour_a,
-        neighbour_b=neighbour_b,
+        pairs=neighbour_pairs(x, y),
         step=values["limits.step"] / back_end.frames_per_step,
         slew_rate=values["limits.slew_rate"],
         command_age=values["limits.command_age"],

@@ -73,7 +73,7 @@ def state_message(
         limits = configuration.limiter.limits
         # Quantisation may leave a signal up to one code short of its limit.
         code = configuration.output.scale.resolution
-        at_limit = (state.applied <= limits.signal_min + code) | (state.applied >= limits.signal_max - code)
+        at_limit = (state.applied <= limits.low + code) | (state.applied >= limits.high - code)
         flags[at_limit] |= ActuatorState.FLAG_AT_LIMIT
         if message.moving:
             flags[np.abs(state.requested - state.applied) > code] |= ActuatorState.FLAG_RAMPING
@@ -92,12 +92,12 @@ def mirror_info_message(
         actuators=limits.actuators,
         actuator_x=_floats(configuration.x),
         actuator_y=_floats(configuration.y),
-        neighbour_a=_indices(limits.neighbour_a),
-        neighbour_b=_indices(limits.neighbour_b),
+        neighbour_a=_indices(limits.pairs[:, 0]),
+        neighbour_b=_indices(limits.pairs[:, 1]),
         full_aperture_diameter=values["mirror.full_aperture_diameter"],
         working_aperture_diameter=values["mirror.working_aperture_diameter"],
-        signal_min=limits.signal_min,
-        signal_max=limits.signal_max,
+        signal_min=limits.low,
+        signal_max=limits.high,
         neighbour_difference_max=limits.neighbour_difference,
         slew_rate_max=limits.slew_rate,
         volts_min=configuration.output.scale.volts_min,

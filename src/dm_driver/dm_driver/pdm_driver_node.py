@@ -211,7 +211,7 @@ class PdmDriverNode(LifecycleNode):
     def _on_degauss(self, request: Any, response: Any) -> Any:
         def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
             limits = configuration.limiter.limits
-            middle = np.full(limits.actuators, 0.5 * (limits.signal_min + limits.signal_max))
+            middle = np.full(limits.actuators, limits.middle)
             end = configuration.limiter.check_shape(request.end_signals or middle, "end_signals")
             return writer.degauss(request.amplitude, request.steps or self._values["degauss.steps"], end)
 

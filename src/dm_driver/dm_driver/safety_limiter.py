@@ -9,34 +9,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.limits import SLACK, Limits
 
 Shape = NDArray[np.float64]
 
-#: A value this far beyond a limit is rounding, not a mistake.
-SLACK = 1e-9
 #: Interpolation rounds once more, so the check in front of the write is wider by this.
 _ROUNDING = 1e-12
 
 
-def _no_pairs() -> NDArray[np.intp]:
-    return np.zeros(0, dtype=np.intp)
-
-
-@dataclass(frozen=True)
-class Limits:
-    """The limits of one mirror; signals are normalised.
+@dataclass(frozen=True, kw_only=True)
+class DriverLimits(Limits):
+    """The limits of one mirror, and of the commands for it.
 
     Attributes:
         actuators: number of signals N.
-        signal_min, signal_max: range of every signal, inside -1..+1.
-        neighbour_difference: largest difference between the signals of neighbouring actuators.
-        neighbour_a, neighbour_b: (P,) indices of the neighbours.
         step: largest change of a signal from one write to the next.
         slew_rate: largest mean rate of change of a signal, 1/s.
         command_age: a command older than this is refused, s.
@@ -47,21 +39,15 @@ class Limits:
     """
 
     actuators: int
-    signal_min: float = -1.0
-    signal_max: float = 1.0
-    neighbour_difference: float = 1.0
-    neighbour_a: NDArray[np.intp] = field(default_factory=_no_pairs)
-    neighbour_b: NDArray[np.intp] = field(default_factory=_no_pairs)
     step: float = 0.1
     slew_rate: float = 40.0
     command_age: float = 1.0
     command_lead: float = 0.5
 
     def __post_init__(self) -> None:
-        if not -1.0 <= self.signal_min < self.signal_max <= 1.0:
+        if not -1.0 <= self.low < self.high <= 1.0:
             raise ValueError(
-                f"limits.signal_min = {self.signal_min:g}, limits.signal_max = {self.signal_max:g}: must be rising and"
-                " in -1 to 1"
+                f"limits.signal_min = {self.low:g}, limits.signal_max = {self.high:g}: must be rising and in -1 to 1"
             )
         for name in ("neighbour_difference", "step", "slew_rate", "command_age", "command_lead"):
             value = getattr(self, name)
@@ -70,9 +56,9 @@ class Limits:
 
 
 class SafetyLimiter:
-    """Judge commands and plan moves within `Limits`. Holds no state: the caller says where the mirror stands."""
+    """Judge commands and plan moves within `DriverLimits`. Holds no state: the caller says where the mirror stands."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: DriverLimits) -> None:
         self.limits = limits
 
     def check_shape(self, signals: ArrayLike, name: str = "signals") -> Shape:
@@ -88,7 +74,7 @@ class SafetyLimiter:
                 ErrorCode.INVALID_LENGTH,
                 f"{name} has {shape.size} values: must have {limits.actuators}, one per actuator",
             )
-        low, high = limits.signal_min, limits.signal_max
+        low, high = limits.low, limits.high
         inside = (shape >= low - SLACK) & (shape <= high + SLACK)  # False for NaN
         if not inside.all():
             finite = np.isfinite(shape)
@@ -132,9 +118,9 @@ class SafetyLimiter:
         limits = self.limits
         if shape.shape != (limits.actuators,):
             self.check_shape(shape)
-        outside = ~((shape >= limits.signal_min) & (shape <= limits.signal_max))
+        outside = ~((shape >= limits.low) & (shape <= limits.high))
         if outside.any():
-            rule = f"must be {limits.signal_min:g} to {limits.signal_max:g}"
+            rule = f"must be {limits.low:g} to {limits.high:g}"
             raise Refusal(ErrorCode.INTERNAL, self._text("signals", shape, outside, rule), outside)
         self._check_neighbours(shape, "signals", SLACK + _ROUNDING)
         if previous is not None:
@@ -155,7 +141,7 @@ class SafetyLimiter:
         """
         steps = max(1, math.ceil(largest_change(start, target) / self.limits.step - SLACK))
         difference = target - start
-        low, high = self.limits.signal_min, self.limits.signal_max
+        low, high = self.limits.low, self.limits.high
         for number in range(1, steps):
             # The last bit of an interpolated value may lie beyond the range.
             yield np.clip(start + difference * (number / steps), low, high)
@@ -164,7 +150,7 @@ class SafetyLimiter:
     def path(self, start: Shape, waypoints: Iterable[Shape]) -> Iterator[Shape]:
         """Yield the shapes to write on the way from `start` through all `waypoints` (legal but for rounding)."""
         for waypoint in waypoints:
-            target = np.clip(waypoint, self.limits.signal_min, self.limits.signal_max)
+            target = np.clip(waypoint, self.limits.low, self.limits.high)
             yield from self.ramp(start, target)
             start = target
 
@@ -180,15 +166,14 @@ class SafetyLimiter:
 
     def _check_neighbours(self, shape: Shape, name: str, slack: float) -> None:
         limits = self.limits
-        difference = np.abs(shape[limits.neighbour_a] - shape[limits.neighbour_b])
+        difference = limits.differences(shape)
         too_far = difference > limits.neighbour_difference + slack
         if not too_far.any():
             return
         at_fault = np.zeros(limits.actuators, dtype=np.bool_)
-        at_fault[limits.neighbour_a[too_far]] = True
-        at_fault[limits.neighbour_b[too_far]] = True
+        at_fault[limits.pairs[too_far]] = True
         worst = int(difference.argmax())
-        a, b = int(limits.neighbour_a[worst]), int(limits.neighbour_b[worst])
+        a, b = limits.pairs[worst]
         others = int(too_far.sum()) - 1
         raise Refusal(
             ErrorCode.NEIGHBOUR_DIFFERENCE,

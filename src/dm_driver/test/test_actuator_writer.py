@@ -18,11 +18,11 @@ from dm_driver.moves import Kind, Outcome, WriterState
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
 from dm_driver.output.wiring import TABLES, wiring_table
-from dm_driver.safety_limiter import Limits, SafetyLimiter
+from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
 from drive_unit_servers import Edac40TcpUnit, Frame
 from waiting import wait_until
 
-A, B = neighbour_pairs(*hexagonal_positions(37))
+PAIRS = neighbour_pairs(*hexagonal_positions(37))
 SCALE = VoltScale(65535, -6.0, 6.0, 80.0, 0.0, 300.0)
 CODE = SCALE.resolution
 
@@ -42,7 +42,7 @@ def running_writer(
     writer = ActuatorWriter(
         electronics("127.0.0.1", unit.port, timeout_s=0.5),
         OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
-        SafetyLimiter(Limits(37, -1, 1, 1.0, A, B, step=0.1, slew_rate=slew_rate)),
+        SafetyLimiter(DriverLimits(-1, 1, PAIRS, 1.0, actuators=37, step=0.1, slew_rate=slew_rate)),
         np.full(37, -1.0),
         listener=lambda state, edge: told.append((state, edge)),
         **arguments,
@@ -76,7 +76,7 @@ def test_nothing_is_written_before_enable_and_then_the_safe_shape_first(unit: Ed
     writer = ActuatorWriter(
         Edac40Tcp("127.0.0.1", unit.port),
         OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
-        SafetyLimiter(Limits(37)),
+        SafetyLimiter(DriverLimits(actuators=37)),
         shape(-0.25),
     )
     writer.start()
@@ -151,7 +151,7 @@ def test_a_correction_that_something_overtook_is_left_out(unit: Edac40TcpUnit) -
 
 def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac40TcpUnit) -> None:
     generator = np.random.default_rng(7)
-    limiter = SafetyLimiter(Limits(37, -1, 1, 1.0, A, B))
+    limiter = SafetyLimiter(DriverLimits(-1, 1, PAIRS, 1.0, actuators=37))
     with running_writer(unit, slew_rate=200.0) as (writer, _told):
         last = None
         for number in range(60):
@@ -168,7 +168,7 @@ def test_random_commands_at_random_moments_break_no_limit_on_the_wire(unit: Edac
     on_wire = signals_of(unit.frames)
     assert len(on_wire) > 60
     assert np.abs(on_wire).max() <= 1.0
-    assert np.abs(on_wire[:, A] - on_wire[:, B]).max() <= 1.0 + CODE
+    assert np.abs(on_wire[:, PAIRS[:, 0]] - on_wire[:, PAIRS[:, 1]]).max() <= 1.0 + CODE
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
     assert on_wire[-1] == pytest.approx(requested, abs=CODE)
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_driver.safety_limiter import SLACK, Limits, SafetyLimiter
+from dm_driver.safety_limiter import SLACK, DriverLimits, SafetyLimiter
 
 RING = np.arange(7)
 BEYOND = 2 * SLACK
@@ -18,10 +18,10 @@ floats = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
 
 def limiter(**limits: float) -> SafetyLimiter:
     """Seven actuators in a ring."""
-    return SafetyLimiter(Limits(7, neighbour_a=RING, neighbour_b=np.roll(RING, 1), **limits))
+    return SafetyLimiter(DriverLimits(actuators=7, pairs=np.column_stack((RING, np.roll(RING, 1))), **limits))
 
 
-def reason(action: object, *arguments: object) -> ErrorCode:
+def reason(action: object, *arguments: object) -> int:
     with pytest.raises(Refusal) as caught:
         action(*arguments)  # type: ignore[operator]
     return ErrorCode(caught.value.error_code)
@@ -29,7 +29,7 @@ def reason(action: object, *arguments: object) -> ErrorCode:
 
 @given(low=st.floats(-1.0, -0.01), high=st.floats(0.01, 1.0), actuator=st.integers(0, 6))
 def test_range(low: float, high: float, actuator: int) -> None:
-    judge = limiter(signal_min=low, signal_max=high, neighbour_difference=2.0)
+    judge = limiter(low=low, high=high, neighbour_difference=2.0)
     for edge, outwards in ((low, -1.0), (high, 1.0)):
         signals = np.zeros(7)
         signals[actuator] = edge

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dm_common.bounded import BoundedProgramme
 from dm_common.geometry import hexagonal_positions, ring_count
+from dm_common.limits import Limits
 from dm_common.optics.sag import remove_piston_tilt
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import TERMS, basis
-from dm_controller.solvers.bounded import BoundedProgramme, Limits
 from studies.benchmarks.timing import Effort, medians
 from studies.solvers.plate_model import PlateProperties, plate_influence
 

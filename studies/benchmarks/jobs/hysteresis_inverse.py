@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.prepared_inverse import PreparedInverse
+from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import SETTLE_S, Planner
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import Limits
 from studies.benchmarks import stand_in_mirror
 from studies.benchmarks.jobs.scaling import ACTUATORS
 from studies.benchmarks.timing import Effort, medians

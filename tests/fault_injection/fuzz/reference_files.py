@@ -21,8 +21,10 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Outcome
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.geometry import neighbour_pairs
+from dm_common.limits import Limits
 from dm_common.measurement import Measurement
-from dm_common.mirror import NEIGHBOUR_REACH, Mirror
+from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_simulation.interferometer.zygo_files import encode_dat, encode_datx
@@ -177,16 +179,7 @@ def _calibration() -> ReferenceFile:
     """A calibration of a seven-actuator mirror with Gaussian bumps."""
     angles = np.radians(60.0 * np.arange(6))
     x, y = 4.3e-3 * np.append(0.0, np.cos(angles)), 4.3e-3 * np.append(0.0, np.sin(angles))
-    distance = np.hypot(x[:, None] - x, y[:, None] - y)
-    mirror = Mirror(
-        "PDM30-37",
-        "fuzz",
-        x,
-        y,
-        11e-3,
-        neighbours=np.argwhere(np.triu(distance < NEIGHBOUR_REACH * 4.3e-3, 1)),
-        neighbour_difference_max=2.0,
-    )
+    mirror = Mirror("PDM30-37", "fuzz", x, y, 11e-3, Limits(pairs=neighbour_pairs(x, y)))
     points = edge_clustered_points(60)
     away = np.hypot(points.x[:, None] * 11e-3 - x, points.y[:, None] * 11e-3 - y)
     influence = 4e-6 * np.exp(-((away / 4e-3) ** 2))

@@ -31,12 +31,11 @@ from numpy.typing import ArrayLike
 from rclpy.qos import QoSProfile
 
 from dm_bringup.nodes import MODULES
-from dm_common.messages import doubles, recipe_book_message
+from dm_common.messages import doubles, limits_from, recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.worker import WorkerService, answers_arrive
-from dm_controller.planning.conversions import limits_of
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
 from fault_injection.faults.fault import FaultRecord
@@ -149,7 +148,7 @@ class FocusRig(DriverRig):
 
     def calibration(self, **fields: Any) -> Calibration:
         """A calibration with memory and recipes of the mirror that the driver announces."""
-        mirror = CalibratedMirror(self._model, limits_of(self._infos[-1]))
+        mirror = CalibratedMirror(self._model, limits_from(self._infos[-1]))
         plans = {c: mirror.plan(FocusTarget(c)).signals for c in np.linspace(-1.2 * REACH, 1.2 * REACH, 5).tolist()}
         recipes = tuple(Recipe(c, 0.0, signals, signals, 1e-9, 1e-9, 3) for c, signals in plans.items())
         message = stand_in_mirror.calibration(LAW, SERIAL)

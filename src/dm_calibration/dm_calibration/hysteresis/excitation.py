@@ -64,26 +64,24 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
 
 def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
     """(count, N) independent signals; where neighbours must stay near each other, about a common level that moves."""
-    middle = 0.5 * (mirror.signal_max + mirror.signal_min)
-    half_range = 0.5 * (mirror.signal_max - mirror.signal_min)
+    middle, half_range = mirror.limits.middle, mirror.limits.half_range
     swing = rng.choice(SWINGS, (count, 1))
-    own = swing * min(half_range, 0.5 * mirror.neighbour_difference_max)
+    own = swing * min(half_range, 0.5 * mirror.limits.neighbour_difference)
     level = rng.uniform(-1.0, 1.0, (count, 1)) * np.maximum(swing * half_range - own, 0.0)
     return np.asarray(middle + level + own * rng.uniform(-1.0, 1.0, (count, mirror.actuators)))
 
 
 def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
     """(count, N) bowls with some astigmatism, coma and scatter, inside the limits."""
-    middle = 0.5 * (mirror.signal_max + mirror.signal_min)
-    half_range = 0.5 * (mirror.signal_max - mirror.signal_min)
+    middle, half_range = mirror.limits.middle, mirror.limits.half_range
     reach = float(np.hypot(mirror.x, mirror.y).max())
     x, y = mirror.x / reach, mirror.y / reach
     patterns = np.stack((2.0 * (x**2 + y**2) - 1.0, x**2 - y**2, 2.0 * x * y, x * (3.0 * (x**2 + y**2) - 2.0)))
     size = rng.uniform(-1.0, 1.0, (count, len(patterns))) * np.array([0.7, 0.1, 0.1, 0.05])
     shapes = size @ patterns + 0.03 * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
-    if len(mirror.neighbours):
-        a, b = np.asarray(mirror.neighbours).T
+    if len(mirror.limits.pairs):
+        a, b = mirror.limits.pairs.T
         steepest = np.abs(shapes[:, a] - shapes[:, b]).max(axis=1)
-        allowed = mirror.neighbour_difference_max / half_range
+        allowed = mirror.limits.neighbour_difference / half_range
         shapes *= np.minimum(1.0, 0.999 * allowed / np.maximum(steepest, 1e-12))[:, None]
     return np.asarray(middle + half_range * np.clip(shapes, -1.0, 1.0))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from dm_common.mirror import pitch
+from dm_common.geometry import pitch
 from dm_common.optics.sag import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 

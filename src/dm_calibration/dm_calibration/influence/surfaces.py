@@ -12,9 +12,10 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
-from dm_common.mirror import Mirror, scale_to_limits
+from dm_common.bounded import BoundedProgramme
+from dm_common.limits import Limits
+from dm_common.mirror import Mirror
 from dm_common.names import unknown_name
 from dm_common.optics.conic import conic_coefficients
 from dm_common.optics.sag import remove_piston_tilt, rms
@@ -121,14 +122,16 @@ def signal_surface(name: str, mirror: Mirror) -> Surface:
         table[0] = _CENTRE[name]
     else:
         raise ValueError(f"{name} does not prescribe signals")
-    middle, half = mirror.rest[0], 0.5 * (mirror.signal_max - mirror.signal_min)
-    signals, factor = scale_to_limits(middle + half * table, mirror)
+    middle, half = mirror.rest[0], mirror.limits.half_range
+    signals, factor = mirror.limits.scaled(middle + half * table)
     remark = "" if factor == 1.0 else f"{name}: scaled about its mean to {factor:.0%} to keep the mirror's limits"
     return Surface(name, signals, remark=remark)
 
 
 def solve_shape(target: Floats, model: LinearModel, mirror: Mirror) -> tuple[Floats, float]:
     """Signals inside the range for the sag `target` (P,), m, by bounded least squares; piston and tilt are free.
+
+    Neighbours may differ by more than they may: how far the shape must shrink for them is for the caller to say.
 
     Returns:
         Signals (N,) and the rms sag that is left, m.
@@ -137,21 +140,22 @@ def solve_shape(target: Floats, model: LinearModel, mirror: Mirror) -> tuple[Flo
     wanted = remove_piston_tilt((target - model.sag_offset)[None, :], model.points)[0]
     matrix = root * remove_piston_tilt(model.influence_sag.T, model.points).T
     damping = DAMPING * np.linalg.norm(matrix, 2)
-    # A QR first makes the iterations of lsq_linear work on N rows rather than on P.
-    q, r = np.linalg.qr(np.vstack((matrix, damping * np.eye(mirror.actuators))))
-    right = q.T @ np.concatenate((root[:, 0] * wanted, damping * mirror.rest))
-    solution = lsq_linear(r, right, bounds=(mirror.signal_min, mirror.signal_max), method="bvls")
-    left = wanted - remove_piston_tilt((model.influence_sag @ solution.x)[None, :], model.points)[0]
-    return np.asarray(solution.x), float(rms(left, model.points.weight))
+    programme = BoundedProgramme(
+        np.vstack((matrix, damping * np.eye(mirror.actuators))), Limits(mirror.limits.low, mirror.limits.high)
+    )
+    signals = programme.solve(np.concatenate((root[:, 0] * wanted, damping * mirror.rest)))
+    left = wanted - remove_piston_tilt((model.influence_sag @ signals)[None, :], model.points)[0]
+    return signals, float(rms(left, model.points.weight))
 
 
 def largest_step(start: Floats, direction: Floats, mirror: Mirror) -> float:
     """Largest t >= 0 for which start + t direction keeps the range and the neighbour limit; 0 when start breaks one."""
     value, slope = start, direction
-    limit_high, limit_low = np.full(start.size, mirror.signal_max), np.full(start.size, mirror.signal_min)
-    if mirror.neighbours.size:
-        a, b = mirror.neighbours.T
-        most = np.full(a.size, mirror.neighbour_difference_max)
+    limits = mirror.limits
+    limit_high, limit_low = np.full(start.size, limits.high), np.full(start.size, limits.low)
+    if limits.pairs.size:
+        a, b = limits.pairs.T
+        most = np.full(a.size, limits.neighbour_difference)
         value, slope = np.append(value, start[a] - start[b]), np.append(slope, direction[a] - direction[b])
         limit_high, limit_low = np.append(limit_high, most), np.append(limit_low, -most)
     room = np.where(slope > 0, limit_high - value, value - limit_low)
@@ -186,7 +190,7 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
     else:
         raise ValueError(f"{name} prescribes signals, not a shape")
     signals, left = solve_shape(basis(points.x, points.y) @ nominal, model, mirror)
-    signals, factor = scale_to_limits(signals, mirror)
+    signals, factor = mirror.limits.scaled(signals)
     described = f"{name}: {wanted}, {left * 1e9:.1f} nm rms beyond the mirror's reach"
     remark = ""
     if factor < 1.0:
@@ -214,6 +218,6 @@ def _tilt_surface(name: str, unit: Floats, model: LinearModel, mirror: Mirror) -
     flat, _ = solve_shape(np.zeros(model.points.x.size), model, mirror)
     direction = mirror.x / np.abs(mirror.x).max() if np.abs(mirror.x).max() > 0 else np.zeros(mirror.actuators)
     share = ZERNIKE_SHARE * largest_step(flat, direction, mirror)
-    signals, _ = scale_to_limits(flat + share * direction, mirror)
+    signals, _ = mirror.limits.scaled(flat + share * direction)
     target = f"{name}: Z_1^1 as a plane of signals of +-{share:.2f}; its size in metres is not measured"
     return Surface(name, signals, 0.0 * unit, target=target)

@@ -69,7 +69,7 @@ class MapAcquisition:
 
     def swung(self) -> None:
         """The actuators went through their whole range since the last map, nobody knows where the mirror went."""
-        self._bump.swung(0.5 * (self._mirror.signal_max - self._mirror.signal_min))
+        self._bump.swung(self._mirror.limits.half_range)
         self._swung = True
 
     def take(self, label: str, step: Step, number: int, applied: Floats) -> None:

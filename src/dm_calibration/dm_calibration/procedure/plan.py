@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.excitation import REPEATS, excitation
 from dm_calibration.influence import surfaces
-from dm_common.mirror import Mirror, scale_to_limits
+from dm_common.mirror import Mirror
 
 Floats = NDArray[np.float64]
 
@@ -154,7 +154,7 @@ def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple
 
 def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
     """Push and pull of each actuator about mid range, pushed first; the two directions follow each other at once."""
-    half_range = 0.5 * (mirror.signal_max - mirror.signal_min)
+    half_range = mirror.limits.half_range
     steps = []
     smallest = 1.0
     for k in range(mirror.actuators):
@@ -162,7 +162,7 @@ def _pokes(mirror: Mirror, amplitude: float, remarks: list[str]) -> list[Step]:
             signals = mirror.rest
             signals[k] += sign * amplitude * half_range
             # A poke scaled about the mean would move every actuator; shrinking the poke keeps the others at rest.
-            _, factor = scale_to_limits(signals, mirror)
+            _, factor = mirror.limits.scaled(signals)
             if factor < 1.0:  # and a hair less: the driver checks the limit exactly
                 signals[k] = mirror.rest[k] + factor * (1.0 - 1e-12) * (signals[k] - mirror.rest[k])
             smallest = min(smallest, factor)

@@ -203,7 +203,7 @@ def _spacing(run: RecordedRun) -> list[int]:
 
 def _poke_amplitudes(run: RecordedRun) -> list[float]:
     """Half-swing of the first move that is not at rest."""
-    half_range = 0.5 * (run.mirror.signal_max - run.mirror.signal_min)
+    half_range = run.mirror.limits.half_range
     for move in run.moves:
         swing = float(np.abs(move.requested - run.mirror.rest).max()) / half_range
         if not move.degauss and 0.0 < swing <= 1.0:

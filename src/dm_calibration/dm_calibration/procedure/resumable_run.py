@@ -64,10 +64,10 @@ def mirror_facts(mirror: Mirror) -> dict[str, Any]:
         "name": mirror.name,
         "serial": mirror.serial,
         "working_radius_m": mirror.working_radius,
-        "signal_min": mirror.signal_min,
-        "signal_max": mirror.signal_max,
-        "neighbour_difference_max": mirror.neighbour_difference_max,
-        "layout_sha256": _hash(mirror.x, mirror.y, mirror.neighbours),
+        "signal_min": mirror.limits.low,
+        "signal_max": mirror.limits.high,
+        "neighbour_difference_max": mirror.limits.neighbour_difference,
+        "layout_sha256": _hash(mirror.x, mirror.y, mirror.limits.pairs),
     }
 
 

@@ -98,7 +98,7 @@ class ErrorPrediction:
                 ErrorCode.NOT_FINITE, f"signals: number {int(np.argmin(np.isfinite(signals))) + 1} is not finite"
             )
         mirror = self._desk.mirror
-        low, high = (mirror.signal_min, mirror.signal_max) if mirror else (-1.0, 1.0)
+        low, high = (mirror.limits.low, mirror.limits.high) if mirror else (-1.0, 1.0)
         worst = int(np.argmax(np.maximum(low - signals, signals - high)))
         if not low <= signals[worst] <= high:
             raise Refusal(

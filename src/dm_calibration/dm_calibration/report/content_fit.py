@@ -9,7 +9,7 @@ from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.report import figures
 from dm_calibration.report.document import Picture, Section, Table
 from dm_calibration.report.residuals import Residuals
-from dm_common.mirror import rings
+from dm_common.geometry import rings
 from dm_common.optics.sample_regions import AREA_FRACTIONS, EmptyRegionError, regional_rms
 from dm_common.optics.zernike import NAMES, PISTON_TILT
 

@@ -18,12 +18,12 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
-from dm_common.messages import doubles
+from dm_common.messages import doubles, limits_from
 from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
-from dm_controller.planning.conversions import limits_of, model_of
+from dm_controller.planning.conversions import model_of
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import MirrorFacts, make_solver
@@ -142,7 +142,7 @@ class ConvergeAction:
             np.asarray(mirror.actuator_y, dtype=float),
             np.asarray(calibration.region_weights, dtype=float) if len(calibration.region_weights) else None,
         )
-        return make_solver(method, model_of(calibration), limits_of(mirror), facts)
+        return make_solver(method, model_of(calibration), limits_from(mirror), facts)
 
     def _judge(self, outcome: LoopResult) -> tuple[str, int, str]:
         best = outcome.best

@@ -20,14 +20,14 @@ from rclpy.node import Node
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.tracker import Applied, HysteresisTracker
-from dm_common.messages import recipe_book_message
+from dm_common.messages import limits_from, recipe_book_message
 from dm_common.recipes import Recipe, RecipeError
 from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import ServiceCallError, WorkerActionServer, call, wait_for_clock
 from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
-from dm_controller.planning.conversions import hysteresis_figures_of, limits_of, model_of
+from dm_controller.planning.conversions import hysteresis_figures_of, model_of
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget, TargetError
@@ -115,7 +115,7 @@ class BuildRecipesAction:
         if calibration is None or mirror is None:
             raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
         loop = Planner(
-            CalibratedMirror(model_of(calibration), limits_of(mirror)),
+            CalibratedMirror(model_of(calibration), limits_from(mirror)),
             hysteresis_figures_of(calibration),
             mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf,
         )

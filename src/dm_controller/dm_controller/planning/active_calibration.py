@@ -10,10 +10,10 @@ from dm_msgs.msg import Calibration, MirrorInfo
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import certain_reach
-from dm_common.messages import mirror_from, recipe_book_from, stamp_ns
+from dm_common.messages import limits_from, mirror_from, recipe_book_from, stamp_ns
 from dm_common.mirror import mismatch
 from dm_common.recipes import RecipeBook
-from dm_controller.planning.conversions import hysteresis_figures_of, limits_of, model_of
+from dm_controller.planning.conversions import hysteresis_figures_of, model_of
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget
@@ -102,7 +102,7 @@ def active_calibration(
         if wrong:
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
         slew_rate = mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf
-        limits = limits_of(mirror)
+        limits = limits_from(mirror)
         calibrated = CalibratedMirror(model_of(calibration), limits)
         recipes = recipe_book_from(calibration.recipes)
         if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):

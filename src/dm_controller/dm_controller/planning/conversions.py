@@ -11,9 +11,8 @@ from dm_common.messages import doubles, hysteresis_model_from
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import Limits
 
-__all__ = ["doubles", "hysteresis_figures_of", "limits_of", "model_of", "target_of"]
+__all__ = ["doubles", "hysteresis_figures_of", "model_of", "target_of"]
 
 #: A law is scaled so that effective signals span this over a full cycle; gains are in the influence function.
 SPAN = 2.0
@@ -85,9 +84,3 @@ def hysteresis_figures_of(calibration: Any) -> HysteresisFigures | None:
         if not (np.isfinite(value) and value >= 0.0):
             raise ValueError(f"hysteresis: {name} = {value:g}: must be finite and not negative")
     return HysteresisFigures(law, sigma, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma)
-
-
-def limits_of(mirror: Any) -> Limits:
-    """The limits of a dm_msgs/MirrorInfo."""
-    pairs = np.column_stack([np.asarray(mirror.neighbour_a, dtype=np.intp), np.asarray(mirror.neighbour_b, np.intp)])
-    return Limits(mirror.signal_min, mirror.signal_max, pairs, mirror.neighbour_difference_max)

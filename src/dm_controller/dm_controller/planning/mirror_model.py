@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.bounded import BoundedProgramme
+from dm_common.limits import Limits
 from dm_common.optics.zernike import TERM_RMS, basis
 from dm_controller.planning.closed_form import ClosedForm
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import BoundedProgramme, Limits
 
 #: Piston and the two tilts are free: focus does not care, and an interferometer cannot see piston.
 FREE_TERMS = 3

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.prepared_inverse import PreparedInverse
+from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import FREE_TERMS, CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import Limits
 
 Floats = NDArray[np.float64]
 

@@ -14,12 +14,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.limits import SLACK, Limits
 from dm_common.optics.sag import remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.bounded import SLACK, Limits
 
 Floats = NDArray[np.float64]
 
@@ -172,8 +172,7 @@ class Solver(ABC):
         limits = self.limits
         result = np.clip(signals, limits.low, limits.high)
         if not limits.allow_neighbours(result):
-            largest = np.abs(result[limits.pairs[:, 0]] - result[limits.pairs[:, 1]]).max()
-            result = result.mean() + (limits.neighbour_difference / largest) * (result - result.mean())
+            result, _factor = limits.scaled(result)
         overflow = float(np.abs(signals - result).max())
         return Command(result, overflow if overflow > SLACK else 0.0)
 

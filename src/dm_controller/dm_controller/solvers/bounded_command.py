@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dm_common.bounded import BoundedProgramme
+from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows
-from dm_controller.solvers.bounded import BoundedProgramme, Limits
 
 #: Ridge of a correction, m per unit signal: only for actuators without any influence, which stay where they are.
 TINY = 1e-12

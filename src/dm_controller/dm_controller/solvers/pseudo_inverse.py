@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import FREE, Floats, Shape, Solver, normalised_terms
-from dm_controller.solvers.bounded import Limits
 
 #: Singular values below this share of the largest are left out: they would turn noise into signals.
 CUTOFF = 1e-3

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
+from dm_common.limits import Limits
 from dm_common.names import UnknownNameError
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Floats, Solver
-from dm_controller.solvers.bounded import Limits
 from dm_controller.solvers.bounded_command import Bounded
 from dm_controller.solvers.iterative_learning import IterativeLearning
 from dm_controller.solvers.pseudo_inverse import AZreg, PseudoInverse

@@ -60,11 +60,12 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
 
 def best_possible(calibration: Any, mirror: Any) -> float:
     """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, as the model says."""
-    from dm_controller.planning.conversions import limits_of, model_of
+    from dm_common.messages import limits_from
+    from dm_controller.planning.conversions import model_of
     from dm_controller.planning.mirror_model import CalibratedMirror
     from dm_controller.planning.target import FocusTarget
 
-    calibrated = CalibratedMirror(model_of(calibration), limits_of(mirror))
+    calibrated = CalibratedMirror(model_of(calibration), limits_from(mirror))
     return max(calibrated.plan(FocusTarget(curvature)).rms for curvature in (CURVATURES[0], CURVATURES[-1]))
 
 

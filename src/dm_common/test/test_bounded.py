@@ -10,7 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from dm_controller.solvers.bounded import BoundedProgramme, Limits
+from dm_common.bounded import BoundedProgramme
+from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_common.limits import SLACK, Limits
+from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.zernike import basis
 
 NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
 
@@ -107,8 +111,23 @@ def test_bad_right_hand_sides_are_refused(wanted: list[float]) -> None:
         BoundedProgramme(np.eye(3), Limits(-1, 1, NO_PAIRS, 2.0)).solve(wanted)
 
 
-def test_bad_limits_are_refused() -> None:
-    with pytest.raises(ValueError, match="below the upper"):
-        Limits(1.0, -1.0, NO_PAIRS, 2.0)
-    with pytest.raises(ValueError, match="must be positive"):
-        Limits(-1.0, 1.0, NO_PAIRS, 0.0)
+@settings(max_examples=30, deadline=None)
+@given(curvature=st.floats(-0.4, 0.4), difference=st.floats(0.3, 2.0))
+def test_spheres_keep_the_limit_between_neighbours(curvature: float, difference: float) -> None:
+    """To the rounding that the driver allows, on the ill-conditioned influence of a plate."""
+    x, y = hexagonal_positions(37)
+    radius, points = 11e-3, edge_clustered_points(300)
+    away = np.hypot(points.x[:, None] * radius - x, points.y[:, None] * radius - y)
+    modes = basis(points.x, points.y)
+    influence = 4e-6 * np.exp(-((away / 5e-3) ** 2))
+    terms = np.linalg.lstsq(modes, influence, rcond=None)[0][3:]
+    sag = influence - modes[:, :3] @ np.linalg.lstsq(modes[:, :3], influence, rcond=None)[0]
+    matrix = np.vstack([100.0 * terms, sag / np.sqrt(len(sag))])
+    sphere = np.zeros(18)
+    sphere[0] = 0.25 * curvature * radius**2
+    wanted = np.concatenate([100.0 * sphere, modes[:, 3] * sphere[0] / np.sqrt(len(sag))])
+    limits = Limits(-1.0, 1.0, neighbour_pairs(x, y), difference)
+    ridge = 1e-8 * float(np.square(matrix).sum(axis=0).mean())
+    signals = BoundedProgramme(matrix, limits, ridge).solve(wanted)
+    assert np.abs(signals).max() <= 1.0
+    assert limits.differences(signals).max() <= difference + SLACK

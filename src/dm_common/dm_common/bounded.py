@@ -18,16 +18,14 @@ Clipping the unconstrained solution instead can double the residual of a saturat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dgels, dtrtrs
 from scipy.optimize import lsq_linear, nnls
 
-#: Signals closer to a limit than this count as standing at it.
-AT_LIMIT = 1e-6
+from dm_common.limits import SLACK, Limits
+
 #: A signal this close to an end of its range is taken to be bound there.
 NEAR_LIMIT = 1e-5
 #: Largest gradient against a signal that counts as none, as a share of the problem's own gradient at rest.
@@ -39,57 +37,6 @@ PIVOT_SETBACKS = 3
 #: The same for signals known to stand at an end exactly. Stricter: with condition numbers of 1e5 a gradient of 1e-9
 #: still leaves the wrong signals at an end (measured: 1 % of the range).
 ROUNDING = 1e-13
-#: Violations below this are rounding, far below a DAC step (1.5e-5).
-SLACK = 1e-9
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of the signals of one mirror.
-
-    Attributes:
-        low, high: range of every signal (normalised).
-        pairs: (M, 2) indices of neighbouring actuators; may be empty.
-        neighbour_difference: largest allowed difference between the two of a pair (normalised).
-    """
-
-    low: float
-    high: float
-    pairs: NDArray[np.intp]
-    neighbour_difference: float
-
-    def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise ValueError(f"signal range {self.low:g} to {self.high:g}: the lower limit must be below the upper")
-        if not self.neighbour_difference > 0:
-            raise ValueError(f"neighbour_difference = {self.neighbour_difference:g}: must be positive")
-
-    @property
-    def neighbours_can_bind(self) -> bool:
-        """Whether neighbours can differ by more than their limit inside the range."""
-        return len(self.pairs) > 0 and self.neighbour_difference < self.high - self.low
-
-    def allow(self, signals: NDArray[np.float64]) -> bool:
-        """Whether `signals` (N,) break none of the limits."""
-        return self.allow_range(signals) and self.allow_neighbours(signals)
-
-    def allow_range(self, signals: NDArray[np.float64]) -> bool:
-        # Half the time of the methods of the same names.
-        return bool(np.minimum.reduce(signals) >= self.low - SLACK and np.maximum.reduce(signals) <= self.high + SLACK)
-
-    def allow_neighbours(self, signals: NDArray[np.float64]) -> bool:
-        if not self.neighbours_can_bind:
-            return True
-        differences = signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]]
-        return bool(np.abs(differences).max() <= self.neighbour_difference + SLACK)
-
-    def at_limit(self, signals: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(N,) which actuators stand at a limit."""
-        result = (signals <= self.low + AT_LIMIT) | (signals >= self.high - AT_LIMIT)
-        if self.neighbours_can_bind:
-            differences = np.abs(signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]])
-            result[self.pairs[differences >= self.neighbour_difference - AT_LIMIT].ravel()] = True
-        return result
 
 
 class BoundedProgramme:
@@ -157,9 +104,11 @@ class BoundedProgramme:
             pivoted = self._pivoted(signals, projected)
             if pivoted is not None:
                 return pivoted
-        signals = np.clip(self._least_distance(projected), self.limits.low, self.limits.high)
+        signals = self._least_distance(projected)
         if self.limits.neighbours_can_bind:
-            return signals
+            # Found to the accuracy of an ill-conditioned problem: up to 1e-8 too much, which the driver would refuse.
+            return self.limits.scaled(signals)[0]
+        signals = np.clip(signals, self.limits.low, self.limits.high)
         signals = self._polished(signals, projected)
         if not self._optimal(signals, projected):
             ends = (self.limits.low, self.limits.high)
@@ -217,7 +166,7 @@ class BoundedProgramme:
         The multipliers above are found to the accuracy of an ill-conditioned problem; with the set of bound signals
         known, what remains is plain least squares.
         """
-        middle = 0.5 * (self.limits.low + self.limits.high)
+        middle = self.limits.middle
         ends = np.where(signals < middle, self.limits.low, self.limits.high)
         bound = np.abs(signals - ends) < NEAR_LIMIT
         if bound.all():

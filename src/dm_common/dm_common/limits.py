@@ -1,0 +1,104 @@
+"""What the signals of a mirror must keep to: a range for each, and how far neighbours may differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+#: Violations below this are rounding, far below a DAC step (1.5e-5).
+SLACK = 1e-9
+#: Signals closer to a limit than this count as standing at it.
+AT_LIMIT = 1e-6
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of the signals of one mirror; signals are normalised.
+
+    Attributes:
+        low, high: range of every signal.
+        pairs: (P, 2) 0-based indices of neighbouring actuators; may be empty.
+        neighbour_difference: largest allowed difference between the two of a pair.
+
+    Raises:
+        ValueError: an empty range, or a difference that is not positive.
+    """
+
+    low: float = -1.0
+    high: float = 1.0
+    pairs: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
+    neighbour_difference: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ValueError(f"signal range {self.low:g} to {self.high:g}: the lower limit must be below the upper")
+        if not self.neighbour_difference > 0:
+            raise ValueError(f"neighbour_difference = {self.neighbour_difference:g}: must be positive")
+
+    @property
+    def middle(self) -> float:
+        """Mid range."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def half_range(self) -> float:
+        """From mid range to either end."""
+        return 0.5 * (self.high - self.low)
+
+    @property
+    def neighbours_can_bind(self) -> bool:
+        """Whether neighbours can differ by more than their limit inside the range."""
+        return len(self.pairs) > 0 and self.neighbour_difference < self.high - self.low
+
+    def differences(self, signals: Floats) -> Floats:
+        """(P,) by how much neighbours differ."""
+        return np.asarray(np.abs(signals[self.pairs[:, 0]] - signals[self.pairs[:, 1]]))
+
+    def allow(self, signals: Floats) -> bool:
+        """Whether `signals` (N,) break none of the limits but by rounding."""
+        return self.allow_range(signals) and self.allow_neighbours(signals)
+
+    def allow_range(self, signals: Floats) -> bool:
+        # Half the time of the methods of the same names.
+        return bool(np.minimum.reduce(signals) >= self.low - SLACK and np.maximum.reduce(signals) <= self.high + SLACK)
+
+    def allow_neighbours(self, signals: Floats) -> bool:
+        if not self.neighbours_can_bind:
+            return True
+        return bool(self.differences(signals).max() <= self.neighbour_difference + SLACK)
+
+    def at_limit(self, signals: Floats) -> NDArray[np.bool_]:
+        """(N,) which actuators stand at a limit."""
+        result = (signals <= self.low + AT_LIMIT) | (signals >= self.high - AT_LIMIT)
+        if self.neighbours_can_bind:
+            differences = self.differences(signals)
+            result[self.pairs[differences >= self.neighbour_difference - AT_LIMIT].ravel()] = True
+        return result
+
+    def scaled(self, signals: Floats) -> tuple[Floats, float]:
+        """`signals` (N,) scaled about their mean until they keep every limit.
+
+        A common signal lifts the plate without bending it, so scaling about the mean keeps the shape and changes its
+        size.
+
+        Returns:
+            The signals to use and the factor, 1 when nothing had to change.
+        """
+        mean = float(np.clip(signals.mean(), self.low, self.high))
+        departure = signals - signals.mean()
+        factor = 1.0
+        if departure.max(initial=0.0) > self.high - mean:
+            factor = min(factor, (self.high - mean) / departure.max())
+        if -departure.min(initial=0.0) > mean - self.low:
+            factor = min(factor, (mean - self.low) / -departure.min())
+        largest = self.differences(signals).max(initial=0.0)
+        if largest > self.neighbour_difference:
+            factor = min(factor, self.neighbour_difference / largest)
+        if factor == 1.0:
+            return np.clip(signals, self.low, self.high), 1.0
+        # Rounding must not leave a value a hair above a limit that the driver checks exactly.
+        return np.clip(mean + factor * (1.0 - 1e-12) * departure, self.low, self.high), factor
