@@ -1,6 +1,6 @@
 """The virtual bench in process: the twin's mirror, electronics and interferometer without sockets, files or waiting.
 
-Implements `dm_calibration.procedure.procedure.Bench`, so calibrations and closed loops on it run the code they run on hardware.
+Implements `dm_common.measurement.Bench`, so calibrations and closed loops on it run the code they run on hardware.
 What a seed stands for is the same as on the bench behind the sockets: gains, initial figure and noise.
 """
 
@@ -109,7 +109,7 @@ class SimulatedBench:
         other.reports = list(self.reports)
         return other
 
-    # --- dm_calibration.procedure.procedure.Bench ---
+    # --- dm_common.measurement.Bench ---
 
     def degauss(self) -> None:
         """Wipe the hysteresis memory as the driver does, and end at mid range."""

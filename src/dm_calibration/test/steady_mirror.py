@@ -23,7 +23,7 @@ NOISE = 0.5e-9
 
 
 class SteadyMirror:
-    """Implements dm_calibration.procedure.procedure.Bench."""
+    """Implements dm_common.measurement.Bench."""
 
     def __init__(self, seed: int = 1) -> None:
         self.mirror = make_mirror(RINGS)

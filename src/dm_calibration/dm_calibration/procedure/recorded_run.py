@@ -77,7 +77,7 @@ class RecordedRun:
 
 
 class RecordedBench:
-    """Answers as the bench did; implements :class:`dm_calibration.procedure.procedure.Bench`."""
+    """Answers as the bench did; implements :class:`dm_common.measurement.Bench`."""
 
     def __init__(self, run: RecordedRun) -> None:
         self._moves, self._maps = run.moves, run.maps

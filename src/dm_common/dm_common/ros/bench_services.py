@@ -40,7 +40,7 @@ def _never() -> bool:
 
 
 class BenchServices:
-    """Driver and interferometer of one calibration; implements :class:`dm_calibration.procedure.procedure.Bench`.
+    """Driver and interferometer of one calibration; implements :class:`dm_common.measurement.Bench`.
 
     All methods block and belong into a worker thread.
 
@@ -116,7 +116,7 @@ class BenchServices:
     def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
         request = Measure.Request(label=label, timeout=timeout)
-        # The interferometer keeps the time itself; the call waits a little longer for its answer in words.
+        # The interferometer keeps the time itself; the call waits a little longer for its answer, which says why.
         try:
             response = self._call(self._measure, request, timeout + 5.0, ErrorCode.INTERFEROMETER_UNAVAILABLE)
         except Refusal as error:
@@ -125,14 +125,14 @@ class BenchServices:
             raise MeasurementError(error.error_code, str(error)) from error
         check()
         try:
-            # The state was looked at after the map, so its stamp is of the write that the map shows.
+            # The state was read after the map, so its stamp is of the write that the map shows.
             moved_ns = stamp_ns(self.state.header.stamp) if self.state is not None else 0
             return replace(measurement_from(response), moved_ns=moved_ns)
         except ValueError as error:
             raise Refusal(ErrorCode.INTERNAL, f"measure: {error}") from error
 
     def rest(self, signals: Floats) -> str:
-        """Ramp back to `signals`, whatever was cancelled. Returns what became of it, in words."""
+        """Ramp back to `signals`, whatever was cancelled. Returns what became of it, a sentence."""
         self.cancelled, self._history_known = _never, False
         deadline = time.monotonic() + self._values["degauss_timeout"]
         while True:

@@ -66,7 +66,7 @@ class Parameter:
         return text
 
     def allowed(self) -> str:
-        """The allowed values in words."""
+        """The allowed values as text."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         kind = self.kind if isinstance(self.kind, str) else self.kind.__name__

@@ -38,8 +38,8 @@ class ServiceCallError(Exception):
     """A service did not answer: not there, too slow, or the wait was cancelled."""
 
 
-def _tell(node: Node, what: str, error: Exception, answer: Any) -> None:
-    """Log an exception of the body of `what`, and tell it in the answer as ErrorCode.INTERNAL if that has a place."""
+def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
+    """Log an exception of the body of `what`; answer it as ErrorCode.INTERNAL where the answer has a place for that."""
     node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
     if hasattr(answer, "error_code"):
         answer.error_code = ErrorCode.INTERNAL
@@ -56,7 +56,7 @@ def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> 
         try:
             return callback(request, response)
         except Exception as error:
-            _tell(node, f"service {name}", error, response)
+            _answer_error(node, f"service {name}", error, response)
             return response
 
     return answer
@@ -167,7 +167,7 @@ class WorkerActionServer(ActionServer):
                 outcome, result = self._body(goal_handle)
         except Exception as error:
             outcome, result = "abort", self._action_type.Result()
-            _tell(self._worker_node, "action", error, result)
+            _answer_error(self._worker_node, "action", error, result)
         finally:
             with self._bookkeeping:
                 self._running -= 1
@@ -187,7 +187,7 @@ class WorkerActionServer(ActionServer):
 def answers_arrive(client: Any, is_ready: Callable[[], bool]) -> bool:
     """Whether a service or action server is there, and has had time to discover the client in its turn.
 
-    A server that answers before it knows the client's reader drops the answer; no API tells whether it does. So a
+    A server that answers before it knows the client's reader drops the answer; no API says whether it does. So a
     server counts as there only some time after it was first seen.
     """
     if not is_ready():

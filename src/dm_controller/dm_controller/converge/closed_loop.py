@@ -42,7 +42,7 @@ RESTORE_RATIO = 1.5
 
 
 class Plant(Protocol):
-    """What the loop drives; `dm_calibration.procedure.procedure.Bench` is one."""
+    """What the loop drives; `dm_common.measurement.Bench` is one."""
 
     def apply(self, signals: Floats) -> Floats:
         """Command `signals` (N,), wait until they stand, return what was written (N,)."""

@@ -36,7 +36,7 @@ SIGMA_MIN = 1e-12
 
 
 class ConditionedPlant(Protocol):
-    """What is driven; `dm_calibration.procedure.procedure.Bench` is one."""
+    """What is driven; `dm_common.measurement.Bench` is one."""
 
     def degauss(self) -> None:
         """Wipe the hysteresis memory over the full range and end at mid range."""
