@@ -15,7 +15,7 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="Camera images in, focus requests out: autofocus with a deformable mirror",
+    description="Autofocus with a deformable mirror: camera images in, focus requests out",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

@@ -15,7 +15,7 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="Interferometer map ingest and calibration of deformable mirrors",
+    description="Interferometer maps in, calibrations of a deformable mirror out",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

@@ -15,6 +15,6 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="Python client of the suite for vision stacks: no callbacks, no executors",
+    description="Python client for vision programs: a curvature in one call, without callbacks or executors",
     license="Apache-2.0",
 )

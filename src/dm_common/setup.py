@@ -15,6 +15,6 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="What more than one node of the suite needs: executor and parameters, optics, hysteresis model, limits, messages",
+    description="What several nodes share: executor, parameters, optics, hysteresis model, limits, messages",
     license="Apache-2.0",
 )

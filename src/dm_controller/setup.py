@@ -15,7 +15,7 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="Open-loop focus controller for deformable mirrors",
+    description="Open-loop focus controller: curvature in, actuator commands out",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

@@ -15,7 +15,7 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="Drive electronics and safety limiter for piezo deformable mirrors",
+    description="Drive units and safety limiter for piezo deformable mirrors",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [

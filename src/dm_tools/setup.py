@@ -15,7 +15,7 @@ setup(
     zip_safe=True,
     maintainer="Deformable mirror maintainers",
     maintainer_email="maintainers@deformable-mirror.example",
-    description="The dm command, bench console, recordings, security profile and generated documentation",
+    description="The command dm, the bench console, recordings, security policies and generated documentation",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
