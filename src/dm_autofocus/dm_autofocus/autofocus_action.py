@@ -71,7 +71,8 @@ class AutofocusAction:
         return self._server.busy
 
     def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
-        started, result = time.monotonic(), Autofocus.Result()
+        started = time.monotonic()
+        result = Autofocus.Result()
         self._probe.start()
         try:
             config, region = self._config(goal_handle.request)
@@ -94,7 +95,8 @@ class AutofocusAction:
 
     def _config(self, goal: Any) -> tuple[SearchConfig, Region]:
         """The search that a goal asks for. Raises Refusal."""
-        values, capabilities = self._values, ready_capabilities(self._probe)
+        values = self._values
+        capabilities = ready_capabilities(self._probe)
         margin = MARGIN * (capabilities.curvature_max - capabilities.curvature_min)
         low, high = capabilities.curvature_min + margin, capabilities.curvature_max - margin
         if goal.curvature_min != 0 or goal.curvature_max != 0:
@@ -187,7 +189,8 @@ class AutofocusAction:
                     if error.error_code != ErrorCode.NOT_CONVERGED:
                         raise
                     # Nothing to see now: what is seen here from now on is the new normal.
-                    peak, position = Peak(tracker.centre, sample.sharpness, False), math.nan
+                    peak = Peak(tracker.centre, sample.sharpness, False)
+                    position = math.nan
                 tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
             self._fill(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
 

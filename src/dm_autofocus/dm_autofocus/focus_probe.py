@@ -133,7 +133,8 @@ class FocusProbe:
         """
         with self._changed:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
-            self._answer, self.target = None, curvature
+            self._answer = None
+            self.target = curvature
             self._asked.append(curvature)
         self._request.publish(FocusRequest(curvature=curvature, mode=FocusRequest.MODE_DIRECT))
         limit = self._values["move_timeout"]
@@ -155,7 +156,8 @@ class FocusProbe:
 
     def release(self) -> None:
         """The mirror may be moved by others from here on."""
-        self.target, self._other_request = math.nan, None
+        self.target = math.nan
+        self._other_request = None
 
     def measure(self, region: Region, stop: Callable[[], bool] = lambda: False) -> SharpnessSample | None:
         """Median sharpness of the next images that show the settled shape; None when `stop()`.
@@ -165,7 +167,8 @@ class FocusProbe:
         """
         samples: list[SharpnessSample] = []
         with self._changed:
-            self._fresh, self._measuring = None, True
+            self._fresh = None
+            self._measuring = True
         try:
             while len(samples) < self._values["images_per_step"]:
                 if not self._wait(lambda: self._fresh is not None, self._values["image_timeout"], stop):

@@ -17,14 +17,16 @@ class SettledGate:
     """
 
     def __init__(self, settle_time: float, stamp_lead: float = 0.0) -> None:
-        self._settle_time, self._stamp_lead = settle_time, stamp_lead
+        self._settle_time = settle_time
+        self._stamp_lead = stamp_lead
         self._sent_at = math.inf
         self._stands_at = math.inf
         self.settled_at = math.inf
 
     def sent(self, stamp: float, duration: float = 0.0) -> None:
         """A command left at `stamp`; its shape is predicted to stand `duration` later."""
-        self._sent_at, self._stands_at = stamp, stamp + duration
+        self._sent_at = stamp
+        self._stands_at = stamp + duration
         self.settled_at = math.inf
 
     def written(self, stamp: float, moving: bool, reached: bool) -> None:

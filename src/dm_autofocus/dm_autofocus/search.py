@@ -146,7 +146,8 @@ class PeakSearch:
             raise ValueError("sharpness: the search is done, it takes no more")
         if not self.step.measured:
             if self.phase is Phase.FINE and self.peak is not None:
-                self.step, self.done = Step(self.peak.curvature), True
+                self.step = Step(self.peak.curvature)
+                self.done = True
             else:
                 self.step = Step(float(self._positions[0]))
             return
@@ -166,7 +167,8 @@ class PeakSearch:
             ValueError: refused too often, or hardly anything of the range is left.
         """
         self._refusals += 1
-        config, seen = self.config, len(self._seen)
+        config = self.config
+        seen = len(self._seen)
         if self._refusals > MOST_REFUSALS:
             raise ValueError(f"range = {config.low:+.4f} to {config.high:+.4f} 1/m: the mirror refuses too much of it")
         if self.step.measured and self.phase is Phase.COARSE and seen >= 4:
@@ -197,11 +199,14 @@ class PeakSearch:
         best = int(seen.argmax())
         spacing = float(self._positions[1] - self._positions[0])
         if self.phase is Phase.COARSE:
-            hill, self._coarse = _is_hill(seen, self.config.least_contrast), seen
+            hill = _is_hill(seen, self.config.least_contrast)
+            self._coarse = seen
         else:
-            hill, self._coarse = _is_seen_again(self._coarse, seen), np.empty(0)
+            hill = _is_seen_again(self._coarse, seen)
+            self._coarse = np.empty(0)
         if not hill:
-            self.done, self.step = True, Step(float(self._positions[-1]))
+            self.step = Step(float(self._positions[-1]))
+            self.done = True
         elif self.phase is Phase.FINE and self._rises_beyond(best) and self._shifts < MOST_SHIFTS:
             self._shifts += 1
             self._around(float(self._positions[best]), float(np.ptp(self._positions)) / 2)

@@ -201,7 +201,8 @@ class WriterThread:
             self._publish(True)
 
     def _step(self) -> None:
-        queue, limits = self._queue, self._limiter.limits
+        queue = self._queue
+        limits = self._limiter.limits
         with self._change:
             move, shape, previous = queue.current, queue.next_shape, self._shape
         assert move is not None and shape is not None and previous is not None

@@ -51,7 +51,8 @@ class BenchServices:
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
-        self._node, self._values = node, values
+        self._node = node
+        self._values = values
         self._set_signals = node.create_client(SetSignals, "set_signals")
         self._degauss = node.create_client(Degauss, "degauss")
         self._measure = node.create_client(Measure, "measure")
@@ -133,7 +134,8 @@ class BenchServices:
 
     def rest(self, signals: Floats) -> str:
         """Ramp back to `signals`, whatever was cancelled. Returns what became of it, a sentence."""
-        self.cancelled, self._history_known = _never, False
+        self.cancelled = _never
+        self._history_known = False
         deadline = time.monotonic() + self._values["degauss_timeout"]
         while True:
             try:

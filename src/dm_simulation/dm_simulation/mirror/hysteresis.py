@@ -150,8 +150,9 @@ class MixedHysteresis(HysteresisLaw):
     """Half the loop by a Preisach operator, half by an asymmetric Bouc-Wen law of order 2."""
 
     def __init__(self, count: int, preisach: float = 4.0, bouc_wen: float = 0.5) -> None:
-        self._preisach, self._bouc_wen = PreisachHysteresis(count), AsymmetricBoucWenHysteresis(count)
-        self._weight = preisach, bouc_wen
+        self._preisach = PreisachHysteresis(count)
+        self._bouc_wen = AsymmetricBoucWenHysteresis(count)
+        self._weight = (preisach, bouc_wen)
 
     def move(self, u: Array) -> Array:
         return self._weight[0] * self._preisach.move(u) + self._weight[1] * self._bouc_wen.move(u)
