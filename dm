@@ -231,10 +231,11 @@ def build_key() -> str:
 
     Python sources, launch and configuration files are linked into the install space: of these only names count.
     """
-    inputs = [path for path in (ROOT / "src" / "dm_msgs").rglob("*") if path.is_file()]
+    inputs = [path for kind in ("msg", "srv", "action") for path in (ROOT / "src" / "dm_msgs" / kind).glob(f"*.{kind}")]
     names = []
     for package in (ROOT / "src").iterdir():
-        inputs += [package / name for name in ("package.xml", "setup.py", "setup.cfg") if (package / name).is_file()]
+        described = ("package.xml", "setup.py", "setup.cfg", "CMakeLists.txt")
+        inputs += [package / name for name in described if (package / name).is_file()]
         names += [str(path) for folder in ("launch", "config") for path in (package / folder).rglob("*.*")]
     return digest(inputs) + hashlib.sha256("\0".join(sorted(names)).encode()).hexdigest()
 

@@ -1,1 +1,1 @@
-"""acquisition of dm_calibration."""
+"""Maps from the instrument: a watched folder, a trigger, files read once they are complete."""

@@ -1,1 +1,1 @@
-"""procedure of dm_calibration."""
+"""The calibration procedure: plan, run, checks of each map, journal and resumption."""

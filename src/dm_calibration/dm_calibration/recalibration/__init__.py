@@ -1,1 +1,1 @@
-"""recalibration of dm_calibration."""
+"""Later maps keep a calibration true: gains and figure by recursive least squares."""

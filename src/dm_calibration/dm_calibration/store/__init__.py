@@ -1,1 +1,1 @@
-"""store of dm_calibration."""
+"""Calibration files: HDF5 read in a process of its own, written whole or not at all."""

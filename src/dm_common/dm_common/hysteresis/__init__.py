@@ -1,1 +1,1 @@
-"""hysteresis of dm_common."""
+"""The model of hysteresis and creep, its state along the commands, and its inverse."""

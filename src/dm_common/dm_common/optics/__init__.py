@@ -1,1 +1,1 @@
-"""optics of dm_common."""
+"""Zernike terms, conic surfaces, sampling points, piston and tilt."""

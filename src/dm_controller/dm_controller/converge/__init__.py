@@ -1,1 +1,1 @@
-"""converge of dm_controller."""
+"""The closed loop on the interferometer, and recipes built by it."""

@@ -1,1 +1,1 @@
-"""demo of dm_tools."""
+"""The demo: a simulated bench is calibrated, focused and measured."""

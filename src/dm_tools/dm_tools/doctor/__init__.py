@@ -1,1 +1,1 @@
-"""doctor of dm_tools."""
+"""What `dm doctor` looks for, on the machine and in a configuration."""

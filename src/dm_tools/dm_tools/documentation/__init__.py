@@ -1,1 +1,1 @@
-"""documentation of dm_tools."""
+"""The pages of interfaces and parameters, written from the code."""

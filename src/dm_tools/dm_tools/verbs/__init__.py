@@ -1,1 +1,1 @@
-"""verbs of dm_tools."""
+"""One module a verb of the command `dm`."""
