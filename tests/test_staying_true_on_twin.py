@@ -75,7 +75,7 @@ def test_maps_of_the_nights_keep_the_calibration_true(twin: AgeingTwin, tmp_path
         twin.age(drift * share, 20e-9 * share)
         twin.night(rng)
         measured = twin.measurement(twin.bench.take_map())
-        standing = twin.history.standing(1e-9 * measured.stamp_ns, 0.1)
+        standing = twin.history.settled(1e-9 * measured.stamp_ns, 0.1)
         fits = (twin.calibration.fit, updates.changed_fit())
         errors.append([twin.error(fit, standing.effective) for fit in fits if fit is not None])
         assert updates.take(measured, standing).accepted, night
@@ -90,7 +90,7 @@ def test_maps_of_the_nights_keep_the_calibration_true(twin: AgeingTwin, tmp_path
     twin.age(drift, 40e-9)
     twin.night(rng)
     bumped = twin.measurement(twin.bench.take_map())
-    verdict = updates.take(bumped, twin.history.standing(1e-9 * bumped.stamp_ns, 0.1))
+    verdict = updates.take(bumped, twin.history.settled(1e-9 * bumped.stamp_ns, 0.1))
     assert not verdict.accepted
     after = updates.updates
     assert after is not None

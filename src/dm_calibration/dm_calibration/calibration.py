@@ -50,10 +50,10 @@ class Calibration:
         maps: the raw data.
         fit: the result.
         dropped: "label: reason" of the states that gave no map at all.
-        targets: the shapes that were solved from an influence function, in words; their coefficients are maps.nominal.
+        targets: the shapes that were solved from an influence function; their coefficients are maps.nominal.
         limitations: sentences; those of the fit, of the run, and of the poke check.
         note: the user's.
-        memory: hysteresis and creep; with it, `fit` acts on effective signals. None = not identified.
+        hysteresis: hysteresis and creep; with it, `fit` acts on effective signals. None = not identified.
         recipes: built on this calibration.
         region_weights: (10,) Eq. (8), for commands weighted by region; empty where no sample surfaces were measured.
     """

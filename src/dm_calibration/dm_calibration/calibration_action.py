@@ -50,12 +50,12 @@ class CalibrateAction:
         self,
         node: Node,
         values: Mapping[str, Any],
-        bench: BenchServices,
-        desk: CalibrationManager,
+        services: BenchServices,
+        manager: CalibrationManager,
         driver_facts: Callable[[], Mapping[str, Any]],
     ) -> None:
         """`driver_facts` tells of wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
-        self._node, self._values, self._bench, self._desk = node, values, bench, desk
+        self._node, self._values, self._services, self._manager = node, values, services, manager
         self._driver_facts = driver_facts
 
     def run(self, handle: ServerGoalHandle) -> tuple[str, Calibrate.Result]:
@@ -63,17 +63,17 @@ class CalibrateAction:
         clock = self._node.get_clock()
         started = clock.now()
         try:
-            mirror = self._desk.known_mirror(wait_s=START_GRACE_S)
+            mirror = self._manager.known_mirror(wait_s=START_GRACE_S)
             wait_for_clock(clock)
             started = clock.now()
             plan, options = self._planned(handle.request, mirror)
-            self._foretell(handle.request, plan, result)
+            self._forecast(handle.request, plan, result)
             if handle.request.dry_run:
                 return "succeed", result
-            self._bench.check_ready()
-            self._bench.settle_time = handle.request.settle_time or self._values["settle_time"]
-            self._bench.cancelled = lambda: bool(handle.is_cancel_requested)
-            with UnfinishedRuns(self._desk.store.folder) as runs:
+            self._services.check_ready()
+            self._services.settle_time = handle.request.settle_time or self._values["settle_time"]
+            self._services.cancelled = lambda: bool(handle.is_cancel_requested)
+            with UnfinishedRuns(self._manager.store.folder) as runs:
                 self._run_kept(handle, plan, options, mirror, runs, result)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
@@ -107,7 +107,7 @@ class CalibrateAction:
             result.dropped = result.dropped or list(run.outcome.dropped)
         finally:
             run.journal.close()
-            rested = self._bench.rest(mirror.rest)
+            rested = self._services.rest(mirror.rest)
         kept = ""
         if result.error_code != ErrorCode.OK and run.outcome.records and run.journal.folder.is_dir():
             kept = (
@@ -119,9 +119,9 @@ class CalibrateAction:
     def _opened(
         self, goal: Calibrate.Goal, plan: Plan, options: PlanOptions, mirror: Mirror, runs: UnfinishedRuns
     ) -> OpenRun:
-        in_use = self._desk.in_use
+        in_use = self._manager.in_use
         settings = {
-            "settle_time_s": self._bench.settle_time,
+            "settle_time_s": self._services.settle_time,
             "maps_per_state": goal.maps_per_state or 1,
             "degauss": "over the full range, steps as configured in the driver" if options.degauss else "none",
             "model": in_use.id if in_use and plan.kind is PlanKind.SURFACES else "",
@@ -133,8 +133,8 @@ class CalibrateAction:
         run = open_run(runs, identity, plan, resume, goal.maps_per_state or 1, goal.note)
         if resume.fresh:  # for one goal only
             self._node.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, False)])
-        for words in filter(None, (*run.notes, run.resumed)):
-            self._node.get_logger().info(words)
+        for text in filter(None, (*run.notes, run.resumed)):
+            self._node.get_logger().info(text)
         return run
 
     def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> tuple[Plan, PlanOptions]:
@@ -158,9 +158,9 @@ class CalibrateAction:
         )
         return make_plan(PlanKind(goal.plan), mirror, options), options
 
-    def _foretell(self, goal: Calibrate.Goal, plan: Plan, result: Calibrate.Result) -> None:
+    def _forecast(self, goal: Calibrate.Goal, plan: Plan, result: Calibrate.Result) -> None:
         """Fill in what is to be expected; the message of a dry run."""
-        expected = forecast(plan, goal.settle_time or self._values["settle_time"], self._desk.in_use)
+        expected = forecast(plan, goal.settle_time or self._values["settle_time"], self._manager.in_use)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
@@ -190,28 +190,28 @@ class CalibrateAction:
             # Reference frames belong to the phase around them.
             report(_PHASES.get(now.kind, feedback.phase), now.label, now.done)
 
-        in_use = self._desk.in_use
+        in_use = self._manager.in_use
         # A full plan solves its shapes on the pokes of this very run.
         model = in_use.fit if in_use and plan.kind is PlanKind.SURFACES else None
         facts = mirror_facts(mirror)
 
         def guard() -> None:
-            if (now := self._desk.mirror) is not None and mirror_facts(now) != facts:
+            if (now := self._manager.mirror) is not None and mirror_facts(now) != facts:
                 raise Refusal(
                     ErrorCode.CALIBRATION_MISMATCH,
                     f"the mirror changed in the middle of the run: {now.name} {now.serial!r}, before it was "
                     f"{mirror.name} {mirror.serial!r} (or its limits did)",
                 )
-            self._bench.check_history()
+            self._services.check_history()
 
         procedure = Procedure(
             plan,
             mirror,
-            self._bench,
+            self._services,
             procedure_options(self._values, handle.request.maps_per_state),
             model=model,
             progress=progress,
-            cancelled=self._bench.cancelled,
+            cancelled=self._services.cancelled,
             outcome=run.outcome,
             keep=run.journal.keep,
             guard=guard,
@@ -236,10 +236,10 @@ class CalibrateAction:
                 fit = fit_influence(outcome.maps(), fit_options(self._values), rings=mirror.rings)
                 check = check_fit(fit, mirror)
             else:
-                state = self._bench.state
+                state = self._services.state
                 unknown = goal.skip_degauss and not (state is not None and state.history_known)
                 remarks = ["Measured from an unknown hysteresis state, without a degauss before."] if unknown else []
-                provenance = self._desk.provenance(mirror.name, mirror.serial, goal.note)
+                provenance = self._manager.provenance(mirror.name, mirror.serial, goal.note)
                 if run.storing is not None:  # killed while storing: the same calibration again, not another one
                     provenance = Provenance(run.storing.id, run.storing.created_ns, provenance.note)
                 calibration = calibrate(
@@ -275,11 +275,11 @@ class CalibrateAction:
             )
         report(Calibrate.Feedback.PHASE_STORE, calibration.id, len(plan.steps))
         run.journal.keep(Storing(calibration.id, calibration.created_ns))
-        result.file = str(self._desk.keep(calibration))
+        result.file = str(self._manager.keep(calibration))
         run.journal.remove()
         result.id = calibration.id
         if goal.activate:
-            self._desk.use(calibration)
+            self._manager.use(calibration)
         found = "" if check.passed else f", poke check: {'; '.join(check.findings)}"
         result.message = (
             f"{result.maps} maps, residual {fit.in_sample_rms * 1e9:.2f} nm in sample, "

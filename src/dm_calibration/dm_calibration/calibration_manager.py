@@ -67,7 +67,7 @@ class CalibrationManager:
         return mirror
 
     def set_mirror(self, mirror: Mirror) -> str:
-        """Take over the mirror. Returns why the calibration in use was withdrawn, in words; "" = it was not."""
+        """Take over the mirror. Returns why the calibration in use was withdrawn; "" = it was not."""
         with self._lock:
             self._mirror = mirror
             wrong = self.mismatch(self._in_use) if self._in_use else ""
@@ -78,7 +78,7 @@ class CalibrationManager:
             return f"calibration {withdrawn} withdrawn: {wrong}"
 
     def mismatch(self, calibration: Calibration) -> str:
-        """Why `calibration` does not belong to the mirror, in words; "" = it does, or no mirror is known."""
+        """Why `calibration` does not belong to the mirror; "" = it does, or no mirror is known."""
         mirror = self.mirror
         if mirror is None:
             return ""

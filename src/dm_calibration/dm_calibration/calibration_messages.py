@@ -89,7 +89,7 @@ def calibration_message(
 def put_updates(
     message: CalibrationMsg, updates: Updates, fit: InfluenceFit, doubts: list[str], mirror_changed: bool
 ) -> None:
-    """What later maps have told, into the `message` of the calibration that they update.
+    """What later maps have shown, into the `message` of the calibration that they update.
 
     Args:
         fit: the influence function as it is now.
@@ -123,7 +123,7 @@ def report_from(message: ActuatorState) -> Report:
 
 
 def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
-    """The memory of a calibration."""
+    """The hysteresis model of a calibration."""
     law = hysteresis.law
     return ActuatorHysteresis(
         law=hysteresis.name,

@@ -52,8 +52,8 @@ class CalibrationNode(Node):
         self._start_pending = bool(self._values["load_on_start"])
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.LATCHED)
-        self._reports = ReportWriter(self._tell_of_report)
-        self._desk = CalibrationManager(
+        self._reports = ReportWriter(self._log_report)
+        self._manager = CalibrationManager(
             ReportingStore(
                 self._values["calibration_folder"], self._reports, lambda: bool(self._values["write_report"])
             ),
@@ -61,16 +61,16 @@ class CalibrationNode(Node):
             lambda: int(self.get_clock().now().nanoseconds),
             self._publish,
         )
-        self._bench = BenchServices(self, self._values)
+        self._services = BenchServices(self, self._values)
         self._driver_facts: dict[str, Any] = {}
-        action = CalibrateAction(self, self._values, self._bench, self._desk, lambda: self._driver_facts)
+        action = CalibrateAction(self, self._values, self._services, self._manager, lambda: self._driver_facts)
         self._server = WorkerActionServer(self, Calibrate, "calibrate", action.run, exclusive="refuse")
-        self._watch = MapListener(self, self._values, self._desk, self._bench, lambda: self._server.busy)
+        self._listener = MapListener(self, self._values, self._manager, self._services, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load)
         WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)
         WorkerService(self, StoreRecipes, "store_recipes", self._on_store_recipes)
-        prediction = ErrorPrediction(self._desk, self._values)
+        prediction = ErrorPrediction(self._manager, self._values)
         for kind, name, work in (
             (FitRegression, "fit_regression", prediction.fit),
             (PredictError, "predict_error", prediction.predict),
@@ -78,29 +78,29 @@ class CalibrationNode(Node):
             WorkerService(self, kind, name, partial(self._serve, work))
         self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._ticker = self.create_timer(PUBLISH_PERIOD_S, self._watch.tick, clock=steady)
+        self._ticker = self.create_timer(PUBLISH_PERIOD_S, self._listener.tick, clock=steady)
         self._publish(None, None)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
 
     def make_safe(self) -> None:
         """Bring the mirror back to mid range when the process ends in the middle of a calibration."""
-        self._watch.stop()
-        mirror = self._desk.mirror
+        self._listener.stop()
+        mirror = self._manager.mirror
         if self._server.busy and mirror is not None:
-            self.get_logger().warning(f"ended during a calibration: {self._bench.rest_at_exit(mirror.rest)}")
+            self.get_logger().warning(f"ended during a calibration: {self._services.rest_at_exit(mirror.rest)}")
         self._reports.end()
 
-    def _tell_of_report(self, words: str, warning: bool) -> None:
+    def _log_report(self, text: str, warning: bool) -> None:
         if warning:
-            self.get_logger().warning(words)
+            self.get_logger().warning(text)
         else:
-            self.get_logger().info(words)
+            self.get_logger().info(text)
 
     def _publish(self, calibration: Calibration | None, file: Path | None) -> None:
         error_max = self._values["calibrated_error_max"]
         message = calibration_message(calibration, file, self._frame_id, error_max)
-        self._watch.begin(calibration)
-        self._watch.amend(message)
+        self._listener.begin(calibration)
+        self._listener.amend(message)
         self._publisher.publish(message)
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
@@ -111,7 +111,7 @@ class CalibrationNode(Node):
             self.get_logger().error(f"mirror_info refused: {error}")
             return
         self._driver_facts = driver_facts(message)
-        if withdrawn := self._desk.set_mirror(mirror):
+        if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"
         if self._start_pending:
@@ -122,21 +122,21 @@ class CalibrationNode(Node):
     def _load_on_start(self) -> None:
         name = self._values["load_on_start"]
         try:
-            calibration = self._desk.load("" if name == "newest" else name)
+            calibration = self._manager.load("" if name == "newest" else name)
             self.get_logger().info(f"calibration {calibration.id} loaded at start")
         except EXPECTED as error:
             self.get_logger().warning(f"load_on_start = {name!r}: {error}")
 
-    def _answer(self, response: Any, work: Callable[[], None], told: str = "") -> Any:
+    def _answer(self, response: Any, work: Callable[[], None], logged: str = "") -> Any:
         """Run `work`; an expected failure becomes error code and message of the response.
 
-        It is logged too, unless its sentence is `told`.
+        It is logged too, unless its sentence is `logged`.
         """
         try:
             work()
         except EXPECTED as error:
             response.error_code, response.message = error_code(error), str(error)
-            if response.message != told:
+            if response.message != logged:
                 self.get_logger().warning(response.message)
         return response
 
@@ -147,11 +147,11 @@ class CalibrationNode(Node):
         return response
 
     def _on_list(self, _request: Any, response: Any) -> Any:
-        in_use = self._desk.in_use
-        for entry in self._desk.store.entries():
+        in_use = self._manager.in_use
+        for entry in self._manager.store.entries():
             calibration, remark = entry.calibration, entry.remark
             if calibration:
-                remark = "in use" if in_use and calibration.id == in_use.id else self._desk.mismatch(calibration)
+                remark = "in use" if in_use and calibration.id == in_use.id else self._manager.mismatch(calibration)
             response.ids.append(entry.id)
             response.mirror_serials.append(calibration.mirror_serial if calibration else "")
             response.methods.append(calibration.fit.method if calibration else "")
@@ -162,7 +162,7 @@ class CalibrationNode(Node):
 
     def _on_load(self, request: Any, response: Any) -> Any:
         def work() -> None:
-            response.id = self._desk.load(request.calibration).id
+            response.id = self._manager.load(request.calibration).id
             response.message = f"calibration {response.id} is in use"
 
         return self._answer(response, work)
@@ -170,28 +170,28 @@ class CalibrationNode(Node):
     def _on_fit(self, request: Any, response: Any) -> Any:
         def work() -> None:
             named = request.calibration
-            stored = self._desk.store.load(named) if named else self._desk.in_use
+            stored = self._manager.store.load(named) if named else self._manager.in_use
             if stored is None:
                 raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use and none was named")
             if request.activate:
-                self._desk.check_fits(stored)
-            provenance = self._desk.provenance(stored.mirror_name, stored.mirror_serial, "")
+                self._manager.check_fits(stored)
+            provenance = self._manager.provenance(stored.mirror_name, stored.mirror_serial, "")
             calibration = refit(stored, fit_options(self._values, request.method), request.exclude, provenance)
-            response.file = str(self._desk.store.save(calibration))
+            response.file = str(self._manager.store.save(calibration))
             response.id = calibration.id
             response.in_sample_rms = calibration.fit.in_sample_rms
             response.held_out_rms = calibration.fit.held_out_rms
             response.condition_number = calibration.fit.condition_number
             response.message = f"fitted again from {stored.id}: {int(calibration.fit.used.sum())} maps used"
             if request.activate:
-                self._desk.use(calibration)
+                self._manager.use(calibration)
 
         return self._answer(response, work)
 
     def _on_store_recipes(self, request: Any, response: Any) -> Any:
         def work() -> None:
             book = recipe_book_from(request.recipes)
-            calibration = self._desk.add_recipes(request.calibration_id, book)
+            calibration = self._manager.add_recipes(request.calibration_id, book)
             response.message = (
                 f"{len(book.recipes)} recipes stored with calibration {calibration.id}, which now has "
                 f"{len(calibration.recipes.recipes)}"
@@ -200,15 +200,15 @@ class CalibrationNode(Node):
         return self._answer(response, work)
 
     def _health(self) -> diagnostics.Health:
-        calibration, mirror = self._desk.in_use, self._desk.mirror
-        values: dict[str, object] = {"calibrating": self._server.busy, "folder": str(self._desk.store.folder)}
+        calibration, mirror = self._manager.in_use, self._manager.mirror
+        values: dict[str, object] = {"calibrating": self._server.busy, "folder": str(self._manager.store.folder)}
         if mirror is None:
             return diagnostics.Health(diagnostics.WARN, "no mirror_info: is pdm_driver running?", values)
         if calibration is None:
             return diagnostics.Health(diagnostics.WARN, "no calibration is in use", values)
         values["held_out_rms_nm"] = round(calibration.fit.held_out_rms * 1e9, 3)
         values["maps_used"] = int(calibration.fit.used.sum())
-        level, warnings, figures = self._watch.health()
+        level, warnings, figures = self._listener.health()
         return diagnostics.Health(level, "; ".join((f"calibration {calibration.id}", *warnings)), values | figures)
 
 

@@ -32,7 +32,7 @@ PARAMETERS = (
     ),
     Parameter("poke_amplitude", float, 0.5, "Half-swing of a push-pull poke, normalised.", "", 0.01, 1.0, live=True),
     Parameter("reference_every", int, 10, "Steps between two reference frames.", "", 1, 1000, live=True),
-    Parameter("hysteresis_maps", int, 300, "Commands of a memory plan; more give less noise.", "", 60, 2000, live=True),
+    Parameter("hysteresis_maps", int, 300, "Commands of a hysteresis plan; more, less noise.", "", 60, 2000, live=True),
     Parameter("settle_time", float, 0.5, "Wait between command and map, in ROS time.", "s", 0.0, 600.0, live=True),
     Parameter("measure_retries", int, 1, "Further tries after a map that failed.", "", 0, 20, live=True),
     Parameter(
@@ -63,7 +63,7 @@ PARAMETERS = (
         "bump.tilt_max",
         float,
         3e-6,
-        "Largest change of tilt between two reference frames, as sag at the edge; 0 = not looked at.",
+        "Largest change of tilt between two reference frames, as sag at the edge; 0 = not checked.",
         "m",
         0.0,
         1e-3,
@@ -73,7 +73,7 @@ PARAMETERS = (
         "bump.shift_max",
         float,
         1e-4,
-        "Largest shift of the aperture on the map between two reference frames, at the mirror; 0 = not looked at.",
+        "Largest shift of the aperture on the map between two reference frames, at the mirror; 0 = not checked.",
         "m",
         0.0,
         1e-2,
@@ -84,7 +84,7 @@ PARAMETERS = (
         float,
         50e-9,
         "Largest change of the rms figure between two reference frames, beyond what `hysteresis_allowance` explains; "
-        "0 = not looked at.",
+        "0 = not checked.",
         "m",
         0.0,
         1e-3,
@@ -263,7 +263,7 @@ def update_options(values: Mapping[str, Any]) -> UpdateOptions:
         surprises_max=values["updates.surprises_max"],
         valid_fraction_min=values["valid_fraction_min"],
         aperture_tolerance=values["aperture_tolerance"],
-        # Without a memory law, an actuator may stand on any branch of its loop.
+        # Without a hysteresis model, an actuator may stand on any branch of its loop.
         signal_sigma=0.5 * values["hysteresis_allowance"],
         rates=DriftRates(values["updates.gain_rate"], values["updates.figure_rate"]),
     )

@@ -22,7 +22,7 @@ BACKLASH, SHARE = 0.35, 0.15
 
 
 class RememberingBench:
-    """Implements dm_common.measurement.Bench. The gains differ, so that memory bends the plate."""
+    """Implements dm_common.measurement.Bench. The gains differ, so that hysteresis bends the plate."""
 
     def __init__(self) -> None:
         gains = 1.0 + 0.05 * np.random.default_rng(9).standard_normal(MIRROR.actuators)

@@ -1,4 +1,4 @@
-"""A mirror without memory whose gains and figure can be made to drift, calibrated by pokes."""
+"""A mirror without hysteresis whose gains and figure can be made to drift, calibrated by pokes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.procedure.applied_history import Standing
+from dm_calibration.procedure.applied_history import SettledState
 from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.hysteresis.model import HysteresisModel
@@ -64,9 +64,9 @@ class SteadyMirror:
             wavelength=632.8e-9,
         )
 
-    def standing(self) -> Standing:
+    def settled(self) -> SettledState:
         """What stands at the mirror, as if it had just come."""
-        return Standing(self.signals, 1e-9 * self.clock_ns)
+        return SettledState(self.signals, 1e-9 * self.clock_ns)
 
     def calibrate(self, stamp_ns: int = 0) -> Calibration:
         """Push-pull pokes, fitted; the last map not long before `stamp_ns` where given."""
@@ -79,6 +79,6 @@ class SteadyMirror:
 
 
 def without_effect(error: float = 1e-10) -> HysteresisFit:
-    """A memory that remembers nothing, predicted within `error` (m), so that only its history counts."""
+    """A hysteresis model without hysteresis, predicted within `error` (m), so that only its history counts."""
     sigma = np.concatenate((np.zeros(3), np.full(18, error)))
     return HysteresisFit("none", HysteresisModel.linear(), sigma, 3.0 * error, 0.05, 100, ())

@@ -49,10 +49,10 @@ def driver(history: AppliedHistory) -> Driver:
 def test_a_map_gets_the_signals_of_its_own_time(history: AppliedHistory, driver: Driver) -> None:
     driver.go(10.0, 0.2)
     driver.go(20.0, 0.4)
-    standing = history.standing(15.0, 1.0)
-    assert (standing.effective == 0.2).all()
-    assert standing.since == 10.0
-    assert (history.standing(25.0, 1.0).effective == 0.4).all()
+    settled = history.settled(15.0, 1.0)
+    assert (settled.effective == 0.2).all()
+    assert settled.since == 10.0
+    assert (history.settled(25.0, 1.0).effective == 0.4).all()
 
 
 @pytest.mark.parametrize(
@@ -71,13 +71,13 @@ def test_a_mirror_that_did_not_stand_still(time: float, words: str, history: App
     driver.report(30.0, active=False)
     driver.report(40.0, moving=True)
     with pytest.raises(MapNotUsableError, match=words):
-        history.standing(time, 1.0)
+        history.settled(time, 1.0)
 
 
 def test_holding_a_shape_against_creep_is_no_move(history: AppliedHistory, driver: Driver) -> None:
     driver.go(10.0, 0.2)
     driver.go(20.0, 0.2001)
-    assert history.standing(20.2, 1.0).effective == pytest.approx(0.2001)
+    assert history.settled(20.2, 1.0).effective == pytest.approx(0.2001)
 
 
 def test_effective_signals_follow_the_hysteresis(history: AppliedHistory, driver: Driver) -> None:
@@ -85,7 +85,7 @@ def test_effective_signals_follow_the_hysteresis(history: AppliedHistory, driver
     driver.degauss(1.0)
     driver.go(2.0, 0.8)
     driver.go(4.0, 0.4)
-    assert history.standing(6.0, 1.0).effective == pytest.approx(0.5 * 0.4 + 0.5 * 0.5)
+    assert history.settled(6.0, 1.0).effective == pytest.approx(0.5 * 0.4 + 0.5 * 0.5)
 
 
 def test_a_law_that_comes_later_is_followed_from_the_last_degauss(history: AppliedHistory, driver: Driver) -> None:
@@ -93,14 +93,14 @@ def test_a_law_that_comes_later_is_followed_from_the_last_degauss(history: Appli
     driver.go(2.0, 0.8)
     driver.go(4.0, 0.4)
     history.follow(LAW)
-    assert history.standing(6.0, 1.0).effective == pytest.approx(0.45)
+    assert history.settled(6.0, 1.0).effective == pytest.approx(0.45)
 
 
 def test_an_unknown_history_is_refused(history: AppliedHistory, driver: Driver) -> None:
     history.follow(LAW)
     driver.go(2.0, 0.8)
     with pytest.raises(MapNotUsableError, match=r"history of the actuators is not known: .*; a degauss"):
-        history.standing(4.0, 1.0)
+        history.settled(4.0, 1.0)
 
 
 def test_a_silent_driver_is_noticed(history: AppliedHistory, driver: Driver) -> None:
@@ -117,4 +117,4 @@ def test_another_number_of_signals_starts_anew(history: AppliedHistory, driver: 
     with pytest.raises(ValueError, match="applied: 3 signals, before there were 2"):
         driver.report(2.0)
     with pytest.raises(MapNotUsableError, match="no report so old"):
-        history.standing(5.0, 1.0)
+        history.settled(5.0, 1.0)

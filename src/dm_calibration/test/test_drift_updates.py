@@ -22,7 +22,7 @@ from steady_mirror import SteadyMirror
 
 Made = tuple[SteadyMirror, Calibration]
 
-#: Without a memory law the node allows for hysteresis; this mirror has none.
+#: Without a hysteresis model the node allows for hysteresis; this mirror has none.
 EXACT = UpdateOptions(signal_sigma=1e-4)
 
 
@@ -71,7 +71,7 @@ def error(bench: SteadyMirror, fit: InfluenceFit) -> float:
 
 
 def test_a_map_that_agrees_is_taken(bench: SteadyMirror, updates: RecalibrationManager) -> None:
-    verdict = updates.take(bench.measure("check"), bench.standing())
+    verdict = updates.take(bench.measure("check"), bench.settled())
     assert verdict.accepted
     assert 0.3 < verdict.comparison.surprise < 1.7
     assert known(updates).revision == 1
@@ -87,7 +87,7 @@ def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path)
     for night in range(100):
         bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
         bench.drift(gain * (night + 1) / 100, figure * (night + 1) / 100)
-        assert updates.take(bench.measure("night", days=1.0), bench.standing()).accepted, night
+        assert updates.take(bench.measure("night", days=1.0), bench.settled()).accepted, night
     drift = known(updates).drift
     assert drift.offset_rms == pytest.approx(20e-9, rel=0.1)
     assert np.abs(drift.gain - gain).max() < 0.25 * gain.max()
@@ -95,9 +95,9 @@ def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path)
 
 
 def test_one_bad_map_changes_nothing(bench: SteadyMirror, updates: RecalibrationManager) -> None:
-    updates.take(bench.measure("good"), bench.standing())
+    updates.take(bench.measure("good"), bench.settled())
     before = changed_fit(updates)
-    verdict = updates.take(bench.measure("bumped", bump=30e-9), bench.standing())
+    verdict = updates.take(bench.measure("bumped", bump=30e-9), bench.settled())
     assert not verdict.accepted
     assert verdict.comparison.surprise > 3.0
     assert "bad map, or the mirror has changed" in verdict.reason
@@ -108,32 +108,32 @@ def test_one_bad_map_changes_nothing(bench: SteadyMirror, updates: Recalibration
 
 
 def test_a_map_of_another_shape_is_refused(bench: SteadyMirror, updates: RecalibrationManager) -> None:
-    claimed = bench.standing()
+    claimed = bench.settled()
     bench.apply(-bench.signals)
     assert not updates.take(bench.measure("wrong"), claimed).accepted
 
 
 def test_several_bad_maps_in_a_row_tell_of_a_changed_mirror(bench: SteadyMirror, updates: RecalibrationManager) -> None:
-    reasons = [updates.take(bench.measure("bumped", bump=30e-9), bench.standing()).reason for _ in range(3)]
+    reasons = [updates.take(bench.measure("bumped", bump=30e-9), bench.settled()).reason for _ in range(3)]
     assert updates.mirror_changed
     assert "calibrate again" not in reasons[1]
     assert "3 maps in a row did: the mirror has changed: calibrate again" in reasons[2]
-    assert updates.take(bench.measure("good"), bench.standing()).accepted
+    assert updates.take(bench.measure("good"), bench.settled()).accepted
     assert not updates.mirror_changed
 
 
 def test_maps_of_one_unmoved_mirror_count_for_less_and_less(bench: SteadyMirror, updates: RecalibrationManager) -> None:
-    standing = bench.standing()
+    settled = bench.settled()
     sizes = []
     for _ in range(12):
-        updates.take(bench.measure("again"), standing)
+        updates.take(bench.measure("again"), settled)
         sizes.append(np.trace(known(updates).drift.covariance))
     gained = -np.diff(sizes)
     assert gained[-1] < 0.2 * gained[0]
 
 
 def test_a_dry_run_compares_only(bench: SteadyMirror, updates: RecalibrationManager, tmp_path: Path) -> None:
-    verdict = updates.take(bench.measure("check"), bench.standing(), dry_run=True)
+    verdict = updates.take(bench.measure("check"), bench.settled(), dry_run=True)
     assert verdict.accepted
     assert known(updates).revision == 0
     assert not list(tmp_path.iterdir())
@@ -157,15 +157,15 @@ def test_maps_that_cannot_be_compared_are_refused(
     change: Callable[[Measurement], Measurement], words: str, bench: SteadyMirror, updates: RecalibrationManager
 ) -> None:
     with pytest.raises(MapNotUsableError, match=words):
-        updates.take(change(bench.measure("check")), bench.standing())
+        updates.take(change(bench.measure("check")), bench.settled())
     assert known(updates).revision == 0
 
 
 def test_points_without_data_do_no_harm(bench: SteadyMirror, updates: RecalibrationManager) -> None:
     measured = bench.measure("check")
     gaps = np.where(np.arange(measured.sag.size) % 10 == 0, np.nan, measured.sag)
-    whole = updates.take(measured, bench.standing(), dry_run=True).comparison
-    verdict = updates.take(replace(measured, sag=gaps), bench.standing())
+    whole = updates.take(measured, bench.settled(), dry_run=True).comparison
+    verdict = updates.take(replace(measured, sag=gaps), bench.settled())
     assert verdict.accepted
     assert verdict.comparison.surprise == pytest.approx(whole.surprise, rel=0.3)
 
@@ -177,7 +177,7 @@ def test_updates_are_there_again_and_the_calibration_file_is_as_it_was(
     content = file.read_bytes()
     updates = begun(made, tmp_path)
     bench.drift(2e-4)
-    updates.take(bench.measure("check"), bench.standing())
+    updates.take(bench.measure("check"), bench.settled())
     again = begun(made, tmp_path)
     assert known(again).revision == 1
     assert np.array_equal(changed_fit(again).influence_sag, changed_fit(updates).influence_sag)
@@ -188,7 +188,7 @@ def test_updates_are_there_again_and_the_calibration_file_is_as_it_was(
 def test_forgotten_updates_are_gone(
     bench: SteadyMirror, made: Made, updates: RecalibrationManager, tmp_path: Path
 ) -> None:
-    updates.take(bench.measure("check"), bench.standing())
+    updates.take(bench.measure("check"), bench.settled())
     updates.forget()
     assert known(updates).revision == 0
     assert np.array_equal(changed_fit(updates).influence_sag, made[1].fit.influence_sag)
@@ -198,7 +198,7 @@ def test_forgotten_updates_are_gone(
 def test_a_damaged_file_is_told_and_ignored(
     bench: SteadyMirror, made: Made, updates: RecalibrationManager, tmp_path: Path
 ) -> None:
-    updates.take(bench.measure("check"), bench.standing())
+    updates.take(bench.measure("check"), bench.settled())
     file = next(tmp_path.iterdir())
     file.write_bytes(file.read_bytes()[:2000])
     assert known(begun(made, tmp_path, remark="not a whole HDF5 file")).revision == 0
@@ -207,7 +207,7 @@ def test_a_damaged_file_is_told_and_ignored(
 def test_updates_of_another_content_are_ignored(
     bench: SteadyMirror, made: Made, updates: RecalibrationManager, tmp_path: Path
 ) -> None:
-    updates.take(bench.measure("check"), bench.standing())
+    updates.take(bench.measure("check"), bench.settled())
     fit = replace(made[1].fit, zernike_offset=made[1].fit.zernike_offset + 1e-9)
     other = (made[0], replace(made[1], fit=fit))
     assert known(begun(other, tmp_path, remark="basis_sha256")).revision == 0
@@ -218,7 +218,7 @@ def test_an_update_that_cannot_be_stored_changes_nothing(bench: SteadyMirror, ma
     nowhere.write_text("no folder")
     updates = begun(made, nowhere)
     with pytest.raises(StoreError, match="was not stored"):
-        updates.take(bench.measure("check"), bench.standing())
+        updates.take(bench.measure("check"), bench.settled())
     assert known(updates).revision == 0
 
 
@@ -226,6 +226,6 @@ def test_a_rate_of_zero_keeps_the_gains(bench: SteadyMirror, made: Made, tmp_pat
     widths = []
     for gain in (0.0, 1e-3):
         updates = begun(made, tmp_path / str(gain), replace(EXACT, rates=DriftRates(gain=gain, figure=0.0)))
-        updates.take(bench.measure("later", days=100.0), bench.standing())
+        updates.take(bench.measure("later", days=100.0), bench.settled())
         widths.append(np.diag(known(updates).drift.covariance)[: bench.mirror.actuators].max())
     assert widths[0] < 0.1 * widths[1]

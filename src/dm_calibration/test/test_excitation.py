@@ -1,4 +1,4 @@
-"""The commands of a memory plan: legal, turning, the same for the same seed."""
+"""The commands of a hysteresis plan: legal, turning, the same for the same seed."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def names(watch: FolderWatch, now: float) -> list[str]:
-    return [sighting.path.name for sighting in watch.poll(now) if not sighting.refused]
+    return [event.path.name for event in watch.poll(now) if not event.refused]
 
 
 def test_existing_files_are_not_new_until_written_again(folder: Path) -> None:
@@ -92,7 +92,7 @@ def test_what_leads_elsewhere_or_is_no_file_is_refused_once(folder: Path, tmp_pa
     (folder / "real.dat").write_bytes(b"1")
     (folder / "alias.dat").symlink_to("real.dat")
     watch.poll(1)
-    found = {sighting.path.name: sighting.refused for sighting in watch.poll(3)}
+    found = {event.path.name: event.refused for event in watch.poll(3)}
     assert found.pop("real.dat") == ""
     assert "out of the watched folder" in found.pop("out.dat")
     assert "not a regular file" in found.pop("pipe.dat")
@@ -131,7 +131,7 @@ def test_closed_file_of_the_length_it_tells_is_taken_at_once(folder: Path) -> No
     (folder / "half.dat").write_bytes(WHOLE[:-1])
     (folder / "other.txt").write_bytes(WHOLE)
     taken = watch.closed(["whole.dat", "half.dat", "other.txt", "gone.dat"], 1)
-    assert [sighting.path.name for sighting in taken] == ["whole.dat"]
+    assert [event.path.name for event in taken] == ["whole.dat"]
     assert watch.closed(["whole.dat"], 1.1) == []  # closed again, nothing new
     assert names(watch, 3) == ["half.dat"]  # still as it was: it will not become longer
 
@@ -148,7 +148,7 @@ def test_closed_link_that_leads_out_is_left_to_be_refused(folder: Path, tmp_path
     (tmp_path / "outside.dat").write_bytes(WHOLE)
     (folder / "link.dat").symlink_to(tmp_path / "outside.dat")
     assert watch.closed(["link.dat"], 1) == []
-    assert [bool(sighting.refused) for sighting in watch.poll(3)] == [True]
+    assert [bool(event.refused) for event in watch.poll(3)] == [True]
 
 
 def test_the_kernel_tells_of_closed_and_moved_files(folder: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Memory and recipes in calibration files: what goes in comes out, and files without them are read."""
+"""Hysteresis model and recipes in calibration files: what goes in comes out, and files without them are read."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def test_maps_that_do_not_tell_count_from_the_map_before() -> None:
         (5, 0),
         (7, 1),
         (9, 10),
-    ]  # s of map and move: told, not told, before the last map, after it
+    ]  # s of map and move: known, not known, before the last map, after it
     records = [
         replace(record, label=str(k), stamp_ns=stamp * 10**9, moved_ns=moved * 10**9)
         for k, (stamp, moved) in enumerate(times)

@@ -34,17 +34,17 @@ def calibration() -> Calibration:
 
 
 class Stand:
-    """A desk with one stored calibration in use."""
+    """A manager with one stored calibration in use."""
 
     def __init__(self, folder: Path, calibration: Calibration) -> None:
         self.published: list[Calibration | None] = []
         self.store = CalibrationStore(folder)
         self.file = self.store.save(calibration)
-        self.desk = CalibrationManager(
+        self.manager = CalibrationManager(
             self.store, lambda: 0.01, lambda: 0, lambda one, _file: self.published.append(one)
         )
-        self.desk.set_mirror(MIRROR)
-        self.desk.load("known")
+        self.manager.set_mirror(MIRROR)
+        self.manager.load("known")
 
 
 @pytest.fixture
@@ -71,14 +71,14 @@ def raw_data(file: Path) -> dict[str, bytes]:
 
 def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:
     before = raw_data(stand.file)
-    stand.desk.add_recipes("known", book(-0.01, 0.02))
-    stand.desk.add_recipes("known", book(0.0, 0.02, maps=33))
+    stand.manager.add_recipes("known", book(-0.01, 0.02))
+    stand.manager.add_recipes("known", book(0.0, 0.02, maps=33))
     loaded = stand.store.load("known")
     assert [(r.curvature, r.maps) for r in loaded.recipes.recipes] == [(-0.01, 20), (0.0, 33), (0.02, 33)]
     assert len(before) > 10
     assert raw_data(stand.file) == before
     assert list(stand.file.parent.iterdir()) == [stand.file]
-    assert stand.published[-1] is stand.desk.in_use
+    assert stand.published[-1] is stand.manager.in_use
     assert stand.published[-1] is not None
     assert len(stand.published[-1].recipes.recipes) == 3
 
@@ -91,13 +91,13 @@ def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatc
 
     monkeypatch.setattr(os, "write", full)
     with pytest.raises(StoreError, match=r"known was not stored in .*: No space left on device") as caught:
-        stand.desk.add_recipes("known", book(0.01))
+        stand.manager.add_recipes("known", book(0.01))
     monkeypatch.undo()
     assert error_code(caught.value) == ErrorCode.STORAGE_FAILED
     assert stand.file.read_bytes() == before
     assert list(stand.file.parent.iterdir()) == [stand.file]
-    assert stand.desk.in_use is not None
-    assert stand.desk.in_use.recipes is NO_RECIPES
+    assert stand.manager.in_use is not None
+    assert stand.manager.in_use.recipes is NO_RECIPES
     assert len(stand.published) == published
 
 
@@ -119,18 +119,18 @@ def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatc
 def test_recipes_that_do_not_belong_are_refused(
     stand: Stand, calibration_id: str, recipes: Callable[[], RecipeBook], code: int, words: str
 ) -> None:
-    stand.desk.add_recipes("known", book(0.01))
+    stand.manager.add_recipes("known", book(0.01))
     before = stand.file.read_bytes()
     with pytest.raises((Refusal, RecipeError), match=words) as caught:
-        stand.desk.add_recipes(calibration_id, recipes())
+        stand.manager.add_recipes(calibration_id, recipes())
     assert error_code(caught.value) == code
     assert stand.file.read_bytes() == before
 
 
 def test_without_a_calibration_in_use_there_is_nothing_to_join(stand: Stand) -> None:
-    stand.desk.set_mirror(make_mirror(serial="T-2"))
+    stand.manager.set_mirror(make_mirror(serial="T-2"))
     with pytest.raises(Refusal, match="no calibration is in use") as caught:
-        stand.desk.add_recipes("known", book(0.01))
+        stand.manager.add_recipes("known", book(0.01))
     assert caught.value.error_code == ErrorCode.NOT_CALIBRATED
 
 

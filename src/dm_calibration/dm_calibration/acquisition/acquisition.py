@@ -252,21 +252,21 @@ class Acquisition:
         try:
             while not self._stop.is_set():
                 names = closed.wait(due - time.monotonic())
-                sightings = watch.closed(names, time.monotonic())
+                events = watch.closed(names, time.monotonic())
                 if time.monotonic() >= due:
-                    sightings += self._poll(watch)
+                    events += self._poll(watch)
                     due = time.monotonic() + period
-                for sighting in sightings:
-                    if sighting.refused:
-                        self._on_trouble(f"{sighting.path}: {sighting.refused}")
+                for event in events:
+                    if event.refused:
+                        self._on_trouble(f"{event.path}: {event.refused}")
                     else:
-                        self._hand_over(sighting)
+                        self._hand_over(event)
         finally:
             closed.close()
 
     def _poll(self, watch: FolderWatch) -> list[FileEvent]:
         try:
-            sightings = watch.poll(time.monotonic())
+            events = watch.poll(time.monotonic())
         except OSError as error:
             trouble = f"watch_folder = {str(watch.folder)!r} cannot be read: {error.strerror or error}"
             if not self.folder_trouble:
@@ -274,13 +274,13 @@ class Acquisition:
             self.folder_trouble = trouble
             return []
         self.folder_trouble = ""
-        return sightings
+        return events
 
-    def _hand_over(self, sighting: FileEvent) -> None:
+    def _hand_over(self, event: FileEvent) -> None:
         with self._handover:
             # A file from before the request shows the mirror as it was then.
-            if self._waiting is not None and sighting.written >= self._waiting_since:
-                self._waiting.put(sighting.path)
+            if self._waiting is not None and event.written >= self._waiting_since:
+                self._waiting.put(event.path)
                 self._waiting = None  # one file per request
                 return
-        self._on_file(sighting.path)
+        self._on_file(event.path)

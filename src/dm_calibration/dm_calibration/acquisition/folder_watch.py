@@ -88,7 +88,7 @@ class FolderWatch:
                 candidate.done = True
                 ready.append((signature.modified_ns, self._judge(name, candidate.since)))
         self._known = known
-        return [sighting for _time, sighting in sorted(ready)]
+        return [event for _time, event in sorted(ready)]
 
     def closed(self, names: Iterable[str], now: float) -> list[FileEvent]:
         """Look at files whose writer has just closed them, as far as they are known to be whole, which need not wait.
@@ -107,10 +107,10 @@ class FolderWatch:
             candidate = self._known.get(name)
             if candidate is None or candidate.signature != signature:
                 candidate = self._known[name] = _Candidate(signature, now)
-            sighting = self._judge(name, now)
-            if not candidate.done and not sighting.refused and is_complete(sighting.path):
+            event = self._judge(name, now)
+            if not candidate.done and not event.refused and is_complete(event.path):
                 candidate.done = True
-                ready.append(sighting)
+                ready.append(event)
         return ready
 
     def _list(self) -> dict[str, Signature]:

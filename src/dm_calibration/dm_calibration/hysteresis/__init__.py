@@ -1,1 +1,1 @@
-"""What piezo actuators remember: hysteresis and creep, identified from maps and followed through commands."""
+"""Hysteresis and creep of piezo actuators, identified from maps and followed through commands."""

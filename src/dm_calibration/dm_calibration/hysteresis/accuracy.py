@@ -1,4 +1,4 @@
-"""How well a run will tell the memory law, from its commands alone, before anything moves.
+"""How well a run will show the hysteresis model, from its commands alone, before anything moves.
 
 A coefficient of a map is ``figure + sum_n H_n e_n`` with effective signals ``e_n = sum_f w_f x_fn`` of features x. To
 first order the errors of the gains H and of the weights w that the run leaves are those of two linear regressions on
@@ -29,7 +29,7 @@ TYPICAL_NOISE = 2e-10
 FLOOR = 3.5e-10
 #: Draws for quantiles of the largest of many errors.
 DRAWS = 4000
-#: Directions of the features weaker than this share of the strongest are not told apart, and not needed.
+#: Directions of the features weaker than this share of the strongest cannot be distinguished, and need not be.
 RESOLVED = 1e-7
 
 
@@ -102,12 +102,12 @@ def _features(signals: Floats, time: Floats, start: float) -> Floats:
 def _leverage(seen: Floats, asked: Floats) -> Floats:
     """(Q,) variance of predictions at rows `asked` (Q, U), from rows `seen` (M, U) of unit variance."""
     _, strength, axes = np.linalg.svd(seen, full_matrices=False)
-    told = strength > RESOLVED * strength[0]
-    return np.asarray(np.square(asked @ axes[told].T / strength[told]).sum(axis=1))
+    resolved = strength > RESOLVED * strength[0]
+    return np.asarray(np.square(asked @ axes[resolved].T / strength[resolved]).sum(axis=1))
 
 
 def _shared_error(seen: Floats, asked: Floats, response: Floats) -> Floats:
-    """(D, D) mean covariance of the responses of moves `asked` (Q, F, N) from weights told by `seen` (M, F, N).
+    """(D, D) mean covariance of the responses of moves `asked` (Q, F, N) from weights shown by `seen` (M, F, N).
 
     Args:
         response: (N, D) of unit signals; every response with unit variance.
@@ -115,7 +115,7 @@ def _shared_error(seen: Floats, asked: Floats, response: Floats) -> Floats:
     count = seen.shape[1]
     columns = (seen @ response).transpose(1, 0, 2).reshape(count, -1)
     size, axes = np.linalg.eigh(columns @ columns.T)
-    told = size > RESOLVED**2 * size[-1]
-    root = axes[:, told] / np.sqrt(size[told])
+    resolved = size > RESOLVED**2 * size[-1]
+    root = axes[:, resolved] / np.sqrt(size[resolved])
     moved = (asked @ response).transpose(0, 2, 1) @ root  # (Q, D, F)
     return np.asarray(np.einsum("qdf,qef->de", moved, moved, optimize=True) / len(asked))

@@ -1,4 +1,4 @@
-"""What a memory plan will take and give, told before anything moves."""
+"""What a hysteresis plan will take and give, before anything moves."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Forecast:
 
 
 def forecast(plan: Plan, settle_time: float, earlier: Calibration | None) -> Forecast:
-    """Duration and accuracy to expect of `plan`; accuracy only of memory plans.
+    """Duration and accuracy to expect of `plan`; accuracy only of hysteresis plans.
 
     Args:
         settle_time: s between command and map.

@@ -28,10 +28,10 @@ DRAWS = 4000
 
 @dataclass(frozen=True, eq=False)
 class HysteresisFit:
-    """The memory of one mirror.
+    """Hysteresis and creep of one mirror.
 
     Attributes:
-        name: class of the law, in words.
+        name: class of the law.
         law: see :class:`~dm_common.hysteresis.model.HysteresisModel`.
         zernike_sigma: (K,) m, standard deviation of the coefficients of a predicted move, on maps that had no part in
             the fit, the maps' own noise taken off; 0 for piston and tilt.
@@ -61,7 +61,7 @@ def fit_hysteresis(
         candidates: classes of laws to choose from.
 
     Raises:
-        ExcitationError: the maps do not show the memory.
+        ExcitationError: the maps do not show hysteresis.
         TooFewMapsError: no map can be used.
         ValueError: time stamps that run backwards.
     """
@@ -103,7 +103,9 @@ def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
     if not labels:
         return ()
     more = f" and {len(labels) - 5} more" if len(labels) > 5 else ""
-    return (f"Memory: {len(labels)} maps say nothing of the law or contradict it: {', '.join(labels[:5])}{more}.",)
+    return (
+        f"Hysteresis: {len(labels)} maps say nothing of the model or contradict it: {', '.join(labels[:5])}{more}.",
+    )
 
 
 def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
@@ -197,6 +199,6 @@ def _error_covariance(found: Identification, run: Run, terms: int) -> Floats:
 def _remarks(found: Identification) -> tuple[str, ...]:
     best = found.fit.candidate.name
     others = ", ".join(f"{name} {score:.2f}" for name, score in found.scores.items() if name != best)
-    sentences = [f"Memory: {best} predicts the maps left out best; error of other laws relative to it: {others}."]
-    sentences += [f"Memory: {name} was not taken: {reason}." for name, reason in found.refused.items()]
+    sentences = [f"Hysteresis: {best} predicts the maps left out best; error of other models relative to it: {others}."]
+    sentences += [f"Hysteresis: {name} was not taken: {reason}." for name, reason in found.refused.items()]
     return tuple(sentences)

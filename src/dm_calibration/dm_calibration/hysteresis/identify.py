@@ -25,7 +25,7 @@ PARSIMONY = 1.03
 
 
 class ExcitationError(TooFewMapsError):
-    """The maps do not show the memory: too few, or the commands do not turn."""
+    """The maps do not show hysteresis: too few, or the commands do not turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def identify(
         folds: contiguous parts of the run that are predicted from the others.
 
     Raises:
-        ExcitationError: the run does not show the memory.
+        ExcitationError: the run does not show hysteresis.
         ValueError: time stamps that run backwards.
     """
     check_excitation(run)
@@ -98,7 +98,7 @@ def identify(
 
 
 def check_excitation(run: Run) -> None:
-    """Refuse runs that cannot show the memory.
+    """Refuse runs that cannot show hysteresis.
 
     Raises:
         ExcitationError: fewer maps than unknowns, or actuators that hardly turn or hardly move.
@@ -108,7 +108,7 @@ def check_excitation(run: Run) -> None:
     needed = 2 * actuators
     if usable < needed:
         raise ExcitationError(
-            f"{usable} usable maps: the memory of {actuators} actuators needs at least {needed}; take 100 to 400"
+            f"{usable} usable maps: the hysteresis of {actuators} actuators needs at least {needed}; take 100 to 400"
         )
     change = np.diff(run.signals, axis=0)
     turns = (change[1:] * change[:-1] < 0.0).sum(axis=0)
@@ -118,7 +118,7 @@ def check_excitation(run: Run) -> None:
         worst = int(quiet[np.argmin(turns[quiet])])
         raise ExcitationError(
             f"actuator {worst + 1} turned {turns[worst]} times over a swing of {swing[worst]:.2f} "
-            f"({quiet.size} of {actuators} actuators like it): 10 turns over 0.3 are needed: use the memory plan"
+            f"({quiet.size} of {actuators} actuators like it): 10 turns over 0.3 are needed: use the hysteresis plan"
         )
 
 

@@ -95,7 +95,7 @@ class MapSet:
         return np.array([kind == REFERENCE for kind in self.kind], dtype=bool)
 
     def moved_s(self) -> Floats:
-        """(M,) s since the first map: when the mirror took each shape; right after the map before where not told."""
+        """(M,) s since the first map: when the mirror took each shape; right after the map before where not known."""
         before = np.concatenate((self.stamp_ns[:1], self.stamp_ns[:-1]))
         resumed = np.concatenate(([False], np.diff(self.segment) != 0))
         before = np.where(resumed, self.stamp_ns, before)  # nobody knows what was before

@@ -216,7 +216,7 @@ def _place_findings(place: NDArray[np.int64], active: NDArray[np.int64], x: Floa
 def _nearest_symmetry(
     place: NDArray[np.int64], active: NDArray[np.int64], x: Floats, y: Floats
 ) -> tuple[str, NDArray[np.int64]]:
-    """The turn or mirror image of the layout that explains most of `place`, in words and as a permutation."""
+    """The turn or mirror image of the layout that explains most of `place`: a sentence and a permutation."""
     identity = np.arange(x.size)
     best, best_words = identity, ""
     fewest = int((place != identity)[active].sum())
@@ -228,7 +228,7 @@ def _nearest_symmetry(
 
 
 def layout_symmetries(x: Floats, y: Floats) -> list[tuple[str, NDArray[np.int64]]]:
-    """Turns by multiples of 60 degrees and mirror images that map the layout onto itself, in words and as permutations.
+    """Turns by multiples of 60 degrees and mirror images that map the layout onto itself: sentences and permutations.
 
     Layouts without hexagonal symmetry simply have fewer of them.
     """

@@ -122,9 +122,9 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
         untested: number of maps that the cross-validation could not judge.
     """
     if EXCITATION in good.kind:
-        sentences = ["The influence function acts on effective signals; hysteresis and creep are in the memory law."]
+        sentences = ["The influence function acts on effective signals; hysteresis and creep are in their model."]
     else:
-        sentences = ["The model is linear and without memory: hysteresis and creep stay in its error."]
+        sentences = ["The model is linear: hysteresis and creep stay in its error."]
     if not tilt_known:
         sentences.append(
             "The maps do not show the mirror's tilt (the interferometer's own is larger); "

@@ -69,8 +69,8 @@ class Surface:
         name: as in Table 1.
         signals: (N,) normalised, inside the mirror's limits.
         nominal: (21,) Zernike coefficients of the shape aimed at, m; None when signals were prescribed.
-        remark: what the mirror's limits changed, in words; "" = nothing.
-        target: the shape aimed at and how far it is out of reach, in words; "" when signals were prescribed.
+        remark: what the mirror's limits changed; "" = nothing.
+        target: the shape aimed at and how far it is out of reach; "" when signals were prescribed.
     """
 
     name: str
@@ -93,7 +93,7 @@ def check_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def missing_on(name: str, mirror: Mirror) -> str:
-    """Why a surface of Table 1 makes no sense on `mirror`, in words; "" = it does."""
+    """Why a surface of Table 1 makes no sense on `mirror`; "" = it does."""
     if name in _POKES and _POKES[name] >= mirror.actuators:
         return f"{name} moves actuator {_POKES[name] + 1}; the mirror has {mirror.actuators}"
     if name in _RINGS and not (mirror.rings == _RINGS[name]).any():

@@ -1,4 +1,4 @@
-"""Whether a map file is as long as it says itself, told from its first bytes."""
+"""Whether a map file is as long as it says itself, from its first bytes."""
 
 from __future__ import annotations
 

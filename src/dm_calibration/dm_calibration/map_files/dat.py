@@ -99,11 +99,11 @@ def check_length(header: dict[str, Any], length: int) -> int:
 
 
 def _check_sizes(header: dict[str, Any], intensities: int, pixels: int) -> None:
-    """What the header tells twice about sizes must agree: the format has no checksum. 0 = not told."""
+    """What the header tells twice about sizes must agree: the format has no checksum. 0 = not known."""
     for name, needed in (("phase_bytes", 4 * pixels), ("intensity_bytes", 2 * intensities)):
-        told = header[name]
-        if told not in (0, needed):
-            raise MapFileError(f"{name.replace('_', ' ')} = {told}: must be {needed} for the sizes in the header")
+        stated = header[name]
+        if stated not in (0, needed):
+            raise MapFileError(f"{name.replace('_', ' ')} = {stated}: must be {needed} for the sizes in the header")
     if intensities:
         for size in ("width", "height"):
             most = header[f"intensity_{size}"]

@@ -247,13 +247,13 @@ def _pitch(surface: h5py.Dataset, extra: dict[str, Any]) -> float | None:
     x, y = _converter_pitch(surface, "X Converter"), _converter_pitch(surface, "Y Converter")
     if x is not None and y is not None and abs(x - y) > _SQUARE_TOLERANCE * x:
         raise MapFileError(f"{surface.name}: pixels of {x:g} m x {y:g} m: must be square")
-    told = check_pitch(_extra_number(extra, "Lateral Resolution") or 0.0)
+    stated = check_pitch(_extra_number(extra, "Lateral Resolution") or 0.0)
     pitch = x if x is not None else y
     if pitch is None:
-        return told
-    if told is not None and abs(pitch - told) > _SQUARE_TOLERANCE * pitch:
+        return stated
+    if stated is not None and abs(pitch - stated) > _SQUARE_TOLERANCE * pitch:
         raise MapFileError(
-            f"{surface.name}: X Converter: {pitch:g} m per pixel, Lateral Resolution {told:g} m: must agree"
+            f"{surface.name}: X Converter: {pitch:g} m per pixel, Lateral Resolution {stated:g} m: must agree"
         )
     return pitch
 
@@ -269,13 +269,13 @@ def _origin(surface: h5py.Dataset) -> tuple[int, int]:
 
 def _check_witnesses(surface: h5py.Dataset, extra: dict[str, Any], wavelength: float) -> None:
     """Values that the file tells twice must agree: the format has no checksum."""
-    told = _converter(surface, "Z Converter")
+    stated = _converter(surface, "Z Converter")
     scale, obliquity = _number(surface, "Interferometric Scale Factor"), _number(surface, "Obliquity Factor")
     witnesses: list[tuple[str, float | None, float | None]]
     witnesses = [("Wavelength", wavelength, _extra_number(extra, "Wavelength"))]
-    if told is not None and len(told) >= 4:  # (0, wavelength, scale factor, obliquity)
-        witnesses += [("Wavelength", wavelength, told[1])]
-        witnesses += [("Interferometric Scale Factor", scale, told[2]), ("Obliquity Factor", obliquity, told[3])]
+    if stated is not None and len(stated) >= 4:  # (0, wavelength, scale factor, obliquity)
+        witnesses += [("Wavelength", wavelength, stated[1])]
+        witnesses += [("Interferometric Scale Factor", scale, stated[2]), ("Obliquity Factor", obliquity, stated[3])]
     for name, value, witness in witnesses:
         if value is None or not witness:  # a witness of 0 says nothing, as everywhere in this format
             continue

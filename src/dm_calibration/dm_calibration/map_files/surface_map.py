@@ -54,10 +54,10 @@ class SurfaceMap:
         origin: column and row of the map's top left pixel on the camera.
         format: "dat", "asc", "xyz" or "datx".
         instrument: software and system type, as told by the file.
-        serial: serial number of the instrument; "" when not told.
-        part_name: name of the part; "" when not told.
-        time_stamp: Unix time of the measurement, s; None when not told.
-        system_error_subtracted: None when not told. Maps that differ in it must not be mixed.
+        serial: serial number of the instrument; "" when not known.
+        part_name: name of the part; "" when not known.
+        time_stamp: Unix time of the measurement, s; None when not known.
+        system_error_subtracted: None when not known. Maps that differ in it must not be mixed.
         piston_tilt_removed: whether the plane of the map was subtracted.
         file: where the map was read from.
         content: the file's bytes, for :attr:`sha256`.

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 #: Signals that differ less, normalised, do not count as a move: below 1 nm, as steps of holding a shape against creep.
 SMALL_MOVE = 2e-4
-#: Reports kept to follow another memory law: hysteresis begins anew with a degauss, creep goes further back.
+#: Reports kept to follow another hysteresis model: hysteresis begins anew with a degauss, creep goes further back.
 LOG_LENGTH = 10_000
 #: States kept for maps that arrive late.
 STATES_KEPT = 500
@@ -45,11 +45,11 @@ class Report:
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class SettledState:
     """The mirror at the time of a map.
 
     Attributes:
-        effective: (N,) effective signals; the signals where no memory is followed.
+        effective: (N,) effective signals; the signals where no hysteresis is followed.
         since: s, when it took this shape.
     """
 
@@ -65,7 +65,7 @@ class _Entry:
 
 
 class AppliedHistory:
-    """The states of late, under one memory law; every method may be called from any thread."""
+    """The states of late, under one hysteresis model; every method may be called from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -75,7 +75,7 @@ class AppliedHistory:
         self._heard = float("-inf")
 
     def follow(self, law: HysteresisModel | None, middle: float = 0.0) -> None:
-        """Follow `law` from now on, and through what was heard before; None = no memory."""
+        """Follow `law` from now on, and through what was heard before; None = no hysteresis."""
         with self._lock:
             self._tracker = HysteresisTracker(law, middle) if law is not None else None
             self._entries.clear()
@@ -115,11 +115,11 @@ class AppliedHistory:
         with self._lock:
             return self._heard >= time
 
-    def standing(self, time: float, still: float) -> Standing:
+    def settled(self, time: float, still: float) -> SettledState:
         """What stood at `time` (s), if the mirror stood still from `still` (s) before to `still` after.
 
         Raises:
-            MapNotUsableError: it did not, or that is not known, or the memory of the actuators is not known.
+            MapNotUsableError: it did not, or that is not known, or the hysteresis of the actuators is not known.
         """
         with self._lock:
             entries = list(self._entries)
@@ -149,12 +149,12 @@ class AppliedHistory:
                 f"{still:g} s"
             )
         if law is None:
-            return Standing(signals, times[first])
+            return SettledState(signals, times[first])
         if entry.unknown or entry.state is None:
             raise MapNotUsableError(
                 f"the history of the actuators is not known: {entry.unknown}; a degauss over the full range cures that"
             )
-        return Standing(law.effective(law.advance(entry.state, time)), times[first])
+        return SettledState(law.effective(law.advance(entry.state, time)), times[first])
 
 
 def _moved(entry: _Entry, signals: Floats) -> bool:

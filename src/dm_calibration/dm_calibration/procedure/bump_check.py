@@ -23,7 +23,7 @@ _WANDER_PX = 1.5
 
 @dataclass(frozen=True)
 class BumpOptions:
-    """Largest changes between two reference frames; 0 = not looked at.
+    """Largest changes between two reference frames; 0 = not checked.
 
     Attributes:
         tilt_max: of the sag at the edge by tilt, m.
@@ -39,7 +39,7 @@ class BumpOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _ReferenceFrame:
     label: str
     coefficients: Floats
     centre: Floats
@@ -51,7 +51,7 @@ class BumpCheck:
     def __init__(self, options: BumpOptions, rest: Floats) -> None:
         """`rest`: (N,) signals of the reference frames."""
         self._options, self._rest = options, rest
-        self._last: _Look | None = None
+        self._last: _ReferenceFrame | None = None
         self._moved = np.zeros_like(rest)
         # Sums of squares: what the maps showed, rms m, and what was commanded. Their ratio is the size of a response.
         self._shown = self._commanded = 0.0
@@ -59,7 +59,7 @@ class BumpCheck:
     def take(self, record: Measurement, centre: tuple[float, float], reference: bool) -> None:
         """Take a good map, which later reference frames are compared with."""
         if reference:
-            self._last = _Look(record.label, record.coefficients, np.array(centre))
+            self._last = _ReferenceFrame(record.label, record.coefficients, np.array(centre))
             self._moved = np.zeros_like(self._moved)
             return
         away = record.applied - self._rest
@@ -76,7 +76,7 @@ class BumpCheck:
     def change(
         self, record: Measurement, centre: tuple[float, float], pixel: float = 0.0, interrupted: bool = False
     ) -> str:
-        """How the reference frame `record` differs from the one before it, in words; "" = as it should.
+        """How the reference frame `record` differs from the one before it; "" = as it should.
 
         Args:
             centre: of the aperture on the map, m.

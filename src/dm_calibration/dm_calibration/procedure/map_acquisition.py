@@ -56,12 +56,12 @@ class MapAcquisition:
         options: ProcedureOptions,
         outcome: Outcome,
         note: Callable[[Event], None],
-        look_around: Callable[[], None],
+        checkpoint: Callable[[], None],
         guard: Callable[[], None],
     ) -> None:
-        """`note` takes each event; `look_around` is asked before a map, `guard` after it: their errors end the run."""
+        """`note` takes each event; `checkpoint` is asked before a map, `guard` after it: their errors end the run."""
         self._bench, self._mirror, self._options = bench, mirror, options
-        self.outcome, self._note, self._look_around, self._guard = outcome, note, look_around, guard
+        self.outcome, self._note, self._checkpoint, self._guard = outcome, note, checkpoint, guard
         self._bump = BumpCheck(options.bump, mirror.rest)
         self._swung = False
         for record, centre in zip(outcome.records, outcome.centres, strict=True):
@@ -90,7 +90,7 @@ class MapAcquisition:
 
     def _taken(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
         for attempt in range(self._options.measure_retries + 1):
-            self._look_around()
+            self._checkpoint()
             try:
                 measured = self._measured(label)
                 break
@@ -194,7 +194,7 @@ def check_comparable(
         raise MeasurementError(
             ErrorCode.MAP_REJECTED,
             f"wavelength {measured.wavelength * 1e9:.3f} nm, before it was {outcome.wavelength * 1e9:.3f} nm "
-            "(0 = not told): never mix wavelengths in one fit, measure the whole run with one instrument",
+            "(0 = not known): never mix wavelengths in one fit, measure the whole run with one instrument",
         )
     if different := _other_instrument(measured, outcome):
         raise MeasurementError(
@@ -211,12 +211,12 @@ def check_comparable(
 
 
 def _other_instrument(measured: Measurement, outcome: Outcome) -> str:
-    """What tells that another instrument took the map, in words; "" = nothing."""
+    """What tells that another instrument took the map; "" = nothing."""
     if measured.instrument != outcome.instrument:
         return f"instrument {measured.instrument!r}, before it was {outcome.instrument!r}"
     if measured.camera != outcome.camera:
         here, before = ("{} x {}".format(*size) for size in (measured.camera, outcome.camera))
         return f"camera of {here} pixels, before it was {before}"
     if not np.isclose(measured.pitch, outcome.pitch, rtol=PITCH_TOLERANCE, atol=0.0):
-        return f"pixel pitch {measured.pitch * 1e6:.3f} um, before it was {outcome.pitch * 1e6:.3f} um (0 = not told)"
+        return f"pixel pitch {measured.pitch * 1e6:.3f} um, before it was {outcome.pitch * 1e6:.3f} um (0 = not known)"
     return ""

@@ -63,7 +63,7 @@ class MapTaken:
     Attributes:
         record: of it.
         radius_known: whether it tells its aperture radius.
-        centre: of the aperture on the map, m; NaN = not told.
+        centre: of the aperture on the map, m; NaN = not known.
     """
 
     record: Measurement
@@ -89,7 +89,7 @@ class Dropped:
 
 @dataclass(frozen=True)
 class Solved:
-    """The signals of a shape were solved from an influence function: the shape and what was reduced, in words."""
+    """The signals of a shape were solved from an influence function: the shape and what was reduced."""
 
     target: str
     remark: str = ""
@@ -119,9 +119,9 @@ class Outcome:
         radius_known: whether the maps tell their aperture radius.
         dropped: "label: reason" of each map or state that gave none.
         remarks: what was measured differently than asked.
-        targets: the shapes that were solved, in words.
+        targets: the shapes that were solved.
         segment: number of the present segment: see :class:`Segment`.
-        centres: of the aperture on each map of `records`, m; NaN = not told.
+        centres: of the aperture on each map of `records`, m; NaN = not known.
     """
 
     records: list[Measurement] = field(default_factory=list)

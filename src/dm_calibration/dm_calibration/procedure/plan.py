@@ -15,7 +15,7 @@ from dm_common.mirror import Mirror
 
 Floats = NDArray[np.float64]
 
-#: Commands between two reference frames of a MEMORY plan; creep takes up most of what drifts.
+#: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
 HYSTERESIS_REFERENCE_EVERY = 100
 
 
@@ -73,7 +73,7 @@ class PlanOptions:
         reference_every: steps between two reference frames.
         surfaces: names of Table 1; empty = all.
         degauss: whether to start with a degauss.
-        hysteresis_maps: commands of a MEMORY plan.
+        hysteresis_maps: commands of a hysteresis plan.
     """
 
     poke_amplitude: float = 0.5
@@ -91,7 +91,7 @@ class PlanOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps in order, and what differs from what was asked, in words."""
+    """The steps in order, and what differs from what was asked."""
 
     kind: PlanKind
     steps: tuple[Step, ...]
@@ -132,7 +132,7 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
         ValueError: a run that would not begin with a degauss, or of too few or too many maps.
     """
     if not options.degauss:
-        raise ValueError("skip_degauss = true: the memory can only be identified from a degauss on")
+        raise ValueError("skip_degauss = true: hysteresis can only be identified from a degauss on")
     commands = excitation(mirror, options.hysteresis_maps)
     steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
     steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]

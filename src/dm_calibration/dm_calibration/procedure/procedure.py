@@ -75,7 +75,7 @@ class Procedure:
         self._model = model
         self._progress, self._cancelled, self._keep, self._guard = progress, cancelled, keep, guard
         self._failures = 0
-        self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._look_around, guard)
+        self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._checkpoint, guard)
 
     @property
     def complete(self) -> bool:
@@ -108,7 +108,7 @@ class Procedure:
         return self.outcome.tried(number) >= self._options.maps_per_state
 
     def _do(self, planned: Step, number: int) -> None:
-        self._look_around()
+        self._checkpoint()
         self._report(planned.label, planned.kind, number)
         if planned.kind is StepKind.DEGAUSS:
             self._bench.degauss()
@@ -120,7 +120,7 @@ class Procedure:
         """Begin a new segment after an interruption: wipe the memory, look at the mirror at rest."""
         last = self.outcome.records[-1].label
         done = next(number for number, step in enumerate(self._plan.steps) if not self._is_done(number, step))
-        self._look_around()
+        self._checkpoint()
         if self._plan.steps[0].kind is StepKind.DEGAUSS:
             self._report(f"degauss (resumed after {last})", StepKind.DEGAUSS, done)
             self._bench.degauss()
@@ -140,7 +140,7 @@ class Procedure:
             Progress(label, kind, done, len(self._plan.steps), len(self.outcome.dropped), residual_rms)
         )  # fmt: skip
 
-    def _look_around(self) -> None:
+    def _checkpoint(self) -> None:
         if self._cancelled():
             raise Cancelled("cancelled")
         self._guard()

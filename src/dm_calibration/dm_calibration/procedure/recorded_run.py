@@ -212,7 +212,7 @@ def _poke_amplitudes(run: RecordedRun) -> list[float]:
 
 
 def _agreement(plan: Plan, moves: Sequence[Move]) -> tuple[int, str]:
-    """How many steps of `plan` agree with `moves`, and where they differ, in words; "" = nowhere.
+    """How many steps of `plan` agree with `moves`, and where they differ; "" = nowhere.
 
     Solved steps agree with any move.
     """

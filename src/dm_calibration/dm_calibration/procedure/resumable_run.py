@@ -32,8 +32,8 @@ class OpenRun:
     Attributes:
         outcome: so far.
         storing: the calibration it may have been stored as already; None = it had not come so far.
-        resumed: what it goes on from, in words; "" = it begins.
-        notes: what became of other unfinished runs, in words.
+        resumed: what it goes on from; "" = it begins.
+        notes: what became of other unfinished runs.
     """
 
     journal: RunJournal
@@ -139,7 +139,7 @@ def open_run(
 
 
 def _why_not(found: Found, plan: Plan, options: ResumeOptions) -> str:
-    """Why an unfinished run is not to go on, in words; "" = it is."""
+    """Why an unfinished run is not to go on; "" = it is."""
     age = 1e-9 * (time.time_ns() - found.kept.last_ns)
     if options.fresh:
         return "a fresh run was asked for"

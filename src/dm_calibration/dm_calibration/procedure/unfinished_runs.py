@@ -109,7 +109,7 @@ class UnfinishedRuns:
         return sorted(found, key=lambda run: (run.kept.last_ns, run.id), reverse=True)
 
     def others(self, identity: Mapping[str, Any]) -> list[str]:
-        """Each unfinished run that a goal with `identity` does not go on with, and why, in words."""
+        """Each unfinished run that a goal with `identity` does not go on with, and why."""
         words = []
         for folder in self._runs():
             try:

@@ -52,7 +52,7 @@ class DriftRates:
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What later maps have told of a mirror. Never changed in place.
+    """What later maps have shown of a mirror. Never changed in place.
 
     Attributes:
         gain: (N,) relative changes.
@@ -100,14 +100,14 @@ class DriftFilter:
     """Follows one mirror's :class:`Drift`.
 
     Args:
-        fit: the influence function, of effective signals when `memory` is known.
+        fit: the influence function, of effective signals when `hysteresis` is known.
         maps: what it was fitted to: shows how far a map scatters about its prediction.
-        memory: None = not identified.
-        signal_sigma: standard deviation of an effective signal where no memory is identified, normalised.
+        hysteresis: None = not identified.
+        signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
         rates: see there.
 
     Raises:
-        ValueError: the maps of a memory have time stamps that run backwards.
+        ValueError: the maps of a hysteresis model have time stamps that run backwards.
     """
 
     def __init__(

@@ -50,12 +50,12 @@ class MapListener:
         self,
         node: Node,
         values: Mapping[str, Any],
-        desk: CalibrationManager,
-        bench: BenchServices,
+        manager: CalibrationManager,
+        services: BenchServices,
         busy: Callable[[], bool],
     ) -> None:
-        self._node, self._values, self._desk, self._bench, self._busy = node, values, desk, bench, busy
-        self._updates = RecalibrationManager(desk.store.folder, lambda: update_options(values))
+        self._node, self._values, self._manager, self._services, self._busy = node, values, manager, services, busy
+        self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
         self._history = AppliedHistory()
         self._law: HysteresisModel | None = None
         self._turn = threading.Lock()  # one map at a time; held over measuring and judging
@@ -87,7 +87,7 @@ class MapListener:
             remark = f"calibration {calibration.id if calibration else ''} cannot be kept true: {error}"
         if remark:
             self._node.get_logger().warning(remark)
-        mirror = self._desk.mirror
+        mirror = self._manager.mirror
         middle = float(mirror.rest[0]) if mirror is not None else 0.0
         hysteresis = calibration.hysteresis if calibration is not None else None
         law = hysteresis.law if hysteresis is not None else None
@@ -96,7 +96,7 @@ class MapListener:
             self._history.follow(law, middle)
 
     def amend(self, message: CalibrationMsg) -> None:
-        """Put what maps have told since into the message of the calibration in use."""
+        """Put what maps have shown since into the message of the calibration in use."""
         updates, fit = self._updates.updates, self._updates.changed_fit()
         if updates is not None and fit is not None:
             self._published_at, self._dirty = time.monotonic(), False
@@ -134,13 +134,13 @@ class MapListener:
         due = time.monotonic() - self._published_at >= PUBLISH_PERIOD_S
         if (self._dirty or stale != self._was_stale) and due:
             self._was_stale = stale
-            self._desk.publish_again()
+            self._manager.publish_again()
 
     def _changed(self) -> None:
         """Publish now, or with the next tick when the last message is less than a second old."""
         self._dirty = True
         if time.monotonic() - self._published_at >= PUBLISH_PERIOD_S:
-            self._desk.publish_again()
+            self._manager.publish_again()
 
     # --- maps ---
 
@@ -197,7 +197,7 @@ class MapListener:
             time.sleep(0.01)
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
-        verdict = self._updates.take(measured, self._history.standing(at, still), dry_run)
+        verdict = self._updates.take(measured, self._history.settled(at, still), dry_run)
         if dry_run:
             return verdict
         if verdict.accepted:
@@ -242,7 +242,7 @@ class MapListener:
         with self._turn:
             if self._busy():
                 raise Refusal(ErrorCode.BUSY, "a calibration is running")
-            measured = self._bench.measure_as_it_stands("calibration check")
+            measured = self._services.measure_as_it_stands("calibration check")
             try:
                 verdict = self._judge(measured, request.dry_run)
             except MapNotUsableError as error:

@@ -1,6 +1,6 @@
 """The calibration in use, kept true by maps that arrive later: which are taken, what they change, what is stored.
 
-The calibration's own file is never touched. What later maps have told stands beside it, in ``<id>.updates.hdf5``.
+The calibration's own file is never touched. What later maps have shown stands beside it, in ``<id>.updates.hdf5``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import same_points
-from dm_calibration.procedure.applied_history import MapNotUsableError, Standing
+from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
 from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter, DriftRates
 from dm_calibration.store.calibration_store import StoreError
 from dm_calibration.store.update_storage import Updates, UpdatesFileError, basis_hash, read_updates, write_updates
@@ -25,7 +25,7 @@ from dm_common.mirror import APERTURE_TOLERANCE
 
 Floats = NDArray[np.float64]
 
-#: Maps of one unmoved mirror within this time share the error of the memory law, s.
+#: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
 #: Share by which wavelengths may differ.
 WAVELENGTH_TOLERANCE = 1e-4
@@ -41,7 +41,7 @@ class UpdateOptions:
         surprises_max: bad maps in a row after which the mirror counts as changed.
         valid_fraction_min: least share of valid pixels.
         aperture_tolerance: largest relative deviation of a map's aperture radius from the calibration's.
-        signal_sigma: standard deviation of an effective signal where no memory is identified, normalised.
+        signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
         rates: how fast the mirror is expected to change.
     """
 
@@ -59,7 +59,7 @@ class Verdict:
 
     Attributes:
         accepted: it agreed well enough to be taken in.
-        reason: why not, or what it showed, in words.
+        reason: why not, or what it showed.
     """
 
     accepted: bool
@@ -95,7 +95,7 @@ class RecalibrationManager:
 
     @property
     def updates(self) -> Updates | None:
-        """What maps have told since; None without a calibration."""
+        """What maps have shown since; None without a calibration."""
         with self._lock:
             return self._updates
 
@@ -138,8 +138,8 @@ class RecalibrationManager:
                 return None
             return self._filter.changed(self._updates.drift)
 
-    def take(self, measured: Measurement, standing: Standing, dry_run: bool = False) -> Verdict:
-        """Compare a map of the mirror at `standing` with the calibration, and take it in when it agrees.
+    def take(self, measured: Measurement, settled: SettledState, dry_run: bool = False) -> Verdict:
+        """Compare a map of the mirror at `settled` with the calibration, and take it in when it agrees.
 
         Args:
             dry_run: compare only.
@@ -154,14 +154,14 @@ class RecalibrationManager:
                 raise MapNotUsableError("no calibration is in use")
             options = self._options()
             check_map(measured, calibration, options)
-            if standing.effective.shape != (calibration.fit.actuators,):
+            if settled.effective.shape != (calibration.fit.actuators,):
                 raise MapNotUsableError(
-                    f"{standing.effective.size} signals stand at the mirror, the calibration has "
+                    f"{settled.effective.size} signals stand at the mirror, the calibration has "
                     f"{calibration.fit.actuators}"
                 )
-            repeat = self._repeats(measured.stamp_ns, standing)
+            repeat = self._repeats(measured.stamp_ns, settled)
             comparison = drift_filter.compare(
-                updates.drift, measured.coefficients, measured.sag, standing.effective, measured.stamp_ns, repeat
+                updates.drift, measured.coefficients, measured.sag, settled.effective, measured.stamp_ns, repeat
             )
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected" + (
@@ -177,7 +177,7 @@ class RecalibrationManager:
             self._updates = changed
             if accepted:
                 if not repeat:
-                    self._since, self._first_ns = standing.since, measured.stamp_ns
+                    self._since, self._first_ns = settled.since, measured.stamp_ns
                 self._repeat = repeat + 1
             elif self.mirror_changed:
                 reason = f"{reason}; {changed.surprising} maps in a row did: the mirror has changed: calibrate again"
@@ -200,8 +200,8 @@ class RecalibrationManager:
             self._updates = Updates(self._filter.start(self._calibration.stamp_ns))
             self._forget_repeats()
 
-    def _repeats(self, stamp_ns: int, standing: Standing) -> int:
-        same = standing.since == self._since and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
+    def _repeats(self, stamp_ns: int, settled: SettledState) -> int:
+        same = settled.since == self._since and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
         return self._repeat if same else 0
 
     def _store(self, identifier: str, updates: Updates) -> None:
@@ -233,7 +233,7 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
     if not abs(measured.wavelength - calibration.wavelength) <= WAVELENGTH_TOLERANCE * calibration.wavelength:
         raise MapNotUsableError(
             f"wavelength {measured.wavelength * 1e9:.3f} nm, the calibration's is "
-            f"{calibration.wavelength * 1e9:.3f} nm (0 = not told)"
+            f"{calibration.wavelength * 1e9:.3f} nm (0 = not known)"
         )
     radius, tolerance = calibration.aperture_radius, options.aperture_tolerance
     if measured.radius and not abs(measured.radius - radius) <= tolerance * radius:

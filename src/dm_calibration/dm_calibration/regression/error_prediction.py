@@ -24,9 +24,9 @@ class ErrorPrediction:
     A regression belongs to one calibration: for another one in use, the first request fits one with the defaults.
     """
 
-    def __init__(self, desk: CalibrationManager, values: Mapping[str, Any]) -> None:
+    def __init__(self, manager: CalibrationManager, values: Mapping[str, Any]) -> None:
         """`values` are the parameters of the node."""
-        self._desk, self._values = desk, values
+        self._manager, self._values = manager, values
         self._lock = threading.Lock()
         self._of = ""
         self._predictor: ErrorPredictor | None = None
@@ -37,7 +37,7 @@ class ErrorPrediction:
         Raises:
             Refusal, ValueError, StoreError: see :mod:`~dm_common.errors`; nothing has changed then.
         """
-        stored = self._desk.store.load(request.calibration) if request.calibration else self._in_use()
+        stored = self._manager.store.load(request.calibration) if request.calibration else self._in_use()
         options = _selection(request.p_enter, request.p_remove)
         with self._lock:
             predictor = self._fitted(stored, request.method or stored.fit.method, options)
@@ -72,7 +72,7 @@ class ErrorPrediction:
         response.message = f"by {method} on calibration {calibration.id}, over many histories before this command"
 
     def _in_use(self) -> Calibration:
-        calibration = self._desk.in_use
+        calibration = self._manager.in_use
         if calibration is None:
             raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use: calibrate, or load one")
         return calibration
@@ -97,7 +97,7 @@ class ErrorPrediction:
             raise Refusal(
                 ErrorCode.NOT_FINITE, f"signals: number {int(np.argmin(np.isfinite(signals))) + 1} is not finite"
             )
-        mirror = self._desk.mirror
+        mirror = self._manager.mirror
         low, high = (mirror.limits.low, mirror.limits.high) if mirror else (-1.0, 1.0)
         worst = int(np.argmax(np.maximum(low - signals, signals - high)))
         if not low <= signals[worst] <= high:

@@ -177,7 +177,7 @@ class Hdf5Sandbox:
             os.close(descriptor)
 
     def _end(self, process: subprocess.Popen[bytes]) -> str:
-        """End the helper; returns how it ended, in words."""
+        """End the helper; returns how it ended."""
         self._process = None
         self._forget_shared()
         for stream in (process.stdin, process.stdout):

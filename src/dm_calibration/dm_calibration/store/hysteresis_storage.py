@@ -1,4 +1,4 @@
-"""Memory and recipes as datasets and attributes of a calibration file."""
+"""Hysteresis model and recipes as datasets and attributes of a calibration file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe))
 
 
 def hysteresis_columns(hysteresis: HysteresisFit | None) -> dict[str, Column]:
-    """Datasets of a memory; none without one."""
+    """Datasets of a hysteresis model; none without one."""
     if hysteresis is None:
         return {}
     columns: dict[str, Column] = {
@@ -32,7 +32,7 @@ def hysteresis_columns(hysteresis: HysteresisFit | None) -> dict[str, Column]:
 
 
 def hysteresis_from(columns: Mapping[str, Column]) -> HysteresisFit | None:
-    """The memory in the datasets of a file; None when it has none.
+    """The hysteresis model in the datasets of a file; None when it has none.
 
     Raises:
         KeyError, ValueError: something is missing or makes no sense.

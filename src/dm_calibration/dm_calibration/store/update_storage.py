@@ -26,7 +26,7 @@ class UpdatesFileError(ValueError):
 
 @dataclass(frozen=True)
 class Updates:
-    """What later maps have told of a calibrated mirror.
+    """What later maps have shown of a calibrated mirror.
 
     Attributes:
         drift: changes of gains and figure.
@@ -42,7 +42,7 @@ class Updates:
 
 
 def basis_hash(calibration: Calibration) -> str:
-    """SHA-256 over what updates change: influence function, points, memory. Recipes and notes may be added later."""
+    """SHA-256 over what updates change: influence function, points, hysteresis. Recipes, notes may be added later."""
     columns: dict[str, Column] = {name: getattr(calibration.fit, name) for name in _RESULT}
     columns |= {f"points/{name}": getattr(calibration.fit.points, name) for name in ("x", "y", "weight")}
     return content_hash(columns | hysteresis_columns(calibration.hysteresis), {"id": calibration.id})
