@@ -145,7 +145,7 @@ PARSED = {
 ELSEWHERE = {
     "git clone <this repository>": "placeholder",
     "cd <its folder>": "placeholder",
-    "rosdep install --from-paths src --ignore-src -r -y": "needs apt and root",
+    "rosdep install --from-paths src --ignore-src -y": "needs apt and root",
     "sudo apt-get install python3-statsmodels": "needs apt and root",
     "colcon build": "needs ROS 2 from apt; ./dm builds with colcon",
     "source install/setup.bash": "the same",
