@@ -93,18 +93,18 @@ def test_hysteresis_costs_what_ideal_actuators_do_not_show(made: tuple[Path, dic
 def test_maps_and_hysteresis_reach_a_thousandth_of_the_wavelength(made: tuple[Path, dict[str, Any]]) -> None:
     figures = made[1]
     readings = figures["control"]["AZreg"]
-    remembering = readings[control.LOOP_HYSTERESIS]
-    assert remembering["maps"] == control.LOOP_MAPS
-    assert remembering["within"]["lambda/1000"] == 1.0
+    following = readings[control.LOOP_HYSTERESIS]
+    assert following["maps"] == control.LOOP_MAPS
+    assert following["within"]["lambda/1000"] == 1.0
     assert readings["closed loop"]["within"]["lambda/50"] == 1.0
     assert readings[control.OPEN_HYSTERESIS]["maps"] == 0.0
     assert readings[control.OPEN_HYSTERESIS]["true_p50_nm"] < 0.2 * readings["stored"]["true_p50_nm"]
     # A noisy map cannot show what the noise-free surface does.
-    assert remembering["p50_nm"] > remembering["true_p50_nm"]
-    for order in remembering["orders"].values():
+    assert following["p50_nm"] > following["true_p50_nm"]
+    for order in following["orders"].values():
         shares = list(order["within"].values())
         assert shares == sorted(shares, reverse=True)
-        assert order["max_nm"] <= max(remembering["true_max_zernike_nm"])
+        assert order["max_nm"] <= max(following["true_max_zernike_nm"])
 
 
 def test_sampling_study_is_reported(made: tuple[Path, dict[str, Any]]) -> None:

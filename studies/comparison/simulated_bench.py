@@ -1,4 +1,4 @@
-"""The virtual bench in process: the twin's mirror, electronics and interferometer without sockets, files or waiting.
+"""The virtual bench in process: mirror, electronics and interferometer without sockets, files or waiting.
 
 Implements `dm_common.measurement.Bench`, so calibrations and closed loops on it run the code they run on hardware.
 What a seed stands for is the same as on the bench behind the sockets: gains, initial figure and noise.

@@ -8,11 +8,11 @@ target. It leaves open when c_ini was measured. Both readings are run, and a clo
 - "closed loop": the stored start, then corrected on maps, three in all; creep is foreseen, and the last correction is
   made but not measured.
 
-An influence function does not know what the actuators remember. In two more readings the commands are those of a law of
-hysteresis and creep beside it, see `remembering`:
+An influence function of signals knows neither hysteresis nor creep. In two more readings a model of both stands beside
+it, see `hysteresis_control`:
 
-- "stored with memory": open loop as "stored"; no map is taken.
-- "closed loop with memory": as "closed loop".
+- "stored with hysteresis": open loop as "stored"; no map is taken.
+- "closed loop with hysteresis": as "closed loop".
 
 Each method gets the same mirror in the same state, with the same noise to come.
 """
@@ -27,21 +27,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.calibrator import fit_effective
+from dm_calibration.influence.fit import FitOptions
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
+from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import FREE, Floats, Shape, Solver, measured_shape, rms_sag, target_shape
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
+from studies.paper.hysteresis_control import HysteresisControl
 from studies.paper.regressions import fit_of
-from studies.paper.remembering import RememberingControl
 from studies.paper.reported import CLAIM_PARTS, CURVATURE_RANGE, WAVELENGTH
 from studies.paper.samples import Samples
 from studies.solvers.registry import MirrorFacts, make_solver
 
-#: Readings by a linear model alone, and those that follow the memory of the actuators.
+#: Readings by a linear model alone, and those that follow hysteresis and creep of the actuators.
 LINEAR_READINGS = ("stored", "measured", "closed loop")
-OPEN_HYSTERESIS, LOOP_HYSTERESIS = "stored with memory", "closed loop with memory"
+OPEN_HYSTERESIS, LOOP_HYSTERESIS = "stored with hysteresis", "closed loop with hysteresis"
 READINGS = (*LINEAR_READINGS, OPEN_HYSTERESIS, LOOP_HYSTERESIS)
 #: Maps of a closed loop.
 LOOP_MAPS = 3
@@ -163,13 +166,21 @@ def initial_state(target: FocusTarget) -> str:
     return "p55" if target.curvature >= 0.0 else "p56"
 
 
-def make_method(name: str, samples: Samples) -> Solver:
-    """The solver of a row of METHODS on the influence function of `samples`."""
+def make_method(name: str, samples: Samples, model: InfluenceModel | None = None) -> Solver:
+    """The solver of a row of METHODS on `model`; None = the influence function of `samples` on applied signals."""
     method = METHODS[name]
     chosen = {"": None, "median": samples.median_weights, "chosen": samples.weighting.weights}[method.weights]
-    fit = fit_of(samples.calibration, samples.bench, method.model)
-    model = influence_model(fit, samples.bench.mirror.working_radius)
+    if model is None:
+        fit = fit_of(samples.calibration, samples.bench, method.model)
+        model = influence_model(fit, samples.bench.mirror.working_radius)
     return make_solver(method.solver, model, samples.bench.limits, MirrorFacts(region_weights=chosen))
+
+
+def _effective_method(name: str, samples: Samples) -> Solver:
+    """The solver of a row of METHODS on the influence function of `samples` on effective signals."""
+    options, mirror = FitOptions(method=METHODS[name].model), samples.bench.mirror
+    fit = fit_effective(samples.calibration.maps, samples.hysteresis, options, mirror)
+    return make_method(name, samples, influence_model(fit, mirror.working_radius))
 
 
 def run_series(
@@ -186,19 +197,20 @@ def run_series(
     """
     if reading not in READINGS:
         raise ValueError(f"reading = {reading!r}: must be one of {', '.join(READINGS)}")
-    solver, bench = make_method(method, samples), samples.bench.fork()
-    remembering = RememberingControl(samples, bench, solver) if reading not in LINEAR_READINGS else None
+    linear, bench = reading in LINEAR_READINGS, samples.bench.fork()
+    solver = make_method(method, samples) if linear else _effective_method(method, samples)
+    following = None if linear else HysteresisControl(samples, bench, solver)
     shots = []
     for target in targets:
         start = initial_state(target)
-        if remembering is None:
+        if following is None:
             overflow, taken = _control(samples, bench, solver, reading, target)
         else:
             row, wanted = samples.row(start), target_shape(target, solver.model)
-            remembering.move(samples.calibration.maps.applied[row])
-            signals, overflow = remembering.start(row, wanted)
+            _go(bench, samples.calibration.maps.applied[row])
+            effective, overflow = following.start(row, wanted)
             taken = LOOP_MAPS if reading == LOOP_HYSTERESIS else 0
-            remembering.converge(signals, wanted, taken)
+            following.converge(effective, wanted, taken)
         shots.append(_judge(bench, target, start, overflow, taken))
         on_shot()
     return Series(method, reading, tuple(shots))
@@ -260,7 +272,7 @@ def _thinned(sag: Floats) -> NDArray[np.float32]:
 def branch_spread(samples: Samples) -> float:
     """Largest coefficient difference of one command, p55, reached from the two ends of the range of curvature, m.
 
-    The p55 of the bench without memory differs by noise only.
+    The p55 of the bench without hysteresis differs by noise only.
     """
     solver, bench = make_method("bounded programme", samples), samples.bench.fork()
     signals = samples.calibration.maps.applied[samples.row("p55")]

@@ -37,7 +37,7 @@ FOREIGN_LAWS = ("preisach", "bouc_wen")
 ASPHERE_METHODS = ("AZreg", "AZWreg")
 #: Method that the spheres are controlled by on twins of foreign laws.
 LAW_METHOD = "AZreg"
-#: Readings on each bench: ideal actuators remember nothing.
+#: Readings on each bench: ideal actuators have no hysteresis.
 READINGS_ON = MappingProxyType({STANDARD: READINGS, IDEAL: LINEAR_READINGS})
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import SURFACE, MapSet
 from dm_calibration.influence.region_weighting import RegionWeighting, weighting_of
@@ -80,6 +81,20 @@ class Samples:
         taken = np.stack([bench.measure(f"repeat {k}").coefficients for k in range(REPEATS)])
         beyond_tilt = np.abs(taken - taken.mean(axis=0))[:, len(PISTON_TILT) :]
         return float(np.median(beyond_tilt.max(axis=1)))
+
+    @cached_property
+    def hysteresis(self) -> HysteresisFit:
+        """The hysteresis and creep of the actuators, identified from the maps of the calibration.
+
+        Raises:
+            ExcitationError: the maps do not show them.
+        """
+        return fit_hysteresis(self.calibration.maps)
+
+    @cached_property
+    def effective_maps(self) -> MapSet:
+        """The maps of the calibration with effective signals in the place of those applied."""
+        return effective_maps(self.calibration.maps, self.hysteresis.law)
 
     def row(self, label: str) -> int:
         """Row of a surface in the calibration's maps."""

@@ -57,7 +57,7 @@ def table_1(results: Results) -> Section:
             "half of the largest that the actuators allow is taken.",
             "The surface control error of a surface is the measured map less its nominal surface, the 21 Zernike terms "
             "that the influence function G predicts for its signals (G s, no offset), without piston and tilt. So it "
-            "holds the initial figure, the print-through beyond 21 terms and what the actuators remember.",
+            "holds the initial figure, the print-through beyond 21 terms and what hysteresis and creep add.",
         ],
         [
             Table(

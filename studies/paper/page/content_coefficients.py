@@ -43,7 +43,7 @@ def coefficient_errors(results: Results) -> Section:
         series = {
             f"{STANDARD}, open loop": standard.spheres[method, SHOWN],
             f"{STANDARD}, closed loop": standard.spheres[method, "closed loop"],
-            f"{STANDARD}, closed loop with memory": standard.spheres[method, LOOP_HYSTERESIS],
+            f"{STANDARD}, closed loop with hysteresis": standard.spheres[method, LOOP_HYSTERESIS],
             f"{IDEAL}, open loop": results.ideal.spheres[method, SHOWN],
         }
         pictures.append(
@@ -128,45 +128,45 @@ def _hysteresis_bound(results: Results) -> str:
         "meets. Second, when c_ini is measured, the step itself errs: after a turn of direction a piezo moves less for "
         f"the same signal than on average, and G is the average. Defocus missed the step asked for by "
         f"{np.median(missed):.0%} in the median and by {max(missed):.0%} at most. Only measuring and correcting, or a "
-        "law of the memory, goes further."
+        "model of hysteresis and creep, goes further."
     )
 
 
 def _loops(bench: BenchResults) -> str:
-    """What limits the closed loops and the open loop that remembers."""
-    plain, remembering, opened = (bench.spheres[BY_ORDER, r] for r in ("closed loop", LOOP_HYSTERESIS, OPEN_HYSTERESIS))
-    worst = remembering.true_max_zernike.max()
+    """What limits the closed loops and the open loop that follows hysteresis."""
+    plain, following, opened = (bench.spheres[BY_ORDER, r] for r in ("closed loop", LOOP_HYSTERESIS, OPEN_HYSTERESIS))
+    worst = following.true_max_zernike.max()
     return (
         f"What limits the closed loop: each correction misses by what its own turns of direction cost, and one factor, "
         f"watched from step to step, cannot know which actuators turn ({BY_ORDER}: median "
         f"{np.median(plain.true_max_zernike) * NM:.2f} nm, worst {plain.true_max_zernike.max() * NM:.2f} nm after "
-        f"{LOOP_MAPS} maps). With memory, the commands come from a law of hysteresis (play operators, fitted to the "
-        "maps of the calibration) and creep (its rate given), followed through all commands since the degauss. Without "
-        f"any map such a command errs by {np.median(opened.true_max_zernike) * NM:.1f} nm "
-        f"({parts(float(np.median(opened.true_max_zernike)))}) in the median, which is the law's own misfit; after "
-        f"{LOOP_MAPS} maps by {np.median(remembering.true_max_zernike) * NM:.2f} nm "
-        f"({parts(float(np.median(remembering.true_max_zernike)))}), {worst * NM:.2f} nm ({parts(worst)}) at worst, "
+        f"{LOOP_MAPS} maps). With hysteresis, the commands come from a model of hysteresis and creep that was "
+        f"identified from the maps of the calibration ({bench.samples.hysteresis.name}, creep "
+        f"{bench.samples.hysteresis.law.creep_rate:.2%} per decade), followed through all commands since the degauss. "
+        f"Without any map such a command errs by {np.median(opened.true_max_zernike) * NM:.1f} nm "
+        f"({parts(float(np.median(opened.true_max_zernike)))}) in the median, which is the model's own misfit; after "
+        f"{LOOP_MAPS} maps by {np.median(following.true_max_zernike) * NM:.2f} nm "
+        f"({parts(float(np.median(following.true_max_zernike)))}), {worst * NM:.2f} nm ({parts(worst)}) at worst, "
         "which is the noise of the maps, averaged as far as the moves between them allow. In both loops the last "
         "correction is made but not measured any more; the judging map comes after it and is not counted."
     )
 
 
 def _foreign(results: Results) -> str:
-    """What the law of memory is worth on mirrors that follow another one."""
+    """What the identified model is worth on mirrors that follow another law."""
 
     def median(law: str, reading: str) -> str:
         length = float(np.median(results.law_spheres[law][reading].true_max_zernike))
         return f"{length * NM:.1f} nm ({parts(length)})"
 
     each = [
-        f"{law}: {median(law, 'stored')} without memory and {median(law, OPEN_HYSTERESIS)} with it in open loop, "
+        f"{law}: {median(law, 'stored')} without the model and {median(law, OPEN_HYSTERESIS)} with it in open loop, "
         f"{median(law, 'closed loop')} and {median(law, LOOP_HYSTERESIS)} after {LOOP_MAPS} maps"
         for law in results.law_spheres
     ]
     return (
-        f"The same law fitted to mirrors that remember in another way, medians: {'; '.join(each)}. In open loop the "
-        "law has to be right over the whole stroke; in a closed loop it only has to tell the response of the next "
-        "small move."
+        f"Identified on mirrors that follow other laws, medians: {'; '.join(each)}. In open loop the model has to be "
+        "right over the whole stroke; in a closed loop it only has to predict the response of the next small move."
     )
 
 

@@ -132,7 +132,7 @@ def claims(results: Results) -> Section:
     standard, ideal = results.standard, results.ideal
     weighted, plain = (standard.spheres[method, SHOWN] for method in ("AZWreg", "AZreg"))
     ratio = float(np.median(weighted.true_max_zernike) / np.median(plain.true_max_zernike))
-    loop, remembering = (best(standard, reading) for reading in ("closed loop", LOOP_HYSTERESIS))
+    loop, following = (best(standard, reading) for reading in ("closed loop", LOOP_HYSTERESIS))
     return Section(
         "Claims that do not survive an honest bench",
         [
@@ -143,13 +143,13 @@ def claims(results: Results) -> Section:
             f"{_best_share(standard):.0%} of the spheres by the best method in one move; on ideal actuators on "
             f"{_best_share(ideal):.0%}, where the noise of a map ({ideal.samples.noise * NM:.2f} nm) is of the size of "
             f"λ/1000 ({reported.WAVELENGTH / 1000 * NM:.2f} nm). What gets there with hysteresis is no other influence "
-            f"function but maps, {LOOP_MAPS} of them, with a law of what the actuators remember: "
-            f"{remembering.share_within(reported.CLAIM_PARTS[1]):.0%} of the spheres "
-            f"({loop.share_within(reported.CLAIM_PARTS[1]):.0%} with maps alone); with the law and no map the median "
+            f"function but maps, {LOOP_MAPS} of them, with a model of hysteresis and creep: "
+            f"{following.share_within(reported.CLAIM_PARTS[1]):.0%} of the spheres "
+            f"({loop.share_within(reported.CLAIM_PARTS[1]):.0%} with maps alone); with the model and no map the median "
             f"is {parts(float(np.median(best(standard, OPEN_HYSTERESIS).true_max_zernike)))}.",
             "“Using the improved IF … the surface control errors of PDM30-37 were compensated”: the largest "
             f"coefficient error with weights is {ratio:.2f} times that without, in the median over the spheres, on the "
-            "bench with hysteresis. What an actuator remembers is the same for all regions of the aperture, so no "
+            "bench with hysteresis. Hysteresis of an actuator is the same for all regions of the aperture, so no "
             "weighting of regions can take it out.",
             "Both models “are significant at the 5% significance level”: after stepwise selection that is true of "
             f"{standard.regressions.shuffled_below(LEVEL):.0%} of shuffled data sets as well, see Table 2.",
