@@ -21,7 +21,7 @@ from calibration_stand_in import StandIn, doubles
 from dm_calibration.procedure.plan import PlanKind
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import ErrorCode
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from support import NodeProcess, Observer, wait_until

@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear
 from dm_bringup.suite import Suite, own_domain
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.limits import Limits
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel

@@ -9,9 +9,10 @@ import pytest
 
 from dm_common.limits import Limits
 from dm_common.names import UnknownNameError
+from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import FREE, Shape, Solver, rms_sag, target_shape
+from dm_controller.solvers.base import Shape, Solver, rms_sag, target_shape
 from dm_controller.solvers.iterative_learning import IterativeLearning
 from dm_controller.solvers.pseudo_inverse import PseudoInverse
 from dm_controller.solvers.region_weighted import AZWreg
@@ -100,8 +101,8 @@ def test_the_pseudo_inverse_says_by_how_much_it_was_cut(model: InfluenceModel) -
 
 def test_the_pseudo_inverse_is_the_shortest_of_all_solutions(model: InfluenceModel) -> None:
     wanted = target_shape(FocusTarget(0.03), model)
-    change = (wanted - Shape(model.zernike_offset, model.sag_offset)).coefficients[FREE:]
-    shortest = np.linalg.lstsq(model.influence_zernike[FREE:], change)[0]
+    change = (wanted - Shape(model.zernike_offset, model.sag_offset)).coefficients[PISTON_TILT:]
+    shortest = np.linalg.lstsq(model.influence_zernike[PISTON_TILT:], change)[0]
     np.testing.assert_allclose(solver_of("pseudo_inverse", model).solve(wanted).signals, shortest, atol=1e-9)
 
 
@@ -153,9 +154,9 @@ def test_theta_is_sparse_and_its_patterns_make_the_change(model: InfluenceModel)
     change = target_shape(FocusTarget(0.02), model) - Shape(model.zernike_offset, model.sag_offset)
     theta = solver.theta(np.zeros(37), change)
     # A vertex of the linear programme has no more non-zero unknowns than equations.
-    assert np.count_nonzero(np.abs(theta) > 1e-9 * np.abs(theta).max()) <= len(model.zernike_offset) - FREE
+    assert np.count_nonzero(np.abs(theta) > 1e-9 * np.abs(theta).max()) <= len(model.zernike_offset) - PISTON_TILT
     np.testing.assert_allclose(
-        model.influence_zernike[FREE:] @ solver.patterns @ theta, change.coefficients[FREE:], atol=1e-11
+        model.influence_zernike[PISTON_TILT:] @ solver.patterns @ theta, change.coefficients[PISTON_TILT:], atol=1e-11
     )
     single = np.abs(solver.theta(np.zeros(37), Shape(np.zeros(21), np.zeros(len(model.sample_x)))))
     assert single.max() == 0.0

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
-from dm_common.optics.zernike import basis
-from dm_controller.planning.mirror_model import FREE_TERMS
+from dm_common.optics.zernike import PISTON_TILT, basis
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.simulated_bench import SimulatedBench
 
@@ -28,8 +27,8 @@ class TrueSurface:
         self._y = (aperture.centre_y_px - rows.astype(float)) / aperture.radius_px
         self._radius = aperture.radius_px * bench.pitch
         modes = basis(self._x, self._y)
-        self._fit = np.linalg.solve(modes.T @ modes, modes.T)[FREE_TERMS:]
-        self._plane = np.linalg.qr(modes[:, :FREE_TERMS])[0]
+        self._fit = np.linalg.solve(modes.T @ modes, modes.T)[PISTON_TILT:]
+        self._plane = np.linalg.qr(modes[:, :PISTON_TILT])[0]
         self._stroke, self._limits = bench.true_stroke, bench.limits
 
     def _difference(self, displacements: Floats, targets: Sequence[FocusTarget]) -> Floats:

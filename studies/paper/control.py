@@ -30,11 +30,12 @@ from numpy.typing import NDArray
 from dm_calibration.calibrator import fit_effective
 from dm_calibration.influence.fit import FitOptions
 from dm_common.measurement import Measurement
-from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_plane
+from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import FREE, Floats, Shape, Solver, measured_shape, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag, target_shape
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 from studies.paper.hysteresis_control import HysteresisControl
 from studies.paper.regressions import fit_of
@@ -105,12 +106,12 @@ class Shot:
     @property
     def max_zernike(self) -> float:
         """Largest coefficient error beyond tilt on the map, m."""
-        return float(np.abs(self.zernike[FREE:]).max())
+        return float(np.abs(self.zernike[PISTON_TILT:]).max())
 
     @property
     def true_max_zernike(self) -> float:
         """Largest coefficient error beyond tilt of the noise-free surface, m."""
-        return float(np.abs(self.true_zernike[FREE:]).max())
+        return float(np.abs(self.true_zernike[PISTON_TILT:]).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,12 +255,12 @@ def _judge(bench: SimulatedBench, target: FocusTarget, start: str, overflow: flo
     aperture, radius = bench.aperture, bench.mirror.working_radius
     x: Floats = (np.arange(sag.shape[1], dtype=np.float64)[None, :] - aperture.centre_x_px) / aperture.radius_px
     y: Floats = (aperture.centre_y_px - np.arange(sag.shape[0], dtype=np.float64)[:, None]) / aperture.radius_px
-    residual = remove_piston_tilt(sag - target.sag(x, y, radius))
+    residual = remove_plane(sag - target.sag(x, y, radius))
     wanted = target.coefficients(radius)
     zernike = bench.measurement_of(sag).coefficients - wanted
     true = bench.measurement_of(bench.true_map()).coefficients - wanted
     rms = float(np.sqrt(np.nanmean(np.square(residual))))
-    drawn = _thinned(remove_piston_tilt(sag))
+    drawn = _thinned(remove_plane(sag))
     return Shot(target, start, drawn, _thinned(residual), zernike, true, rms, overflow, taken)
 
 
@@ -281,7 +282,7 @@ def branch_spread(samples: Samples) -> float:
         _go(bench, solver.solve(target_shape(FocusTarget(curvature), solver.model)).signals)
         _go(bench, signals)
         reached.append(bench.measure("p55").coefficients)
-    return float(np.abs(reached[1] - reached[0])[FREE:].max())
+    return float(np.abs(reached[1] - reached[0])[PISTON_TILT:].max())
 
 
 def fitting_limit(samples: Samples, target: FocusTarget) -> tuple[float, float]:

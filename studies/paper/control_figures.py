@@ -13,8 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from dm_calibration.report.colours import BLUE, GREEN, ORANGE, PURPLE, VERMILION
-from dm_common.optics.zernike import TERMS
-from dm_controller.solvers.base import FREE
+from dm_common.optics.zernike import PISTON_TILT, TERMS
 from studies.paper.control import LOOP_HYSTERESIS, OPEN_HYSTERESIS, Series
 from studies.paper.figures import NM
 from studies.paper.reported import CLAIM_PARTS, WAVELENGTH
@@ -68,15 +67,15 @@ def coefficients_figure(series: Mapping[str, Series], title: str) -> Figure:
     curvatures = [shot.target.curvature for shot in next(iter(series.values())).shots]
     scale, colours = Normalize(min(curvatures), max(curvatures)), colormaps["cividis"]
     names = [f"{'c' if term.kind == 'cos' else 's' if term.kind == 'sin' else ''}{term.n},{term.m}" for term in TERMS]
-    place = np.arange(len(TERMS) - FREE)
+    place = np.arange(len(TERMS) - PISTON_TILT)
     for axes, (name, each) in zip(panels, series.items(), strict=True):
         for shot in each.shots:
-            error = np.maximum(np.abs(shot.true_zernike[FREE:]), FLOOR) * NM
+            error = np.maximum(np.abs(shot.true_zernike[PISTON_TILT:]), FLOOR) * NM
             axes.semilogy(place, error, "o", markersize=3.5, color=colours(scale(shot.target.curvature)))
         lines(axes)
-        for edge in np.flatnonzero(np.diff([term.n for term in TERMS[FREE:]])) + 0.5:
+        for edge in np.flatnonzero(np.diff([term.n for term in TERMS[PISTON_TILT:]])) + 0.5:
             axes.axvline(edge, color="black", linewidth=0.5, alpha=0.4)
-        axes.set_xticks(place, names[FREE:], rotation=90, fontsize=7)
+        axes.set_xticks(place, names[PISTON_TILT:], rotation=90, fontsize=7)
         axes.set(title=name, xlabel="term n,m; lines part the orders 2 to 5")
         axes.title.set_fontsize(9)
         axes.xaxis.label.set_fontsize(8)

@@ -112,7 +112,7 @@ def sampling_figure(study: SamplingStudy) -> Figure:
     """Bias of each coefficient beyond tilt, and ringing at the rim, for each way of sampling."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 1))
-    first = len(PISTON_TILT)
+    first = PISTON_TILT
     names = [f"{'c' if term.kind == 'cos' else 's' if term.kind == 'sin' else ''}{term.n},{term.m}" for term in TERMS]
     place = np.arange(len(TERMS) - first)
     for number, (way, colour) in enumerate(zip(study.results.values(), (GREY, VERMILION, BLUE, ORANGE), strict=True)):

@@ -19,7 +19,7 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.regions import ConcentricRegions, RegionStatistics, figure_5
 from dm_calibration.procedure.procedure import Progress
 from dm_common.measurement import Measurement
-from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sample_regions import regional_rms
 from dm_common.optics.zernike import PISTON_TILT
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
@@ -79,7 +79,7 @@ class Samples:
         bench.settle()
         bench.time += LONG_REST
         taken = np.stack([bench.measure(f"repeat {k}").coefficients for k in range(REPEATS)])
-        beyond_tilt = np.abs(taken - taken.mean(axis=0))[:, len(PISTON_TILT) :]
+        beyond_tilt = np.abs(taken - taken.mean(axis=0))[:, PISTON_TILT:]
         return float(np.median(beyond_tilt.max(axis=1)))
 
     @cached_property
@@ -168,7 +168,7 @@ def _on_every_pixel(bench: _MapKeepingBench, surfaces: MapSet, influence: Floats
 
     def errors() -> Iterator[Floats]:
         for label, signals in zip(surfaces.label, surfaces.applied, strict=True):
-            yield remove_piston_tilt(evaluator.residual(bench.kept[label].astype(np.float64), influence @ signals))
+            yield remove_plane(evaluator.residual(bench.kept[label].astype(np.float64), influence @ signals))
 
     return regions.rms_of_each(errors(), surfaces.label)
 

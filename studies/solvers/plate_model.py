@@ -8,10 +8,10 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from dm_common.limits import Limits
-from dm_common.optics.sag import remove_piston_tilt, weighted_fit
-from dm_common.optics.zernike import basis
+from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
+from dm_common.optics.zernike import PISTON_TILT, basis
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import FREE, Floats, Shape, Solver, normalised_terms, points_of
+from dm_controller.solvers.base import Floats, Shape, Solver, normalised_terms, points_of
 from dm_controller.solvers.pseudo_inverse import CUTOFF
 
 
@@ -118,9 +118,9 @@ class PlateModel(Solver):
         #: (K, N) m per unit signal.
         self.influence: Floats = self.stroke * weighted_fit(sag.T, basis(points.x, points.y), points.weight).T
         _, self._factors = normalised_terms(model)
-        self._inverse = np.linalg.pinv(self._factors[:, None] * self.influence[FREE:], rcond=CUTOFF)
+        self._inverse = np.linalg.pinv(self._factors[:, None] * self.influence[PISTON_TILT:], rcond=CUTOFF)
         self.offset = Shape(np.zeros_like(model.zernike_offset), np.zeros_like(model.sag_offset))
 
     def _signals(self, start: Floats, change: Shape) -> Floats:
-        step: Floats = self._inverse @ (self._factors * change.coefficients[FREE:])
+        step: Floats = self._inverse @ (self._factors * change.coefficients[PISTON_TILT:])
         return start + step

@@ -6,8 +6,9 @@ import numpy as np
 from scipy.optimize import linprog
 
 from dm_common.limits import Limits
+from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import FREE, Command, Floats, Shape, Solver, normalised_terms
+from dm_controller.solvers.base import Command, Floats, Shape, Solver, normalised_terms
 
 #: What a unit of coefficient error (in units of the strongest pattern) costs against a unit of θ. An L1 penalty is
 #: exact: above a certain price the coefficients are met to the last digit whenever the limits permit.
@@ -69,7 +70,7 @@ class SparseSampling(Solver):
 
     def theta(self, start: Floats, change: Shape) -> Floats:
         """(J,) the sparse θ of Eq. (4) for `change`, from the signals `start` (N,)."""
-        wanted = self._factors * change.coefficients[FREE:] / self._scale
+        wanted = self._factors * change.coefficients[PISTON_TILT:] / self._scale
         # The programme in units of its own answer, else the solver's absolute tolerances would cut small corrections.
         size = float(np.abs(wanted).max())
         if size == 0.0:

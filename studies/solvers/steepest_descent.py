@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from dm_common.limits import Limits
+from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import FREE, Command, Floats, Shape, Solver, normalised_terms
+from dm_controller.solvers.base import Command, Floats, Shape, Solver, normalised_terms
 
 #: Iterations on the model in an open-loop solve: with the condition number of such mirrors (10 to 13) the error of the
 #: worst mode falls by 2 % an iteration.
@@ -32,13 +33,13 @@ class SteepestDescent(Solver):
         self._gain = 2.0 / (singular[0] ** 2 + singular[-1] ** 2)
 
     def _signals(self, start: Floats, change: Shape) -> Floats:
-        step: Floats = self._gain * (self._matrix.T @ (self._factors * change.coefficients[FREE:]))
+        step: Floats = self._gain * (self._matrix.T @ (self._factors * change.coefficients[PISTON_TILT:]))
         return start + step
 
     def solve(self, wanted: Shape) -> Command:
         """As in the base class, by iteration on the model."""
         self._check(wanted)
-        change = self._factors * (wanted - self.offset).coefficients[FREE:]
+        change = self._factors * (wanted - self.offset).coefficients[PISTON_TILT:]
         command = Command(self._start())
         overflow = 0.0
         for _ in range(MODEL_ITERATIONS):

@@ -24,7 +24,7 @@ from dm_calibration.report.page import figures_of, write_report
 from dm_calibration.report.residuals import residuals
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.optics.sag import rms
+from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.recipes import Recipe, RecipeBook
 from hysteretic_mirror import MIRROR, RememberingBench

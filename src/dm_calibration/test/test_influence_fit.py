@@ -15,7 +15,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.names import UnknownNameError
-from dm_common.optics.sag import remove_piston_tilt, rms, weighted_fit
+from dm_common.optics.piston_tilt import remove_piston_tilt, rms, weighted_fit
 from linear_mirror import LinearMirror, make_mirror
 
 NM = 1e-9

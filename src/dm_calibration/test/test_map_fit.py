@@ -11,7 +11,7 @@ from dm_calibration.optics.aperture import Aperture, InsufficientDataError
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
 from dm_calibration.optics.regions import ConcentricRegions
-from dm_common.optics.piston_tilt import fit_plane, remove_piston_tilt
+from dm_common.optics.piston_tilt import fit_plane, remove_plane
 from dm_common.optics.zernike import basis
 
 
@@ -156,8 +156,8 @@ def test_regions_have_the_stated_share_of_the_area() -> None:
 def test_piston_and_tilt_are_removed_and_nothing_else() -> None:
     rows, columns = np.mgrid[:40, :50]
     bump = np.where(np.random.default_rng(0).random((40, 50)) < 0.1, np.nan, np.sin(columns / 3.0) * np.cos(rows / 5.0))
-    flat = remove_piston_tilt(bump)
-    tilted = remove_piston_tilt(bump + 5 + 0.3 * columns - 0.2 * rows)
+    flat = remove_plane(bump)
+    tilted = remove_plane(bump + 5 + 0.3 * columns - 0.2 * rows)
     np.testing.assert_allclose(tilted, flat, atol=1e-12)
     np.testing.assert_allclose(fit_plane(flat), 0, atol=1e-13)
     np.testing.assert_allclose(fit_plane(5 + 0.3 * (columns - 24.5) - 0.2 * (rows - 19.5)), [5, 0.3, -0.2])
@@ -166,7 +166,7 @@ def test_piston_and_tilt_are_removed_and_nothing_else() -> None:
 def test_plane_of_a_single_row_does_not_fail() -> None:
     sag = np.full((5, 6), np.nan)
     sag[2] = np.arange(6)
-    np.testing.assert_allclose(remove_piston_tilt(sag)[2], 0, atol=1e-12)
+    np.testing.assert_allclose(remove_plane(sag)[2], 0, atol=1e-12)
     with pytest.raises(ValueError, match="no valid pixel"):
         fit_plane(np.full((2, 2), np.nan))
 

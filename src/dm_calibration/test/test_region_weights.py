@@ -29,7 +29,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Outcome
 from dm_common.measurement import Measurement
 from dm_common.names import UnknownNameError
-from dm_common.optics.sag import remove_piston_tilt, weighted_fit
+from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.sample_regions import EmptyRegionError, command_row_weights, point_weights, regional_rms
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points
 from dm_common.optics.zernike import basis

@@ -7,7 +7,7 @@ import pytest
 
 from dm_calibration.optics.aperture import Aperture
 from dm_calibration.optics.regions import ConcentricRegions, figure_5, region_statistics
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, EmptyRegionError, disc_shares, regional_rms
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points, sample_map, uniform_points
 

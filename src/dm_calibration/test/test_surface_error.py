@@ -17,7 +17,7 @@ from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import MODEL, TEST_SET, Reading, regress_surface_errors
 from dm_calibration.regression.surface_samples import SurfaceErrors, surface_errors, surface_weights
 from dm_common.names import UnknownNameError
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.zernike import basis
 from hysteretic_mirror import RememberingBench, calibrated, calibrated_by_pokes
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.optics.map_fit import MapFitter
-from dm_controller.planning.mirror_model import FREE_TERMS
+from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.target import FocusTarget
 
 
@@ -58,6 +58,6 @@ def surface_error(sag: NDArray[np.floating[Any]], info: Any, target: FocusTarget
     return SurfaceError(
         residual=residual,
         rms=float(np.sqrt(np.nanmean(residual**2))),
-        max_zernike=float(np.abs(fit.coefficients[FREE_TERMS:]).max()),
+        max_zernike=float(np.abs(fit.coefficients[PISTON_TILT:]).max()),
         zernike=fit.coefficients,
     )

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 from dm_common.bounded import BoundedProgramme
 from dm_common.geometry import hexagonal_positions, ring_count
 from dm_common.limits import Limits
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import TERMS, basis
 from studies.benchmarks.timing import Effort, medians

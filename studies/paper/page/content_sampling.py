@@ -32,7 +32,7 @@ def sampling(results: Results) -> Section:
         for name, way in ways.items()
     ]
     by_order = [(name, *(f"{value * NM:.3f}" for value in _by_order(way))) for name, way in ways.items()]
-    orders = sorted({term.n for term in TERMS[len(PISTON_TILT) :]})
+    orders = sorted({term.n for term in TERMS[PISTON_TILT:]})
     return Section(
         "Section 2.2: 500 samples instead of all pixels",
         [
@@ -77,7 +77,7 @@ def _by_order(way: SamplingResult) -> np.ndarray:
     """(4,) m rms: bias of the radial orders 2 to 5."""
     power = np.square(way.bias * TERM_RMS)
     orders = np.array([term.n for term in TERMS])
-    return np.sqrt([power[orders == n].sum() for n in sorted(set(orders[len(PISTON_TILT) :].tolist()))])
+    return np.sqrt([power[orders == n].sum() for n in sorted(set(orders[PISTON_TILT:].tolist()))])
 
 
 def _ratio(a: SamplingResult, b: SamplingResult) -> float:

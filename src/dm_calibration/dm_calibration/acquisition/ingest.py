@@ -15,7 +15,7 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.measurement import Measurement
-from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sampling import edge_clustered_points, sample_map
 
 
@@ -121,7 +121,7 @@ class Ingest:
             radius_px=aperture.radius_px,
         )
         if settings.remove_piston_tilt:
-            surface = replace(surface, sag=remove_piston_tilt(sag), piston_tilt_removed=True)
+            surface = replace(surface, sag=remove_plane(sag), piston_tilt_removed=True)
         return surface, measured
 
     @staticmethod

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.features import crept, fading_feature, play_features, relaxation
-from dm_calibration.influence.fit import PISTON_TILT
 from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.optics.zernike import PISTON_TILT
 
 Floats = NDArray[np.float64]
 

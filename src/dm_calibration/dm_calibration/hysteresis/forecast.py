@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.accuracy import TYPICAL_NOISE, expected_accuracy
-from dm_calibration.influence.fit import PISTON_TILT
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import Plan, StepKind
+from dm_common.optics.zernike import PISTON_TILT
 
 Floats = NDArray[np.float64]
 

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.responses import WEAKEST_PATTERN
-from dm_calibration.influence.fit import PISTON_TILT
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
-from dm_common.optics.zernike import TERM_RMS, basis
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 
 Floats = NDArray[np.float64]
 

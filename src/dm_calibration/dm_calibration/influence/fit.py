@@ -23,13 +23,11 @@ from dm_calibration.influence.regression import METHODS, Design, Method, Regress
 from dm_calibration.influence.screening import ScreeningOptions
 from dm_calibration.influence.weights import check_epsilon
 from dm_common.names import unknown_name
-from dm_common.optics.sag import rms
+from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import PISTON_TILT
 
 Floats = NDArray[np.float64]
-
-#: Number of the first terms, piston and the two tilts, that an interferometer does not know.
-PISTON_TILT = 3
 
 
 @dataclass(frozen=True)

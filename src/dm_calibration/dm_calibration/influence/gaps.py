@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import Design, Regression, TooFewMapsError
-from dm_common.optics.sag import fill_gaps, remove_piston_tilt, weighted_fit
+from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
 
 Floats = NDArray[np.float64]

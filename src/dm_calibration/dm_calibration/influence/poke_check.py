@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from dm_common.geometry import pitch
-from dm_common.optics.sag import remove_piston_tilt, rms
+from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]

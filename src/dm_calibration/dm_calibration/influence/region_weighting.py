@@ -28,7 +28,7 @@ from dm_calibration.influence.weights import (
     surface_control_error,
 )
 from dm_calibration.optics.regions import region_statistics
-from dm_common.optics.sag import remove_piston_tilt, weighted_fit
+from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.sample_regions import AREA_FRACTIONS, regional_rms
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 
@@ -182,8 +182,8 @@ def weighted_coefficients(maps: MapSet, sag: Floats, weights: Floats) -> Floats:
     """
     coefficients = sag @ coefficient_operator(maps.points, weights).T
     # What was removed is a plane, which any weights fit exactly.
-    plane = basis(maps.points.x, maps.points.y)[:, PISTON_TILT]
-    coefficients[:, PISTON_TILT] += weighted_fit(maps.sag - sag, plane, maps.points.weight)
+    plane = basis(maps.points.x, maps.points.y)[:, :PISTON_TILT]
+    coefficients[:, :PISTON_TILT] += weighted_fit(maps.sag - sag, plane, maps.points.weight)
     return np.asarray(coefficients)
 
 

@@ -11,7 +11,7 @@ number of the commands.
 
 A pixel without data in some map has no influence function: least squares there would need a design of its own. Pixels
 do not mix, so NaN in a map is NaN in the result at that pixel and nowhere else. Piston and tilt that change from map to
-map belong to the interferometer; remove them before (:func:`~dm_common.optics.piston_tilt.remove_piston_tilt`).
+map belong to the interferometer; remove them before (:func:`~dm_common.optics.piston_tilt.remove_plane`).
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from dm_common.names import unknown_name
 from dm_common.optics.conic import conic_coefficients
-from dm_common.optics.sag import remove_piston_tilt, rms
+from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import TERMS, basis
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import point_weights
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import TERMS, basis

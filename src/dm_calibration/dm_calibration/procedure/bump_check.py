@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.measurement import Measurement
-from dm_common.optics.zernike import TERM_RMS
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 Floats = NDArray[np.float64]
 
-_PISTON_TILT = 3
 #: An aperture found on a map may wander by so many pixels.
 _WANDER_PX = 1.5
 
@@ -121,5 +120,5 @@ class BumpCheck:
 
 def _figure_rms(coefficients: Floats) -> float:
     """Rms sag without piston and tilt, m."""
-    terms = slice(_PISTON_TILT, coefficients.size)
-    return float(np.linalg.norm(coefficients[terms] * TERM_RMS[_PISTON_TILT : coefficients.size]))
+    terms = slice(PISTON_TILT, coefficients.size)
+    return float(np.linalg.norm(coefficients[terms] * TERM_RMS[PISTON_TILT : coefficients.size]))

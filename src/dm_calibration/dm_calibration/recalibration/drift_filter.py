@@ -21,10 +21,10 @@ from scipy.stats import norm
 
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
 from dm_calibration.hysteresis.reduction import Reduction
-from dm_calibration.influence.fit import PISTON_TILT, InfluenceFit
+from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_common.optics.sag import fill_gaps, remove_piston_tilt, rms
-from dm_common.optics.zernike import TERM_RMS
+from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 Floats = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from dm_calibration.regression.sag_history import RunHistory, SagModel
 from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import ErrorRegression, Reading, regress_surface_errors
 from dm_common.hysteresis.model import follow
-from dm_common.optics.sag import rms
+from dm_common.optics.piston_tilt import rms
 
 Floats = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from dm_calibration.influence.gaps import usable_sag
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import drift_columns
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_common.optics.sag import fill_gaps
+from dm_common.optics.piston_tilt import fill_gaps
 
 Floats = NDArray[np.float64]
 

@@ -67,7 +67,7 @@ from dm_calibration.regression.surface_samples import (
     surface_weights,
 )
 from dm_common.names import unknown_name
-from dm_common.optics.sag import rms
+from dm_common.optics.piston_tilt import rms
 from dm_common.optics.zernike import TERM_RMS, basis
 
 Floats = NDArray[np.float64]

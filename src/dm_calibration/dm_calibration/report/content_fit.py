@@ -108,7 +108,7 @@ def coefficients(calibration: Calibration, left: Residuals) -> Section:
     """Residual by Zernike term."""
     hysteresis = calibration.hysteresis
     sigma = hysteresis.zernike_sigma if hysteresis is not None else None
-    first = len(PISTON_TILT)
+    first = PISTON_TILT
     rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0)) * NM
     header = ["term", "in-sample rms, nm"] + (["held-out moves, nm"] if sigma is not None else [])
     rows = [

@@ -164,7 +164,7 @@ def coefficients_figure(left: Residuals, hysteresis_sigma: Floats | None) -> Fig
     """rms residual of each Zernike coefficient beyond tilt; beside it what held-out moves showed, when known."""
     figure = Figure(figsize=(10.5, 3.4), layout="constrained")
     axes = figure.add_subplot()
-    first = len(PISTON_TILT)
+    first = PISTON_TILT
     place = np.arange(first, left.coefficients.shape[1])
     rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0))[first:]
     share = 0.8 if hysteresis_sigma is None else 0.4

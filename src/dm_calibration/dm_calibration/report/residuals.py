@@ -11,7 +11,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import effective_maps
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import make_design
-from dm_common.optics.sag import fill_gaps, remove_piston_tilt
+from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
 
 Floats = NDArray[np.float64]
 

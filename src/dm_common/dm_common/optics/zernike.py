@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 MAX_ORDER = 5
 
-#: Indices of piston and the two tilts, which no interferometer can attribute to the mirror.
-PISTON_TILT = (0, 1, 2)
+#: Number of the first terms that no interferometer can attribute to the mirror: piston and the two tilts.
+PISTON_TILT = 3
 
 
 class Term(NamedTuple):
@@ -96,7 +96,7 @@ def basis(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
     return result
 
 
-def rms_of(coefficients: ArrayLike, exclude: Collection[int] = PISTON_TILT) -> NDArray[np.float64] | float:
+def rms_of(coefficients: ArrayLike, exclude: Collection[int] = range(PISTON_TILT)) -> NDArray[np.float64] | float:
     """Root mean square over the full disc of the sag with these Born & Wolf coefficients.
 
     Args:

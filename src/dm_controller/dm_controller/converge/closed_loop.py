@@ -25,10 +25,10 @@ import numpy as np
 
 from dm_common.errors import Cancelled
 from dm_common.measurement import Measurement
-from dm_common.optics.zernike import TERM_RMS
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import FREE, Floats, Shape, Solver, measured_shape, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag, target_shape
 
 #: Bounds of the factor on a correction that the watched response may ask for.
 SCALE_MIN, SCALE_MAX = 0.6, 1.5
@@ -177,8 +177,8 @@ def response_ratio(asked: Shape, seen: Shape) -> float:
 
     Coefficients count by their rms sag.
     """
-    factors = TERM_RMS[FREE : len(asked.coefficients)]
-    wanted, got = factors * asked.coefficients[FREE:], factors * seen.coefficients[FREE:]
+    factors = TERM_RMS[PISTON_TILT : len(asked.coefficients)]
+    wanted, got = factors * asked.coefficients[PISTON_TILT:], factors * seen.coefficients[PISTON_TILT:]
     power = float(wanted @ wanted)
     return float(wanted @ got) / power if math.sqrt(power) >= CHANGE_MIN else math.nan
 

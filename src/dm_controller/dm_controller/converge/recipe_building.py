@@ -19,9 +19,9 @@ import numpy as np
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Measurement
+from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import Recipe, RecipeBook, RecipeError
 from dm_controller.converge.recipe_targets import UnreachableError
-from dm_controller.planning.mirror_model import FREE_TERMS
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import interpolation_error
 from dm_controller.planning.target import FocusTarget
@@ -242,7 +242,7 @@ class RecipeBuilder:
             error = self._predicted(aim) + mean - wanted
             self._on_step(BuildStep(target.curvature, before + number, error.max_zernike, rms_sag(error, model)))
         self.state = law.advance(self.state, self._now())
-        scatter = np.var(np.array(coefficients)[:, FREE_TERMS:], axis=0, ddof=1)
+        scatter = np.var(np.array(coefficients)[:, PISTON_TILT:], axis=0, ddof=1)
         return _Round(aim, mean, scatter / len(coefficients), len(coefficients))
 
     def _hold(self, aim: Floats) -> None:
@@ -267,7 +267,7 @@ def _pooled(rounds: Sequence[_Round], response: Callable[[Floats], Shape]) -> tu
     last = rounds[-1]
     weights = []
     for taken in rounds:
-        way = response(last.aim - taken.aim).coefficients[FREE_TERMS:]
+        way = response(last.aim - taken.aim).coefficients[PISTON_TILT:]
         weights.append(1.0 / (SIGMA_MIN**2 + np.mean(taken.variance) + (MISS * np.abs(way).max()) ** 2))
     share = np.array(weights) / np.sum(weights)
     pooled = Shape(

@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
-from dm_common.optics.zernike import TERM_RMS, basis
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 from dm_controller.planning.closed_form import ClosedForm
 from dm_controller.planning.target import FocusTarget
 
-#: Piston and the two tilts are free: focus does not care, and an interferometer cannot see piston.
-FREE_TERMS = 3
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
 #: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
 COEFFICIENT_WEIGHT = 100.0
@@ -111,7 +109,7 @@ def coefficient_rows(influence: NDArray[np.float64]) -> NDArray[np.float64]:
     Args:
         influence: (K - 3, N) m per unit signal.
     """
-    rms = TERM_RMS[FREE_TERMS : FREE_TERMS + len(influence)]
+    rms = TERM_RMS[PISTON_TILT : PISTON_TILT + len(influence)]
     modes, authority, _ = np.linalg.svd(rms[:, None] * influence)
     weak = np.ones(len(influence), dtype=np.bool_)
     weak[: len(authority)] = authority < LEAST_AUTHORITY * authority[0]
@@ -142,8 +140,8 @@ class CalibratedMirror:
         self.limits = limits
         self._weights = np.sqrt(model.sample_weight)
         self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
-        self._tilt_free = self._terms[:, :FREE_TERMS]
-        self._coefficient_rows = coefficient_rows(model.influence_zernike[FREE_TERMS:])
+        self._tilt_free = self._terms[:, :PISTON_TILT]
+        self._coefficient_rows = coefficient_rows(model.influence_zernike[PISTON_TILT:])
         self.matrix = self.rows(model.influence_zernike, model.influence_sag)
         reduced = self._reduce(model.influence_sag, self._tilt_free)
         self.sag_root: NDArray[np.float64] = np.linalg.qr(reduced)[1]
@@ -175,7 +173,7 @@ class CalibratedMirror:
         Returns:
             (K - 3 + P,) or (K - 3 + P, N).
         """
-        weighted = self._coefficient_rows @ coefficients[FREE_TERMS:]
+        weighted = self._coefficient_rows @ coefficients[PISTON_TILT:]
         return np.concatenate([weighted, self._reduce(sag, self._terms)])
 
     def solve(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -235,7 +233,7 @@ class CalibratedMirror:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Coefficient errors beyond tilt (K - 3,) and weighted sag errors (P,), piston and tilt removed, or columns."""
         model = self.model
-        zernike_error = model.influence_zernike[FREE_TERMS:] @ signals - coefficients[FREE_TERMS:]
+        zernike_error = model.influence_zernike[PISTON_TILT:] @ signals - coefficients[PISTON_TILT:]
         return zernike_error, self._reduce(model.influence_sag @ signals - sag, self._tilt_free)
 
     def _plan(self, signals: NDArray[np.float64], rms: float, largest: float) -> Plan:

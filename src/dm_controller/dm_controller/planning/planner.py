@@ -19,7 +19,8 @@ from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.prepared_inverse import PreparedInverse
 from dm_common.limits import Limits
-from dm_controller.planning.mirror_model import FREE_TERMS, CalibratedMirror, Plan, rms_bounds
+from dm_common.optics.zernike import PISTON_TILT
+from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
@@ -84,7 +85,7 @@ class Planner:
     ) -> None:
         self.mirror, self.hysteresis, self.slew_rate = mirror, hysteresis, slew_rate
         self.law = hysteresis.law if hysteresis is not None else HysteresisModel.linear()
-        self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[FREE_TERMS:])
+        self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[PISTON_TILT:])
         self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
         self._prepared: PreparedInverse | None = None
 
@@ -234,7 +235,7 @@ class Planner:
             return 0.0, 0.0
         model, sigma = self.mirror.model, self.hysteresis.unknown_sigma
         miss = sigma * np.random.default_rng(0).standard_normal((DRAWS, model.influence_zernike.shape[1]))
-        largest = np.abs(miss @ model.influence_zernike[FREE_TERMS:].T).max(axis=1)
+        largest = np.abs(miss @ model.influence_zernike[PISTON_TILT:].T).max(axis=1)
         area = model.sample_weight[:, None] * np.square(model.influence_sag)
         return float(np.quantile(largest, 0.95)), float(sigma * np.sqrt(area.sum()))
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator, make_interp_spline
 
+from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import Recipe, RecipeBook, RecipeError
-from dm_controller.planning.mirror_model import FREE_TERMS
 from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
@@ -90,7 +90,7 @@ def interpolation_error(recipes: Sequence[Recipe], influence_zernike: Floats) ->
     if len(recipes) < 3:
         return 0.0
     missed = _left_out(recipes, _best_curve(recipes))
-    return float(np.abs(missed @ influence_zernike[FREE_TERMS:].T).max())
+    return float(np.abs(missed @ influence_zernike[PISTON_TILT:].T).max())
 
 
 def _of_conic(book: RecipeBook, conic_constant: float) -> list[Recipe]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.limits import SLACK, Limits
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 from dm_controller.planning.mirror_model import InfluenceModel
@@ -23,8 +23,6 @@ from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
 
-#: Terms that an interferometer does not know and focus does not need: they are free in every solve.
-FREE = len(PISTON_TILT)
 #: Share by which an actuator may miss a move: hysteresis of such piezos ([1], section 1: about 10 %).
 MISS = 0.10
 
@@ -53,7 +51,7 @@ class Shape:
     @property
     def max_zernike(self) -> float:
         """Largest coefficient beyond tilt, m."""
-        return float(np.abs(self.coefficients[FREE:]).max())
+        return float(np.abs(self.coefficients[PISTON_TILT:]).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +183,8 @@ def normalised_terms(model: InfluenceModel) -> tuple[Floats, Floats]:
     Raises:
         ValueError: no actuator moves any of these terms.
     """
-    factors = TERM_RMS[FREE : len(model.zernike_offset)]
-    matrix = factors[:, None] * model.influence_zernike[FREE:]
+    factors = TERM_RMS[PISTON_TILT : len(model.zernike_offset)]
+    matrix = factors[:, None] * model.influence_zernike[PISTON_TILT:]
     if not matrix.any():
         raise ValueError("influence_zernike is zero: no actuator moves the surface; calibrate first")
     return matrix, factors

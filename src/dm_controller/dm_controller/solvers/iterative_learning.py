@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from dm_common.limits import Limits
+from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import FREE, Floats, Shape, Solver, normalised_terms
+from dm_controller.solvers.base import Floats, Shape, Solver, normalised_terms
 
 #: β relative to the squared largest singular value of G: the price of a signal change.
 BETA = 1e-3
@@ -33,5 +34,5 @@ class IterativeLearning(Solver):
         self._learning = (right.T * (singular / (singular**2 + beta * singular[0] ** 2))) @ left.T
 
     def _signals(self, start: Floats, change: Shape) -> Floats:
-        step: Floats = self._learning @ (self._factors * change.coefficients[FREE:])
+        step: Floats = self._learning @ (self._factors * change.coefficients[PISTON_TILT:])
         return start + step

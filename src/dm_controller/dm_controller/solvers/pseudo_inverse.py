@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from dm_common.limits import Limits
+from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import FREE, Floats, Shape, Solver, normalised_terms
+from dm_controller.solvers.base import Floats, Shape, Solver, normalised_terms
 
 #: Singular values below this share of the largest are left out: they would turn noise into signals.
 CUTOFF = 1e-3
@@ -29,7 +30,7 @@ class PseudoInverse(Solver):
         self._inverse = np.linalg.pinv(matrix, rcond=CUTOFF)
 
     def _signals(self, start: Floats, change: Shape) -> Floats:
-        step: Floats = self._inverse @ (self._factors * change.coefficients[FREE:])
+        step: Floats = self._inverse @ (self._factors * change.coefficients[PISTON_TILT:])
         return start + step
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dm_common.limits import Limits
-from dm_common.optics.sag import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows, points_of

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.zernike import basis
 from dm_controller.planning.conversions import model_of
 
@@ -84,7 +84,7 @@ def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
     whole = max(1.0, step) ** 2  # what the weights of one point sum to
     enough = (found >= WEIGHT_SHARE * whole) & _disc()[2]
     mean = np.where(enough, rows @ filled @ columns.T / np.where(enough, found, 1.0), np.nan)
-    return Surface(remove_piston_tilt(mean.astype(np.float64)), info.aperture_radius)
+    return Surface(remove_plane(mean.astype(np.float64)), info.aperture_radius)
 
 
 def _nearness(pixels: int, centre: float, step: float) -> NDArray[np.float32]:
@@ -128,7 +128,7 @@ class SurfaceModel:
         """The surface under the effective signals (N,)."""
         sag = np.full(self._inside.shape, np.nan)
         sag[self._inside] = self._sag[:, :-1] @ effective + self._sag[:, -1]
-        return Surface(remove_piston_tilt(sag), self.radius)
+        return Surface(remove_plane(sag), self.radius)
 
     def coefficients(self, effective: Floats) -> Floats:
         """(K,) m under the effective signals (N,)."""
@@ -147,4 +147,4 @@ def difference(measured: Surface, predicted: Surface) -> Surface:
             f"the map's aperture radius is {measured.radius * 1e3:.2f} mm, that of the calibration "
             f"{predicted.radius * 1e3:.2f} mm: they cannot be compared"
         )
-    return Surface(remove_piston_tilt(measured.sag - predicted.sag), predicted.radius)
+    return Surface(remove_plane(measured.sag - predicted.sag), predicted.radius)

@@ -166,7 +166,7 @@ def bars(zernike: Any, predicted: Floats | None, as_difference: bool) -> list[Ba
             predicted_nm=float(predicted[k]) * NM if predicted is not None and usable and not as_difference else None,
         )
         for k in range(len(NAMES))
-        if k not in PISTON_TILT
+        if k >= PISTON_TILT
     ]
 
 

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.patches import Circle, RegularPolygon
 
-from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.piston_tilt import remove_plane
 
 #: Curvatures shown as columns: the ends, half way and flat.
 COLUMNS = (-0.05, -0.02, 0.0, 0.02, 0.05)
@@ -66,7 +66,7 @@ def save_sweep_figure(
     figure = plt.figure(figsize=(13, 11), layout="constrained")
     figure.suptitle(title)
     grid = figure.add_gridspec(4, len(shown), height_ratios=(1, 1, 1, 0.9))
-    measured_sag = [remove_piston_tilt(row["sag"].astype(float)) for row in shown]
+    measured_sag = [remove_plane(row["sag"].astype(float)) for row in shown]
     sag_limit = max(np.nanmax(np.abs(sag)) for sag in measured_sag) * 1e6
     residual_limit = max(np.nanpercentile(np.abs(row["error"].residual), 99.5) for row in shown) * 1e9
     for column, (row, sag) in enumerate(zip(shown, measured_sag, strict=True)):
