@@ -99,13 +99,11 @@ class LawFit:
         candidate: which.
         law: with effective signals that span 2 in a full cycle.
         residual: (M, D) of all rows, those left out included; units of `Responses.values`.
-        weight_covariance: (F, F) of the features' weights, relative to the signal's, for the scatter of the fit.
     """
 
     candidate: Candidate
     law: HysteresisModel
     residual: Floats
-    weight_covariance: Floats
 
 
 class CandidateProblem:
@@ -145,7 +143,7 @@ class CandidateProblem:
                 features = self._features(nonlinear)
             except ValueError:  # a Duhem operator that leads nowhere
                 return np.full(int(keep.sum()) * self._measured.shape[1], 1e3)
-            weights[0], left, _ = self._solve(features, keep, weights[0])
+            weights[0], left = self._solve(features, keep, weights[0])
             return np.asarray(left[keep].ravel())
 
         low = np.concatenate((np.full(slopes, -30.0), [0.0]))
@@ -156,8 +154,8 @@ class CandidateProblem:
             ftol=1e-6,
         )  # fmt: skip
         features = self._features(found.x)
-        solved, left, covariance = self._solve(features, keep, weights[0])
-        return LawFit(self.candidate, self._law(solved, found.x), left * self._scatter, covariance)
+        solved, left = self._solve(features, keep, weights[0])
+        return LawFit(self.candidate, self._law(solved, found.x), left * self._scatter)
 
     def _features(self, nonlinear: Floats) -> Floats:
         rate, slope = nonlinear[-1], nonlinear[:-1]
@@ -169,8 +167,8 @@ class CandidateProblem:
         fading = fading + rate * self._crept(fading)
         return np.concatenate((features, fading), axis=1)
 
-    def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats, Floats]:
-        """Weights (F,), residual (M, D) in units of the scatter, covariance of the weights."""
+    def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats]:
+        """Weights (F,), residual (M, D) in units of the scatter."""
         measured, figure = self._measured[keep], self._figure[keep]
         free = basis_of(figure)
         kept = features[keep]
@@ -178,7 +176,6 @@ class CandidateProblem:
         count = features.shape[1]
         if weights is None:
             weights = np.eye(count)[0]
-        covariance = np.zeros((count, count))
         rows, actuators = len(kept), kept.shape[2]
         flat = kept.reshape(rows, -1)
         projected = (flat - free @ (free.T @ flat)).reshape(kept.shape)
@@ -196,12 +193,10 @@ class CandidateProblem:
             normal = columns @ columns.T
             ridge = RIDGE * np.trace(normal) / count * np.eye(count)
             ridge[0, 0] = 0.0
-            inverse = np.linalg.inv(normal + ridge)
-            weights = inverse @ (columns @ seen)
-            covariance = inverse
+            weights = np.linalg.solve(normal + ridge, columns @ seen)
             weights = weights / weights[0]
         design = np.hstack((self._figure, np.einsum("f,mfn->mn", weights, features)))
-        return weights, self._measured - design @ solution, covariance
+        return weights, self._measured - design @ solution
 
     def _law(self, weights: Floats, nonlinear: Floats) -> HysteresisModel:
         plays = len(self.radius) * self.candidate.powers

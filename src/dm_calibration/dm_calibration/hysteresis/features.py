@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,20 @@ from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES
 
 Floats = NDArray[np.float64]
+
+#: Weight of each element of an even creep spectrum per unit of creep rate.
+PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIMES) - 1)
+
+
+def play_values(signals: Floats, radius: Floats) -> Floats:
+    """(M, R, N) values of play operators of half-widths `radius` (R,) along `signals` (M, N) from a degauss at 0 on."""
+    half_width = radius[:, None]
+    play = np.zeros((len(radius), signals.shape[1]))
+    values = np.empty((len(signals), *play.shape))
+    for row, shape in enumerate(signals):
+        play = np.clip(play, shape - half_width, shape + half_width)
+        values[row] = play
+    return values
 
 
 def play_features(signals: Floats, radius: Floats, powers: int) -> Floats:
@@ -22,15 +38,9 @@ def play_features(signals: Floats, radius: Floats, powers: int) -> Floats:
     Returns:
         (M, R D, N), the powers of one half-width beside each other.
     """
-    count, actuators = signals.shape
-    half_width = radius[:, None]
-    play = np.zeros((len(radius), actuators))
-    values = np.empty((count, len(radius), actuators))
-    for row, shape in enumerate(signals):
-        play = np.clip(play, shape - half_width, shape + half_width)
-        values[row] = play
+    values = play_values(signals, radius)
     stacked = np.stack([values**power for power in range(1, powers + 1)], axis=2)
-    return stacked.reshape(count, len(radius) * powers, actuators)
+    return stacked.reshape(len(signals), len(radius) * powers, signals.shape[1])
 
 
 def fading_feature(signals: Floats, operator: DuhemOperator) -> Floats:
@@ -43,29 +53,34 @@ def fading_feature(signals: Floats, operator: DuhemOperator) -> Floats:
     return values
 
 
-def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
-    """What creep adds to features (M, F, N) per unit of creep rate, seen at `time` (M,) s; all before `start` was 0.
+def creep_states(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Iterator[Floats]:
+    """What the creep elements have followed of `values` (M, ...) at each `time` (M,) s; all before `start` was 0.
 
     Args:
-        moved: (M,) s, when each row began to stand, between the looks; None = right after the look before.
+        moved: (M,) s, when each row began to stand, between the measurements; None = right after the one before.
+
+    Yields:
+        (J, ...), a row after the other.
     """
-    element = CREEP_TIMES[:, None, None]
-    state = np.zeros((len(CREEP_TIMES), *features.shape[1:]))
-    result = np.empty_like(features)
+    shape = (len(CREEP_TIMES), *(1,) * (values.ndim - 1))
     moved = np.concatenate(([start], time[:-1])) if moved is None else np.maximum(moved, start)
     still = np.exp(-np.diff(np.column_stack((moved, time)).ravel(), prepend=start)[:, None] / CREEP_TIMES)
-    before = np.zeros(features.shape[1:])
-    for row, now in enumerate(features):
-        state = before + (state - before) * still[2 * row].reshape(element.shape)
-        state = now + (state - now) * still[2 * row + 1].reshape(element.shape)
-        result[row], before = state.sum(axis=0), now
-    return result * _per_element()
+    state, before = np.zeros((len(CREEP_TIMES), *values.shape[1:])), np.zeros(values.shape[1:])
+    for row, now in enumerate(values):
+        state = before + (state - before) * still[2 * row].reshape(shape)
+        state = now + (state - now) * still[2 * row + 1].reshape(shape)
+        yield state
+        before = now
+
+
+def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
+    """What creep of an even spectrum adds to features (M, F, N) per unit of creep rate; see :func:`creep_states`."""
+    result = np.empty_like(features)
+    for row, state in enumerate(creep_states(features, time, start, moved)):
+        result[row] = state.sum(axis=0)
+    return result * PER_ELEMENT
 
 
 def relaxation(time: Floats, start: float) -> Floats:
     """(M,) how much of an old displacement's creep is still to fade at `time` (s) when it ended at `start`."""
-    return np.asarray(np.exp(-(time[:, None] - start) / CREEP_TIMES).sum(axis=1) * _per_element())
-
-
-def _per_element() -> float:
-    return float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIMES) - 1)
+    return np.asarray(np.exp(-(time[:, None] - start) / CREEP_TIMES).sum(axis=1) * PER_ELEMENT)

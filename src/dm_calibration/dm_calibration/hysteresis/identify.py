@@ -1,7 +1,9 @@
 """Identification of the hysteresis model from the maps of a calibration run.
 
 Which features a mirror needs is not known beforehand: candidates from none to all are fitted to parts of the run
-(:mod:`~dm_calibration.hysteresis.candidate_fit`), and the one that predicts the other parts best is taken.
+(:mod:`~dm_calibration.hysteresis.candidate_fit`), and the one that predicts the other parts best is taken. Laws of
+each actuator by itself (:mod:`~dm_calibration.hysteresis.own_laws`) are one more candidate, so a mirror whose actuators
+are alike keeps its common law.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, CandidateProblem, LawFit, Run
+from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.influence.regression import TooFewMapsError
 
 Floats = NDArray[np.float64]
@@ -50,6 +53,7 @@ def identify(
     run: Run,
     test: Rows | None = None,
     candidates: Sequence[Candidate] = CANDIDATES,
+    own: bool = True,
     folds: int = 4,
     progress: Callable[[str], None] = lambda step: None,
 ) -> Identification:
@@ -57,6 +61,8 @@ def identify(
 
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
+        candidates: laws that all actuators share.
+        own: whether to try laws of each actuator too.
         folds: contiguous parts of the run that are predicted from the others.
 
     Raises:
@@ -70,26 +76,32 @@ def identify(
     scatter = _scatter(run, train)
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds // train.sum()
-    best: tuple[float, CandidateProblem, LawFit, Floats] | None = None
+    best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
-    for candidate in candidates:
-        progress(candidate.name)
-        problem = CandidateProblem(run, candidate, scatter)
+
+    def consider(problem: CandidateProblem | OwnLaws) -> None:
+        nonlocal best
+        name = problem.candidate.name
+        progress(name)
         whole = problem.fit(train)
         slope = whole.law.slope_min()
         if slope < SLOPE_MIN:
-            refused[candidate.name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
-            continue
+            refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
+            return
         held_out = np.full_like(whole.residual, np.nan)
         for fold in range(folds):
             left_out = train & (part == fold)
             held_out[left_out] = problem.fit(train & ~left_out, whole, evaluations=4).residual[left_out]
-        score = float(np.sqrt(np.mean(np.square(held_out[train] / scatter))))
-        scores[candidate.name] = score
-        if best is None or PARSIMONY * score < best[0]:
-            best = (score, problem, whole, held_out)
+        scores[name] = float(np.sqrt(np.mean(np.square(held_out[train] / scatter))))
+        if best is None or PARSIMONY * scores[name] < best[0]:
+            best = (scores[name], problem, whole, held_out)
+
+    for candidate in candidates:
+        consider(CandidateProblem(run, candidate, scatter))
     assert best is not None  # the linear candidate can always be inverted
+    if own and best[2].law.remembers:
+        consider(OwnLaws(run, best[2].law, scatter))
     score, problem, fitted, held_out = best
     if test.any():
         held_out = np.where(test[:, None], fitted.residual, np.nan)

@@ -1,0 +1,215 @@
+"""Laws of hysteresis and creep of each actuator by itself, drawn towards common ones as far as the maps say.
+
+Hysteresis is a Preisach operator of a general density over centre and half-width of its relays: for each half-width r
+any smooth function of the value of the play operator p_r [10]. Functions are Legendre series in p_r; a Gaussian prior
+makes them alike for neighbouring r and small for high orders, and only its strongest patterns are kept, so that forty
+numbers an actuator describe a law. The patterns of all actuators are drawn towards each other: those that one
+actuator shows badly are the mean of the others. Creep is a spectrum over the elements of the model, smooth over the
+logarithm of time, with the same pull towards a common one.
+
+Responses are linear in the gains of the actuators, in their patterns and in their spectra: each is a regularised
+least-squares solution given the other two, in turn. That of the patterns is one system of all actuators, since the
+responses of neighbours overlap; its matrix is the elementwise product of the Gram matrices of features and gains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Run
+from dm_calibration.hysteresis.features import PER_ELEMENT, creep_states, fading_feature, play_values
+from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, starts_of
+from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+#: Play operators beside the signal itself, orders of the Legendre series, and patterns that are kept of their prior.
+PLAYS, ORDERS, PATTERNS = 30, 5, 40
+#: Prior of the weights: standard deviation in all, correlation length and decay over the half-width, and the power by
+#: which the variance falls with the order. Held-out errors change by less than a tenth when any is doubled or halved.
+AMPLITUDE, CORRELATION, DECAY, ORDER_POWER = 0.2, 0.5, 0.35, 3.0
+#: Variance of the loading curve beside that of all play operators together.
+LOADING = 0.3
+#: Prior standard deviation of a Duhem operator's weight.
+DUHEM_WEIGHT = 0.3
+#: Prior of the creep spectrum: standard deviation relative to the common rate, correlation over elements, and the
+#: spread between actuators relative to that; the rate where the common law found less.
+SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD, CREEP_RATE_MIN = 0.5, 4.0, 0.3, 1e-3
+#: Rounds of the three solutions in turn.
+ROUNDS = 6
+#: Standard deviation of a normal distribution by the median of its absolute values.
+MEDIAN_TO_SIGMA = 1.4826
+#: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
+#: times of it errors change by less than a tenth.
+SPREAD = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class OwnFit(LawFit):
+    """Laws of each actuator fitted to some rows of a run.
+
+    Attributes:
+        patterns: (F, N) weights of the features of each actuator.
+        creep: (J, N) weights of the creep elements.
+        scatter: (D,) uncertainty of each response, from what these laws leave.
+    """
+
+    patterns: Floats
+    creep: Floats
+    scatter: Floats
+
+
+class OwnLaws:
+    """Laws of each actuator on one run: features once, then fits to any of its rows.
+
+    Args:
+        run: what was commanded and measured.
+        common: law of all actuators to begin with; its Duhem operator is kept.
+        scatter: (D,) uncertainty of each response to begin with.
+    """
+
+    def __init__(self, run: Run, common: HysteresisModel, scatter: Floats) -> None:
+        self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
+        name = "Preisach and Duhem" if self._slope.size else "Preisach"
+        self.candidate = Candidate(f"{name}, each actuator its own", PLAYS, ORDERS, len(self._slope))
+        self._parts = run.parts
+        self._starts = [run.began, *starts_of(self._parts, run.time, run.moved)]
+        self.radius = np.concatenate(([0.0], (np.arange(PLAYS) + 0.5) / PLAYS))
+        self._basis = pattern_basis(self.radius)
+        signals = run.signals
+        values = in_parts(self._parts, lambda part: play_values(signals[part], self.radius))
+        series = legendre.legvander(values, ORDERS)[..., 1:] - legendre.legvander(np.zeros(1), ORDERS)[0, 1:]
+        flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
+        columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
+        prior = np.ones(self._basis.shape[1])
+        if self._slope.size:
+            operator = DuhemOperator(self._slope)
+            columns.append(in_parts(self._parts, lambda part: fading_feature(signals[part], operator)))
+            prior = np.append(prior, DUHEM_WEIGHT**2)
+        self._features = np.concatenate(columns, axis=1)
+        count = signals.shape[1]
+        self._between: Floats = np.linalg.inv(np.ones((count, count)) + SPREAD**2 * np.eye(count))
+        self._prior: Floats = np.diag(1.0 / prior)
+        self._creep = max(common.creep_rate, CREEP_RATE_MIN) * PER_ELEMENT
+        apart = np.abs(np.subtract.outer(np.arange(len(CREEP_TIMES)), np.arange(len(CREEP_TIMES))))
+        self._creep_prior: Floats = np.linalg.inv((SPECTRUM * self._creep) ** 2 * np.exp(-apart / SPECTRUM_CORRELATION))
+        self._creep_between: Floats = np.linalg.inv(np.ones((count, count)) + SPECTRUM_SPREAD**2 * np.eye(count))
+        self._figure = figure_columns(run.time, self._parts, self._starts)
+
+    def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int = ROUNDS) -> OwnFit:
+        """Fit to the rows in `keep` (M,), from `start` or from no hysteresis at all, in so many rounds."""
+        if isinstance(start, OwnFit):
+            patterns, creep, scatter = start.patterns, start.creep, start.scatter
+        else:
+            patterns = np.zeros(self._features.shape[1:])
+            patterns[0] = 1.0
+            creep, scatter = np.full((len(CREEP_TIMES), patterns.shape[1]), self._creep), self._scatter
+        free = basis_of(self._figure[keep])
+        crept = self._with_creep(creep)
+        gains, residual = self._gains(crept, patterns, keep)
+        for number in range(evaluations):
+            scatter = scatter if number == 0 else self._scatter_of(residual[keep])
+            measured = self.run.responses.values[keep] / scatter
+            patterns = self._patterns(crept[keep], gains / scatter, measured, free)
+            position = np.einsum("mfn,fn->mn", self._features, patterns)
+            creep = self._spectra(position, gains / scatter, measured, keep, free)
+            crept = self._with_creep(creep)
+            gains, residual = self._gains(crept, patterns, keep)
+        return OwnFit(self.candidate, self._law(patterns, creep), residual, patterns, creep, scatter)
+
+    def _law(self, patterns: Floats, creep: Floats) -> HysteresisModel:
+        """The law of the weights (F, N) and (J, N), each actuator's effective signal spanning 2 in a full cycle."""
+        count = self._basis.shape[1]
+        series = (self._basis @ patterns[1 : 1 + count]).T.reshape(-1, len(self.radius), ORDERS)
+        powers = np.zeros((ORDERS, ORDERS + 1))
+        for order in range(1, ORDERS + 1):
+            powers[order - 1, : order + 1] = legendre.leg2poly(np.eye(ORDERS + 1)[order, : order + 1])
+        play_weight = series @ powers[:, 1:]
+        play_weight[:, 0, 0] += patterns[0]
+        share = np.maximum(creep.T, 0.0)
+        mean = float(share.mean())
+        law = HysteresisModel(
+            self.radius,
+            play_weight,
+            self._slope.copy(),
+            patterns[-1].copy() if self._slope.size else 0.0,
+            mean / PER_ELEMENT,
+            CREEP_TIMES,
+            share / mean if mean else np.zeros(0),
+        )
+        return law.scaled(2.0 / law.span())
+
+    def _creep_states(self, values: Floats) -> Iterator[Floats]:
+        """(J, ...) what the creep elements have followed of `values` (M, ...) at each map; each part begins rested."""
+        time, moved = self.run.time, self.run.moved
+        for part, start in zip(self._parts, self._starts, strict=True):
+            yield from creep_states(values[part], time[part], start, None if moved is None else moved[part])
+
+    def _with_creep(self, creep: Floats) -> Floats:
+        """(M, F, N) features with the creep that the spectra `creep` (J, N) add."""
+        added = [np.einsum("jfn,jn->fn", state, creep) for state in self._creep_states(self._features)]
+        return self._features + np.array(added)
+
+    def _gains(self, crept: Floats, patterns: Floats, keep: Rows) -> tuple[Floats, Floats]:
+        """Gains (N, D) and residual (M, D), m."""
+        design = np.hstack((self._figure, np.einsum("mfn,fn->mn", crept, patterns)))
+        values = self.run.responses.values
+        solution = np.linalg.lstsq(design[keep], values[keep], rcond=1e-10)[0]
+        return solution[self._figure.shape[1] :], values - design @ solution
+
+    def _scatter_of(self, residual: Floats) -> Floats:
+        """(D,) m, one value for all coefficients; maps that no law explains do not set it."""
+        count, coefficients = len(residual), self.run.responses.coefficients
+        freedom = max(count - self._figure.shape[1] - self._features.shape[2], 1)
+        scatter = np.maximum(MEDIAN_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0), 1e-11)
+        scatter[:coefficients] = np.median(scatter[:coefficients])
+        return np.asarray(scatter)
+
+    def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats) -> Floats:
+        """(F, N): the signal itself counts 1, the others follow their prior."""
+        left = measured - crept[:, 0] @ gains
+        solved = _solve(_without(crept[:, 1:], free), _without(left, free), gains, self._prior, self._between)
+        return np.concatenate((np.ones((1, solved.shape[1])), solved))
+
+    def _spectra(self, position: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats) -> Floats:
+        """(J, N) weights of the creep elements."""
+        elements = np.array(list(self._creep_states(position)))[keep]
+        left = measured - (position[keep] + self._creep * elements.sum(axis=1)) @ gains
+        return self._creep + _solve(
+            _without(elements, free), _without(left, free), gains, self._creep_prior, self._creep_between
+        )
+
+
+def pattern_basis(radius: Floats) -> Floats:
+    """(R D, K) the strongest patterns of the prior over half-widths and orders, each of unit variance."""
+    away = np.abs(np.subtract.outer(radius, radius))
+    smooth = np.exp(-away / CORRELATION - np.add.outer(radius, radius) / (2.0 * DECAY)) / max(len(radius) - 1, 1)
+    smooth[0, :] = smooth[:, 0] = 0.0  # the loading curve is apart from the loops
+    smooth[0, 0] = LOADING
+    order = np.arange(1, ORDERS + 1, dtype=np.float64) ** -ORDER_POWER
+    size, axes = np.linalg.eigh(AMPLITUDE**2 * np.kron(smooth, np.diag(order)))
+    strongest = np.argsort(size)[::-1][:PATTERNS]
+    return np.asarray(axes[:, strongest] * np.sqrt(size[strongest]))
+
+
+def _without(rows: Floats, free: Floats) -> Floats:
+    """`rows` (M, ...) less what the orthonormal columns `free` (M, C) explain."""
+    return rows - np.tensordot(free, np.tensordot(free.T, rows, 1), 1)
+
+
+def _solve(features: Floats, left: Floats, gains: Floats, prior: Floats, between: Floats) -> Floats:
+    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md and the inverse prior covariance
+    `between` (N, N) over actuators times `prior` (F, F) over features."""
+    count, actuators = features.shape[1:]
+    flat = features.transpose(0, 2, 1).reshape(len(features), -1)
+    normal = flat.T @ flat * np.kron(gains @ gains.T, np.ones((count, count))) + np.kron(between, prior)
+    right = np.einsum("mfn,mn->nf", features, left @ gains.T)
+    return np.asarray(cho_solve(cho_factor(normal), right.ravel()).reshape(actuators, count).T)
