@@ -38,12 +38,15 @@ class Candidate:
         plays: number of play operators beside the signal itself.
         powers: of their values.
         slopes: coefficients of the Duhem operator's slope; 0 = no such operator.
+        own: each actuator has its own weights, drawn towards common ones, and the Duhem operator is that of the best
+            candidate before (:mod:`~dm_calibration.hysteresis.own_laws`).
     """
 
     name: str
     plays: int
     powers: int
     slopes: int
+    own: bool = False
 
 
 CANDIDATES = (
@@ -52,6 +55,7 @@ CANDIDATES = (
     Candidate("Preisach", 20, 3, 0),
     Candidate("Duhem", 0, 3, 4),
     Candidate("Preisach and Duhem", 20, 3, 4),
+    Candidate("Preisach, each actuator its own", 30, 5, 0, own=True),
 )
 
 

@@ -53,7 +53,6 @@ def identify(
     run: Run,
     test: Rows | None = None,
     candidates: Sequence[Candidate] = CANDIDATES,
-    own: bool = True,
     folds: int = 4,
     progress: Callable[[str], None] = lambda step: None,
 ) -> Identification:
@@ -61,8 +60,7 @@ def identify(
 
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
-        candidates: laws that all actuators share.
-        own: whether to try laws of each actuator too.
+        candidates: in this order; the first has no hysteresis to invert, an own one follows common ones.
         folds: contiguous parts of the run that are predicted from the others.
 
     Raises:
@@ -98,10 +96,11 @@ def identify(
             best = (scores[name], problem, whole, held_out)
 
     for candidate in candidates:
-        consider(CandidateProblem(run, candidate, scatter))
+        if not candidate.own:
+            consider(CandidateProblem(run, candidate, scatter))
+        elif best is not None and best[2].law.remembers:
+            consider(OwnLaws(run, candidate, best[2].law, scatter))
     assert best is not None  # the linear candidate can always be inverted
-    if own and best[2].law.remembers:
-        consider(OwnLaws(run, best[2].law, scatter))
     score, problem, fitted, held_out = best
     if test.any():
         held_out = np.where(test[:, None], fitted.residual, np.nan)

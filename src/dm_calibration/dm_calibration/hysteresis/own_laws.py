@@ -31,8 +31,8 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
-#: Play operators beside the signal itself, orders of the Legendre series, and patterns that are kept of their prior.
-PLAYS, ORDERS, PATTERNS = 30, 5, 40
+#: Patterns that are kept of the prior.
+PATTERNS = 40
 #: Prior of the weights: standard deviation in all, correlation length and decay over the half-width, and the power by
 #: which the variance falls with the order. Held-out errors change by less than a tenth when any is doubled or halved.
 AMPLITUDE, CORRELATION, DECAY, ORDER_POWER = 0.2, 0.5, 0.35, 3.0
@@ -72,21 +72,22 @@ class OwnLaws:
 
     Args:
         run: what was commanded and measured.
+        candidate: play operators and orders of the Legendre series.
         common: law of all actuators to begin with; its Duhem operator is kept.
         scatter: (D,) uncertainty of each response to begin with.
     """
 
-    def __init__(self, run: Run, common: HysteresisModel, scatter: Floats) -> None:
+    def __init__(self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats) -> None:
         self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
-        name = "Preisach and Duhem" if self._slope.size else "Preisach"
-        self.candidate = Candidate(f"{name}, each actuator its own", PLAYS, ORDERS, len(self._slope))
+        self.candidate = candidate
         self._parts = run.parts
         self._starts = [run.began, *starts_of(self._parts, run.time, run.moved)]
-        self.radius = np.concatenate(([0.0], (np.arange(PLAYS) + 0.5) / PLAYS))
-        self._basis = pattern_basis(self.radius)
+        self.radius = np.concatenate(([0.0], (np.arange(candidate.plays) + 0.5) / candidate.plays))
+        self._basis = pattern_basis(self.radius, candidate.powers)
         signals = run.signals
         values = in_parts(self._parts, lambda part: play_values(signals[part], self.radius))
-        series = legendre.legvander(values, ORDERS)[..., 1:] - legendre.legvander(np.zeros(1), ORDERS)[0, 1:]
+        orders = candidate.powers
+        series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
         columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
         prior = np.ones(self._basis.shape[1])
@@ -96,12 +97,16 @@ class OwnLaws:
             prior = np.append(prior, DUHEM_WEIGHT**2)
         self._features = np.concatenate(columns, axis=1)
         count = signals.shape[1]
-        self._between: Floats = np.linalg.inv(np.ones((count, count)) + SPREAD**2 * np.eye(count))
-        self._prior: Floats = np.diag(1.0 / prior)
+        self._between = np.asarray(np.linalg.inv(np.ones((count, count)) + SPREAD**2 * np.eye(count)), dtype=np.float64)
+        self._prior = np.asarray(np.diag(1.0 / prior), dtype=np.float64)
         self._creep = max(common.creep_rate, CREEP_RATE_MIN) * PER_ELEMENT
         apart = np.abs(np.subtract.outer(np.arange(len(CREEP_TIMES)), np.arange(len(CREEP_TIMES))))
-        self._creep_prior: Floats = np.linalg.inv((SPECTRUM * self._creep) ** 2 * np.exp(-apart / SPECTRUM_CORRELATION))
-        self._creep_between: Floats = np.linalg.inv(np.ones((count, count)) + SPECTRUM_SPREAD**2 * np.eye(count))
+        self._creep_prior = np.asarray(
+            np.linalg.inv((SPECTRUM * self._creep) ** 2 * np.exp(-apart / SPECTRUM_CORRELATION)), dtype=np.float64
+        )
+        self._creep_between = np.asarray(
+            np.linalg.inv(np.ones((count, count)) + SPECTRUM_SPREAD**2 * np.eye(count)), dtype=np.float64
+        )
         self._figure = figure_columns(run.time, self._parts, self._starts)
 
     def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int = ROUNDS) -> OwnFit:
@@ -109,9 +114,10 @@ class OwnLaws:
         if isinstance(start, OwnFit):
             patterns, creep, scatter = start.patterns, start.creep, start.scatter
         else:
-            patterns = np.zeros(self._features.shape[1:])
+            features, actuators = self._features.shape[1:]
+            patterns = np.zeros((features, actuators))
             patterns[0] = 1.0
-            creep, scatter = np.full((len(CREEP_TIMES), patterns.shape[1]), self._creep), self._scatter
+            creep, scatter = np.full((len(CREEP_TIMES), actuators), self._creep), self._scatter
         free = basis_of(self._figure[keep])
         crept = self._with_creep(creep)
         gains, residual = self._gains(crept, patterns, keep)
@@ -127,11 +133,11 @@ class OwnLaws:
 
     def _law(self, patterns: Floats, creep: Floats) -> HysteresisModel:
         """The law of the weights (F, N) and (J, N), each actuator's effective signal spanning 2 in a full cycle."""
-        count = self._basis.shape[1]
-        series = (self._basis @ patterns[1 : 1 + count]).T.reshape(-1, len(self.radius), ORDERS)
-        powers = np.zeros((ORDERS, ORDERS + 1))
-        for order in range(1, ORDERS + 1):
-            powers[order - 1, : order + 1] = legendre.leg2poly(np.eye(ORDERS + 1)[order, : order + 1])
+        count, orders = self._basis.shape[1], self.candidate.powers
+        series = (self._basis @ patterns[1 : 1 + count]).T.reshape(-1, len(self.radius), orders)
+        powers = np.zeros((orders, orders + 1))
+        for order in range(1, orders + 1):
+            powers[order - 1, : order + 1] = legendre.leg2poly(np.eye(orders + 1)[order, : order + 1])
         play_weight = series @ powers[:, 1:]
         play_weight[:, 0, 0] += patterns[0]
         share = np.maximum(creep.T, 0.0)
@@ -188,13 +194,13 @@ class OwnLaws:
         )
 
 
-def pattern_basis(radius: Floats) -> Floats:
+def pattern_basis(radius: Floats, orders: int) -> Floats:
     """(R D, K) the strongest patterns of the prior over half-widths and orders, each of unit variance."""
     away = np.abs(np.subtract.outer(radius, radius))
     smooth = np.exp(-away / CORRELATION - np.add.outer(radius, radius) / (2.0 * DECAY)) / max(len(radius) - 1, 1)
     smooth[0, :] = smooth[:, 0] = 0.0  # the loading curve is apart from the loops
     smooth[0, 0] = LOADING
-    order = np.arange(1, ORDERS + 1, dtype=np.float64) ** -ORDER_POWER
+    order = np.arange(1, orders + 1, dtype=np.float64) ** -ORDER_POWER
     size, axes = np.linalg.eigh(AMPLITUDE**2 * np.kron(smooth, np.diag(order)))
     strongest = np.argsort(size)[::-1][:PATTERNS]
     return np.asarray(axes[:, strongest] * np.sqrt(size[strongest]))

@@ -1,0 +1,88 @@
+"""Laws of each actuator by itself, on actuators made of relays: a Preisach density of its own for each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
+from dm_calibration.hysteresis.excitation import excitation
+from dm_calibration.hysteresis.identify import Identification, identify
+from dm_calibration.hysteresis.responses import Responses
+from linear_mirror import make_mirror
+
+Floats = NDArray[np.float64]
+
+#: Relays of each actuator; one of them that flips moves it by a few 1e-6 of its range.
+RELAYS = 40_000
+#: Half a stroke, m, and the noise of a response, m.
+HALF_STROKE, NOISE = 4e-6, 2e-10
+COMMON = tuple(candidate for candidate in CANDIDATES if not candidate.own)
+
+
+class Relays:
+    """Actuators of relays that switch up at centre + half-width and down at centre - half-width."""
+
+    def __init__(self, actuators: int, spread: float, rng: np.random.Generator) -> None:
+        decay = 0.25 * np.exp(spread * rng.standard_normal((actuators, 1)))
+        skew = spread * rng.standard_normal((actuators, 1))
+        self._half_width = decay * rng.exponential(1.0, (actuators, RELAYS))
+        centre = rng.uniform(-1.0, 1.0, (actuators, RELAYS))
+        self._centre = centre + skew * (1.0 - centre**2)  # a density that leans to one side
+        self._up = self._centre < 0.0
+        self._share = 0.12 * np.exp(spread * rng.standard_normal(actuators))
+
+    def move(self, signals: Floats) -> Floats:
+        """Go to `signals` (N,); returns displacements (N,), normalised."""
+        column = signals[:, None]
+        self._up |= column >= self._centre + self._half_width
+        self._up &= column > self._centre - self._half_width
+        relays = 2.0 * self._up.mean(axis=1) - 1.0
+        return np.asarray((1.0 - self._share) * signals + self._share * relays)
+
+
+def relay_run(spread: float, seed: int, maps: int = 200) -> tuple[Run, NDArray[np.bool_]]:
+    """A run of the excitation on seven such actuators that creep, seen through a random matrix, and its check maps."""
+    mirror = make_mirror(rings=1)
+    rng = np.random.default_rng(seed)
+    actuators = Relays(mirror.actuators, spread, rng)
+    commands = excitation(mirror, maps)
+    time = np.cumsum(1.0 + commands.dwell)
+    mixing = HALF_STROKE * rng.standard_normal((mirror.actuators, 12)) / 4.0
+    tau = np.array([0.3, 3.0, 30.0, 300.0])
+    share = 0.01 * np.exp(spread * rng.standard_normal((mirror.actuators, 1)))
+    crept = np.zeros((mirror.actuators, tau.size))
+    values, before = [], 0.0
+    for signals, seen in zip(commands.signals, time, strict=True):
+        position = actuators.move(signals)
+        crept = position[:, None] + (crept - position[:, None]) * np.exp(-(seen - before) / tau)
+        before = seen
+        values.append((position + (share * crept).sum(axis=1)) @ mixing)
+    measured = np.array(values) + NOISE * rng.standard_normal((maps, mixing.shape[1]))
+    responses = Responses(measured, mixing.shape[1], np.ones(maps, dtype=bool))
+    return Run(commands.signals, time, responses, 0.0), commands.check
+
+
+def held_out_rms(found: Identification) -> float:
+    return float(np.sqrt(np.nanmean(np.square(found.held_out))))
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(seed: int) -> None:
+    run, check = relay_run(0.2, seed)
+    found, common = identify(run, check), identify(run, check, COMMON)
+    assert found.fit.candidate.own
+    assert found.fit.law.actuators == 7
+    assert found.fit.law.slope_min() > 0.1
+    assert held_out_rms(common) > 2.0 * held_out_rms(found)
+
+
+def test_actuators_that_are_alike_lose_nothing() -> None:
+    run, check = relay_run(0.0, 13)
+    assert held_out_rms(identify(run, check)) < 1.1 * held_out_rms(identify(run, check, COMMON))
+
+
+def test_laws_span_the_same_in_a_full_cycle() -> None:
+    run, check = relay_run(0.2, 14, 120)
+    assert identify(run, check).fit.law.span() == pytest.approx(np.full(7, 2.0), rel=1e-9)
