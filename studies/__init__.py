@@ -1,1 +1,1 @@
-"""studies."""
+"""Studies that are not installed: the paper's page, the comparison of methods, benchmarks, and their verbs of `dm`."""

@@ -234,7 +234,7 @@ def test_a_senseless_region_ends_with_the_reason(start: Start) -> None:
 def test_the_example_of_the_documentation_runs(bench: Bench, domain: int) -> None:
     root = Path(__file__).resolve().parents[1]
     example = (root / "examples" / "camera_focus.py").read_text()
-    code = example[example.index("from dm_client") :]
+    code = example[example.index("from dm_autofocus") :]
     page = (root / "docs" / "camera.md").read_text()
     assert all(line in page for line in code.splitlines())
     done = subprocess.run(

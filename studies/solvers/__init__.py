@@ -1,1 +1,1 @@
-"""solvers."""
+"""Solvers that exist to be compared with those of the controller."""

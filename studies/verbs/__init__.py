@@ -1,1 +1,1 @@
-"""verbs."""
+"""Verbs of `dm` that run a study: bench, compare, paper."""

@@ -1,1 +1,1 @@
-"""Open-loop focus controller for deformable mirrors, with launch files and the dm command."""
+"""Open-loop focus control of deformable mirrors, and the closed loop on an interferometer."""

@@ -1,1 +1,1 @@
-"""ros_jobs."""
+"""Benchmarks of running nodes: latencies between processes and hosts, and what idle nodes cost."""

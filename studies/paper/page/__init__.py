@@ -1,1 +1,1 @@
-"""page."""
+"""The page that sets the paper's tables and figures beside those of the virtual bench."""

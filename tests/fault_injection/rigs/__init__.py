@@ -1,1 +1,1 @@
-"""rigs."""
+"""Real nodes in front of emulated electronics, networks and clients, for faults to be injected into."""
