@@ -43,7 +43,7 @@ class HysteresisTracker:
     Attributes:
         law: the law that is followed.
         state: the best guess; None before the first report.
-        unknown: why the state is a guess only, in words; "" = it is known.
+        unknown: reason why the state is a guess only; "" = it is known.
     """
 
     def __init__(self, law: HysteresisModel, middle: float = 0.0) -> None:
@@ -113,14 +113,14 @@ class HysteresisTracker:
             self.state = self.law.move(self.state, report.turned_at, report.time)
         self.state = self.law.move(self.state, report.signals, report.time)
 
-    def _guess(self, report: Applied, why: str) -> None:
+    def _guess(self, report: Applied, reason: str) -> None:
         fresh = self.law.demagnetised(len(report.signals), report.time, self._middle)
         moved = self.law.move(fresh, report.signals, report.time)
         settled = np.repeat(moved.position[:, None], moved.crept.shape[1], axis=1)
-        self.state, self.unknown = replace(moved, crept=settled), why
+        self.state, self.unknown = replace(moved, crept=settled), reason
 
-    def _guess_keeping_creep(self, report: Applied, why: str) -> None:
+    def _guess_keeping_creep(self, report: Applied, reason: str) -> None:
         """Where the mirror stands is known, on which branch is not."""
         assert self.state is not None
         self.state = self.law.move(self.state, report.signals, report.time)
-        self.unknown = why
+        self.unknown = reason
