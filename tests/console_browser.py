@@ -24,10 +24,11 @@ from selenium.webdriver.common.keys import Keys
 from dm_tools.demo.demo import free_ports
 from support import wait_until
 
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+BROWSERS = ("chromium", "google-chrome", "google-chrome-stable", "chromium-browser")
+CHROMIUM, DRIVER = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
     not (CHROMIUM and DRIVER),
-    reason="no chromium and chromedriver in PATH; on Debian: sudo apt-get install chromium chromium-driver",
+    reason="no chromium and chromedriver in PATH; run it with: sudo apt-get install chromium chromium-driver",
 )
 DESKTOP, PHONE = (1440, 1000), (390, 844)
 

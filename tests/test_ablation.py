@@ -27,6 +27,8 @@ from studies.comparison.true_surface import TrueSurface
 from studies.verbs.compare import compare as command
 from studies.verbs.compare_history import rows_of
 
+pytestmark = pytest.mark.slow
+
 WAVELENGTH = 632.8e-9
 SMALL = SimulationConfig(pixels=120, degauss_steps=50)
 OPTIONS = AblationOptions(SMALL, ("bouc_wen",), (3,), requests=10, maps=120)

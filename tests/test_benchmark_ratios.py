@@ -21,6 +21,8 @@ from studies.benchmarks.suite import JOBS, run
 from studies.benchmarks.targets import TARGETS, rows
 from studies.benchmarks.timing import Effort, medians
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 BASELINE: dict[str, Any] = json.loads((ROOT / "benchmarks" / "baseline.json").read_text())
 

@@ -28,6 +28,8 @@ from dm_common.measurement import Measurement
 from hysteretic_mirror import MIRROR, RememberingBench
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
+pytestmark = pytest.mark.slow
+
 POKES = make_plan(PlanKind.POKES, MIRROR)
 
 

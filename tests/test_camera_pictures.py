@@ -13,6 +13,8 @@ from dm_autofocus.sharpness import check_region, cut
 from dm_tools.demo.demo_camera import Focused, Shot, camera_config, regions
 from dm_tools.demo.pictures import HOLD, save_animation, save_contact_sheet
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def found() -> list[Focused]:

@@ -26,6 +26,8 @@ from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.solvers.registry import SOLVERS
 from studies.verbs.compare import compare as command
 
+pytestmark = pytest.mark.slow
+
 SMALL = SimulationConfig(pixels=120, degauss_steps=30)
 
 

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SHELL = shutil.which("bash") or ""
 
-pytestmark = pytest.mark.skipif(not SHELL, reason="no bash here")
+pytestmark = [pytest.mark.processes, pytest.mark.skipif(not SHELL, reason="no bash here")]
 
 
 def in_bash(script: str, home: Path, folder: Path) -> str:

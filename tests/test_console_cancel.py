@@ -21,6 +21,8 @@ from dm_tools.console import console_node as ros_side
 from dm_tools.console.console_node import ConsoleNode
 from support import own_domain
 
+pytestmark = pytest.mark.processes
+
 LONGEST_S = 60.0
 
 

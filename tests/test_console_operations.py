@@ -14,7 +14,7 @@ from dm_bringup.suite import Suite
 from dm_tools.demo.demo import bench_config
 from support import Observer, own_domain, wait_until
 
-pytestmark = needs_browser
+pytestmark = [pytest.mark.processes, needs_browser]
 
 
 @pytest.fixture(scope="module")

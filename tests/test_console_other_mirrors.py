@@ -18,7 +18,7 @@ from console_stand_in import StandIn
 from dm_common.geometry import hexagonal_positions
 from support import Observer, own_domain, wait_until
 
-pytestmark = needs_browser
+pytestmark = [pytest.mark.processes, needs_browser]
 
 #: 19 actuators on a grid turned by 20 degrees.
 X, Y = hexagonal_positions(19, pitch=3.5e-3, start_angle=np.radians(20.0))

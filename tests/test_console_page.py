@@ -25,7 +25,7 @@ from dm_bringup.suite import Suite
 from dm_tools.demo.demo import bench_config
 from support import own_domain, wait_until
 
-pytestmark = needs_browser
+pytestmark = [pytest.mark.processes, needs_browser]
 
 
 @dataclass

@@ -35,6 +35,8 @@ from dm_tools.documentation.parameters import TABLES
 from documentation import Block, blocks
 from support import wait_until
 
+pytestmark = pytest.mark.processes
+
 ROOT = told.ROOT
 BLOCKS = blocks()
 SHELL = [(str(block), command) for block in BLOCKS if block.kind == "shell" for command in block.commands]

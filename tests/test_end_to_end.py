@@ -32,6 +32,8 @@ from dm_tools.demo.demo import bench_config
 from dm_tools.verify import map_of, surface_error
 from support import bench_figures, wait_until
 
+pytestmark = pytest.mark.processes
+
 SEED = 20_11
 WAVELENGTH = 632.8e-9
 

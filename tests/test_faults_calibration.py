@@ -9,6 +9,8 @@ import pytest
 from fault_injection.faults.calibration_faults import FAULTS
 from fault_injection.faults.fault import run_faults
 
+pytestmark = pytest.mark.processes
+
 #: Those that nothing else in the tests shows; `./dm faults` runs all.
 NAMES = ("calibration_power_cut", "calibration_interferometer_killed")
 

@@ -11,6 +11,8 @@ from fault_injection.faults.fault import FaultRecord, run_faults
 from fault_injection.faults.registry import GROUPS, OTHERS, select
 from fault_injection.rigs.focus_rig import FocusRig
 
+pytestmark = pytest.mark.processes
+
 #: Those that nothing else in the tests shows; `./dm faults` runs all.
 FAULTS = (
     "foreign_calibration",

@@ -12,6 +12,8 @@ from fault_injection.faults.driver_faults import REGISTRY, select
 from fault_injection.faults.fault import Fault, FaultRecord, run_faults
 from fault_injection.rigs.driver_rig import DriverRig
 
+pytestmark = pytest.mark.processes
+
 #: Those that nothing else in the tests shows; `./dm faults` runs all.
 FAULTS = (
     "driver_killed_in_move",

@@ -17,6 +17,8 @@ from fault_injection.fuzz.fuzz import fuzz
 from fault_injection.fuzz.mutations import Mutation, mutate
 from fault_injection.fuzz.reference_files import FORMATS, XYZ_UNIT, ReferenceFile, intact
 
+pytestmark = pytest.mark.processes
+
 #: HDF5 files take longer: the library crashes now and then, and its process is started again.
 FILES = {"dat": 1000, "asc": 1000, "xyz": 1000, "datx": 250, "calibration": 250}
 

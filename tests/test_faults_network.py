@@ -15,6 +15,8 @@ from fault_injection.faults.registry import select
 from fault_injection.rigs.netem import Netem, bad_cable
 from studies.network_namespaces import NotPermittedError, inside
 
+pytestmark = pytest.mark.processes
+
 DATAGRAMS = 2000
 
 

@@ -11,6 +11,8 @@ from fault_injection.faults import process_faults, wire_faults
 from fault_injection.faults.fault import run_faults
 from fault_injection.faults.wire_faults import Storm
 
+pytestmark = pytest.mark.processes
+
 FAULTS = {fault.name: fault for fault in (*process_faults.FAULTS, *wire_faults.FAULTS)}
 
 

@@ -8,6 +8,8 @@ import pytest
 
 from fault_injection.soak import NODES, RATE, WINDOWS, SoakResult, Window, soak
 
+pytestmark = pytest.mark.processes
+
 SECONDS = 25.0
 
 

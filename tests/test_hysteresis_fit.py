@@ -17,6 +17,8 @@ from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
+pytestmark = pytest.mark.slow
+
 MAPS = 100
 
 

@@ -9,6 +9,8 @@ from dm_calibration.hysteresis.forecast import Forecast, forecast, map_noise
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
+pytestmark = pytest.mark.slow
+
 TWIN = SimulationConfig(law="bouc_wen", seed=8, pixels=120, degauss_steps=50)
 
 

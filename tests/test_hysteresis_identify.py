@@ -16,6 +16,8 @@ from dm_calibration.hysteresis.responses import Responses
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from linear_mirror import make_mirror
 
+pytestmark = pytest.mark.slow
+
 LINEAR = CANDIDATES[0]
 
 

@@ -16,6 +16,8 @@ from dm_client import DeformableMirrorClient
 from dm_tools.demo.demo import bench_config
 from dm_tools.verbs.up import configurations
 
+pytestmark = pytest.mark.processes
+
 
 def test_virtual_mirrors_share_neither_ports_nor_folders() -> None:
     left, right = configurations([], ["left", "/right/"]).values()

@@ -20,6 +20,8 @@ from studies.paper.results import PaperOptions
 from studies.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
 from studies.verbs.paper import paper
 
+pytestmark = pytest.mark.slow
+
 SEED = 31
 
 

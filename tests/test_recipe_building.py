@@ -31,6 +31,8 @@ from perfect_calibration import perfect_model
 from studies.comparison.compare import true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
+pytestmark = pytest.mark.slow
+
 LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().limits.pairs, dtype=np.intp), 2.0)
 WAVELENGTH = 632.8e-9
 

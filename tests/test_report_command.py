@@ -16,6 +16,8 @@ from dm_tools.verbs.report import find_calibration, report
 from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> CalibrationStore:

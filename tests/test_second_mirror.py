@@ -27,6 +27,8 @@ from dm_tools.verbs.up import shared_config
 from dm_tools.verify import map_of, surface_error
 from support import bench_figures
 
+pytestmark = pytest.mark.processes
+
 SEED = 20_19
 MIRROR_19 = shared_config("mirror_19.yaml")
 

@@ -20,6 +20,8 @@ from dm_tools.security.keystore import check_keystore, keys_missing
 from dm_tools.security.policy import Profile, dds_topics, write_profile
 from support import wait_until
 
+pytestmark = pytest.mark.processes
+
 PROFILE = Profile(simulation=True)
 #: Nodes that live for a moment only.
 SHORT_LIVED = {"calibration_exit"}

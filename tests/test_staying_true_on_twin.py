@@ -15,6 +15,8 @@ from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS, basis
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
+pytestmark = pytest.mark.slow
+
 NIGHTS = 100
 ASTIGMATISM = 4
 

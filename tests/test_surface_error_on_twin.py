@@ -10,6 +10,8 @@ from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.regression.surface_error import Reading, regress_surface_errors
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:

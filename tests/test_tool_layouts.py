@@ -99,7 +99,7 @@ def test_every_topic_of_a_foxglove_panel_is_published() -> None:
             assert topic.lstrip("/") in TOPICS.keys() | STANDARD, name
 
 
-@pytest.mark.skipif(shutil.which("node") is None, reason="no node in PATH to run the layout's script with")
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node in PATH; run it with: sudo apt-get install nodejs")
 def test_the_script_of_the_foxglove_layout_paints_the_map(tmp_path: Path) -> None:
     (script,) = foxglove()["userNodes"].values()
     plain = re.sub(r"^import .*$", "", script["sourceCode"], flags=re.MULTILINE)

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-ORACLE_MISSING = "no SurfaceTopography: ./dm exec python -m pip install -r requirements/test-oracles.txt"
+ORACLE_MISSING = "no SurfaceTopography; run it with: ./dm exec python -m pip install -r requirements/test-oracles.txt"
 NO_DATA = 2147483640
 WAVELENGTH = 632.8e-9
 

@@ -31,6 +31,8 @@ from hysteretic_mirror import MIRROR, RememberingBench
 from linear_mirror import LinearMirror, make_mirror
 from recorded_bench import recorded
 
+pytestmark = pytest.mark.slow
+
 #: One play operator of half-width 0.2 and weight 1 beside the signal: the loop opens by 2 x 0.2 of a span of 2 + 1.6.
 PLAY = HysteresisModel(
     np.array([0.0, 0.2]), np.array([[1.0], [1.0]]), np.zeros(0), 0.0, 0.01, np.geomspace(0.03, 3e5, 15)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -137,11 +138,18 @@ def test_disk_full_leaves_everything_as_it_was(tmp_path: Path, calibration: Cali
     assert (tmp_path / "PDM_1.h5").read_bytes() == before
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write to read-only folders")
-def test_read_only_folder(tmp_path: Path, calibration: Calibration) -> None:
-    tmp_path.chmod(0o500)
-    with pytest.raises(StoreError, match="Permission denied"):
-        CalibrationStore(tmp_path).save(calibration)
+def test_read_only_folder(calibration: Calibration) -> None:
+    root = os.geteuid() == 0  # who may write everywhere, and whose folder of the test nobody else may enter
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o555)
+        try:
+            if root:
+                os.seteuid(65534)
+            with pytest.raises(StoreError, match="Permission denied"):
+                CalibrationStore(Path(folder)).save(calibration)
+        finally:
+            if root:
+                os.seteuid(0)
 
 
 def test_folder_that_is_a_file(tmp_path: Path, calibration: Calibration) -> None:

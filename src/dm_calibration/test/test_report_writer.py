@@ -15,6 +15,8 @@ from dm_calibration.report.report_writer import ReportingStore, ReportWriter
 from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
 
+pytestmark = pytest.mark.slow
+
 PATIENCE_S = 200.0
 
 

@@ -13,22 +13,33 @@ import typer
 
 from dm_tools.output import JsonOption, console, write_json
 
+#: What `--fast` leaves out: nodes as processes, and whole comparisons, reports and identifications.
+FAST = "not processes and not slow"
+#: Most of a node's test is waiting, so a few at once; modules stay whole for what their tests share, and conftest.py
+#: has those first that take longest.
+WORKERS = max(3, os.cpu_count() or 1)
+SCHEDULE = ("--dist", "loadfile", "--no-loadscope-reorder")
+
 
 def test(
     context: typer.Context,
-    lint: Annotated[bool, typer.Option(help="Run ruff and mypy too.")] = True,
+    fast: Annotated[bool, typer.Option("--fast", help="Only tests that start no process and take no time.")] = False,
+    lint: Annotated[bool | None, typer.Option(help="Run ruff and mypy too; by default in a run of all tests.")] = None,
     json: JsonOption = None,
 ) -> None:
-    """Run all checks of the project: ruff, mypy, pytest. Further arguments go to pytest."""
+    """Run all checks of the project: ruff, mypy, pytest.
+
+    Further arguments go to pytest: `./dm test PATH ...` runs these tests alone.
+    """
     root = Path(os.environ.get("DM_ROOT", Path.cwd()))
+    chosen = any(not argument.startswith("-") for argument in context.args)
     steps = {}
-    if lint:
+    if lint or (lint is None and not fast and not chosen):
         steps["ruff check"] = ["ruff", "check", "."]
         steps["ruff format"] = ["ruff", "format", "--check", "."]
         steps["mypy"] = ["mypy"]
-    # Most of a node's test is waiting, so a few at once; modules stay whole for what their tests share.
-    workers = str(max(3, os.cpu_count() or 1))
-    steps["pytest"] = ["pytest", "-n", workers, "--dist", "loadfile", *context.args]
+    workers = os.cpu_count() or 1 if fast else 0 if chosen else WORKERS
+    steps["pytest"] = ["pytest", "-n", str(workers), *SCHEDULE, *(["-m", FAST] if fast else []), *context.args]
     results: dict[str, dict[str, float | int]] = {}
     for name, command in steps.items():
         console.rule(name)
