@@ -12,10 +12,10 @@ import pytest
 from typer import Typer
 from typer.testing import CliRunner
 
-from dm_calibration.regression.f_statistic import adjusted_r2_of_f, p_of_f
 from dm_calibration.report.document import Section, Table, write_html, write_pdf
 from studies.comparison.simulated_bench import SimulationConfig
 from studies.paper import control, reported
+from studies.paper.f_statistic import adjusted_r2_of_f, p_of_f
 from studies.paper.results import PaperOptions
 from studies.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
 from studies.verbs.paper import paper

@@ -60,7 +60,7 @@ TARGETS: tuple[Target, ...] = (
         "ms",
         lambda f: f["zernike_fit"]["ms"],
         lambda f: 3.0 * f["zernike_fit"]["memory_read_ms"],
-        _others("zernike_fit", {"hysteresis": "memory_read_ms"}),
+        _others("zernike_fit", {"memory": "memory_read_ms"}),
     ),
     Target(
         "the same, difference from lstsq",
@@ -91,18 +91,18 @@ TARGETS: tuple[Target, ...] = (
         _others("regions", {"ten passes": "ten_passes_ms"}),
     ),
     Target(
-        "influence function at every pixel, 75 maps, at most 0.25 s",
+        "influence function of 75 maps with its figures of quality, at most 0.25 s",
         "s",
         lambda f: f["influence"]["s"],
         lambda f: 0.25,
-        _others("influence", {"one product": "gemm_s", "dmlib's loop": "dmlib_loop_s"}),
+        _others("influence", {"one product, no more": "gemm_s", "dmlib's loop, at every pixel": "dmlib_loop_s"}),
     ),
     Target(
-        "its memory with 75 maps, at most 1.1 × that with 25",
+        "memory of taking in and fitting 75 maps, at most 1.1 × that with 25",
         "MB",
         lambda f: f["influence"]["peak_mb_75_maps"],
         lambda f: 1.1 * f["influence"]["peak_mb_25_maps"],
-        _others("influence", {"25 maps": "peak_mb_25_maps", "all 75 at once, more": "gemm_stack_mb"}),
+        _others("influence", {"25 maps": "peak_mb_25_maps", "all 75 at once, more": "stack_mb"}),
     ),
     Target(
         "bounded solve, saturated, at most 0.2 ms",
@@ -112,7 +112,7 @@ TARGETS: tuple[Target, ...] = (
         _others("solve", {"BVLS": "bvls_ms", "inside the limits": "inside_ms"}),
     ),
     Target(
-        "inverse of the memory law, 37 actuators, at most 0.3 ms",
+        "inverse of the hysteresis model, 37 actuators, at most 0.3 ms",
         "ms",
         lambda f: f["inverse"]["ms"],
         lambda f: 0.3,
@@ -162,7 +162,7 @@ TARGETS: tuple[Target, ...] = (
         "%",
         lambda f: f["idle"]["percent"],
         lambda f: 3.0,
-        lambda f: {"the twin": f["idle"]["nodes"]["virtual_bench"]},
+        lambda f: {"the simulation": f["idle"]["nodes"]["virtual_bench"]},
     ),
     Target(
         "computing of a calibration, plan FULL, at most 5 % of the bench's time",

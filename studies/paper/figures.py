@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from dm_calibration.influence.region_weighting import RegionWeighting
-from dm_calibration.optics.regions import RegionStatistics
 from dm_calibration.report.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.zernike import PISTON_TILT, TERMS
+from studies.paper.regions import RegionStatistics
 from studies.paper.sampling_study import SamplingStudy
 
 NM = 1e9

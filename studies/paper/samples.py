@@ -14,15 +14,16 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_ma
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import SURFACE, MapSet
 from dm_calibration.influence.region_weighting import RegionWeighting, weighting_of
-from dm_calibration.influence.weights import region_weights, surface_control_error, weights_cancel_max_abs
+from dm_calibration.influence.weights import region_weights, surface_control_error
 from dm_calibration.optics.map_fit import MapFitter
-from dm_calibration.optics.regions import ConcentricRegions, RegionStatistics, figure_5
 from dm_calibration.procedure.procedure import Progress
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sample_regions import regional_rms
 from dm_common.optics.zernike import PISTON_TILT
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
+from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5
+from studies.paper.weights_cancel import weights_cancel_max_abs
 
 Floats = NDArray[np.float64]
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from dm_calibration.optics.regions import RegionStatistics
 from dm_calibration.regression.surface_error import ErrorRegression
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from studies.paper import reported
 from studies.paper.control import Series, share_within
 from studies.paper.page.content_coefficients import MARKS
+from studies.paper.regions import RegionStatistics
 from studies.paper.regressions import LEVEL, TAKEN
 from studies.paper.results import BenchResults, Results
 from studies.paper.sampling_study import SamplingStudy

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
-from dm_calibration.optics.regions import ConcentricRegions
 from dm_common.optics.piston_tilt import fit_plane, remove_plane
 from dm_common.optics.zernike import basis
 
@@ -129,28 +128,13 @@ def test_fitter_knows_what_it_was_made_for() -> None:
     assert not fitter.fits(mask, Aperture(29.5, 29.5, 21))
 
 
-def test_residual_map_and_its_regions() -> None:
+def test_residual_map() -> None:
     sag = rough_map((80, 80), 4)
     aperture = Aperture(40.2, 39.1, 35.0)
     fitter = MapFitter(np.isfinite(sag), aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
     residual = fitter.residual(sag, fitter.fit(sag).coefficients)
     _coefficients, expected, _inverse = plain_fit(sag, 40.2, 39.1, 35.0)
     np.testing.assert_allclose(residual[np.isfinite(residual)], expected, atol=1e-15)
-    found = ConcentricRegions((80, 80), aperture).rms(residual)
-    u, v = unit_coordinates((80, 80), 40.2, 39.1, 35.0)
-    for share, rms in zip(np.arange(1, 11) / 10, found, strict=True):
-        inside = (u**2 + v**2 <= share) & np.isfinite(residual)
-        assert rms == pytest.approx(np.sqrt((residual[inside] ** 2).mean()), rel=1e-9)
-
-
-def test_regions_have_the_stated_share_of_the_area() -> None:
-    aperture = Aperture(149.5, 149.5, 150)
-    step = np.where(aperture.squared_distance((300, 300)) <= 0.3, 1.0, 0.0)
-    found = ConcentricRegions((300, 300), aperture).rms(step)
-    np.testing.assert_allclose(found**2, np.minimum(1, 0.3 / (np.arange(1, 11) / 10)), rtol=2e-3)
-    assert np.isnan(ConcentricRegions((300, 300), aperture).rms(np.full((300, 300), np.nan))).all()
-    with pytest.raises(ValueError, match="must rise within 0 to 1"):
-        ConcentricRegions((3, 3), aperture, [0.5, 0.4])
 
 
 def test_piston_and_tilt_are_removed_and_nothing_else() -> None:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from dm_calibration.hysteresis.features import play_features
 from dm_calibration.influence.fit import fit_influence
-from dm_calibration.regression.f_statistic import adjusted_r2_of_f, p_of_f
 from dm_calibration.regression.predictor import fit_predictor
 from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.sample_checks import TooFewSamplesError
@@ -49,8 +49,9 @@ def test_following_the_history_predicts_the_test_set(method: str) -> None:
         assert (table2.n, table2.model, table2.reading) == (50, method, reading.value)
         assert result.fit.weighted == (method == "AZWreg")
         if table2.k:
-            assert table2.adjusted_r2 == pytest.approx(adjusted_r2_of_f(table2.f_statistic, 50, table2.k))
-            assert table2.p_value == pytest.approx(p_of_f(table2.f_statistic, 50, table2.k))
+            explained, freedom = table2.k * table2.f_statistic, 49 - table2.k  # R^2 = kF / (kF + n - k - 1)
+            assert table2.adjusted_r2 == pytest.approx(1.0 - 49.0 / (explained + freedom))
+            assert table2.p_value == pytest.approx(stats.f.sf(table2.f_statistic, table2.k, freedom))
         for row in result.table3:
             assert row.error == pytest.approx(row.predicted - row.actual)
             assert row.relative_error == pytest.approx(abs(row.error) / row.actual)

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.optics.map_fit import MapFitter
-from dm_calibration.optics.regions import ConcentricRegions
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.zernike import TERMS, basis, noll_to_born_wolf
 from studies.benchmarks.sample_maps import CAMERA, Ring, full_aperture, maps, mask_of
 from studies.benchmarks.timing import Effort, medians
+from studies.paper.regions import ConcentricRegions
 
 Floats = NDArray[np.float64]
 Fit = Callable[[Floats], Floats]

@@ -27,7 +27,6 @@ from dm_calibration.influence.weights import (
     region_weights,
     surface_control_error,
 )
-from dm_calibration.optics.regions import region_statistics
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.sample_regions import AREA_FRACTIONS, regional_rms
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
@@ -213,13 +212,14 @@ def _variance(design: Design, maps: MapSet, sag: Floats, chosen: NDArray[np.bool
     influence[:, design.excited] = coefficients[design.drift :].T
     error = surface_control_error(sag[chosen], maps.applied[chosen], influence, maps.points)
     labels = [label for label, used in zip(maps.label, chosen, strict=True) if used]
-    statistics = region_statistics(regional_rms(error, maps.points, labels=labels), labels)
-    if (np.sqrt(statistics.variance) <= CONSTANT * statistics.mean).all():
+    regional = regional_rms(error, maps.points, labels=labels)
+    variance = regional.var(axis=0, ddof=1)
+    if (np.sqrt(variance) <= CONSTANT * regional.mean(axis=0)).all():
         raise ValueError(
             f"the regional errors are the same for all {chosen.sum()} sample surfaces, so Eq. (8) has no variances to "
             "weight by: measure surfaces that differ, or use AZreg"
         )
-    return statistics.variance
+    return np.asarray(variance)
 
 
 def _squares(predicted: Floats, measured: Floats, maps: MapSet, weights: Floats) -> float:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from dm_calibration.optics.aperture import Aperture
-from dm_calibration.optics.regions import ConcentricRegions, figure_5, region_statistics
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import AREA_FRACTIONS, EmptyRegionError, disc_shares, regional_rms
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points, sample_map, uniform_points
+from studies.paper.regions import ConcentricRegions, figure_5, region_statistics
 
 SIZE = 301
 APERTURE = Aperture(150.0, 150.0, 150.0)
@@ -115,3 +115,24 @@ def test_both_panels_of_figure_5() -> None:
     assert (zernikes.mean < 2.0).all() and zernikes.rms.max() == 9.0
     with pytest.raises(ValueError, match="0 surfaces to average"):
         figure_5(rms[:59], labels[:59])
+
+
+def test_rms_inside_each_disc_of_a_rough_map() -> None:
+    aperture = Aperture(40.2, 39.1, 35.0)
+    y, x = np.mgrid[:80, :80]
+    u, v = (x - 40.2) / 35.0, (39.1 - y) / 35.0
+    residual = np.where(u**2 + v**2 <= 1.0, np.random.default_rng(4).standard_normal((80, 80)), np.nan)
+    found = ConcentricRegions((80, 80), aperture).rms(residual)
+    for share, rms in zip(np.arange(1, 11) / 10, found, strict=True):
+        inside = (u**2 + v**2 <= share) & np.isfinite(residual)
+        assert rms == pytest.approx(np.sqrt((residual[inside] ** 2).mean()), rel=1e-9)
+
+
+def test_regions_have_the_stated_share_of_the_area() -> None:
+    aperture = Aperture(149.5, 149.5, 150)
+    step = np.where(aperture.squared_distance((300, 300)) <= 0.3, 1.0, 0.0)
+    found = ConcentricRegions((300, 300), aperture).rms(step)
+    np.testing.assert_allclose(found**2, np.minimum(1, 0.3 / (np.arange(1, 11) / 10)), rtol=2e-3)
+    assert np.isnan(ConcentricRegions((300, 300), aperture).rms(np.full((300, 300), np.nan))).all()
+    with pytest.raises(ValueError, match="must rise within 0 to 1"):
+        ConcentricRegions((3, 3), aperture, [0.5, 0.4])
