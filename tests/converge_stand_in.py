@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,22 +11,18 @@ from dm_msgs.srv import Degauss, Measure, SetSignals
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import doubles
 from dm_common.ros import qos
 from dm_common.ros.parameters import declare
 from dm_controller.converge.converge_action import CONVERGE_PARAMETERS, ConvergeAction
 from dm_controller.converge.loop_bench import BENCH_PARAMETERS, LoopBench
 from dm_controller.converge.recipe_action import RECIPE_PARAMETERS, BuildRecipesAction
-from dm_controller.planning.conversions import target_of
+from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 X, Y = hexagon()
-
-
-@dataclass
-class Decision:
-    target: FocusTarget
 
 
 class Bench:
@@ -103,6 +98,7 @@ def mirror_info() -> MirrorInfo:
     return MirrorInfo(
         actuators=37, actuator_x=doubles(X), actuator_y=doubles(Y), signal_min=-1.0, signal_max=1.0,
         neighbour_a=[int(a) for a, _b in pairs], neighbour_b=[int(b) for _a, b in pairs], neighbour_difference_max=2.0,
+        working_aperture_diameter=2.0 * RADIUS,
     )  # fmt: skip
 
 
@@ -114,14 +110,21 @@ class Host(Node):
         self.refuse = False
         self.calibration: Calibration | None = calibration()
         self.values = declare(self, (*CONVERGE_PARAMETERS, *RECIPE_PARAMETERS, *BENCH_PARAMETERS))
-        bench = LoopBench(self, self.values)
-        self.action = ConvergeAction(self, self.values, bench, self.decide, self.known)
-        self.recipes = BuildRecipesAction(self, self.values, bench, self.decide, self.known)
+        self.reserved: list[str] = []
+        bench = LoopBench(self, self.values, self)
+        ConvergeAction(self, self.values, bench)
+        BuildRecipesAction(self, self.values, bench)
 
-    def known(self) -> tuple[Calibration | None, MirrorInfo]:
-        return self.calibration, mirror_info()
-
-    def decide(self, request: FocusRequest) -> Decision:
+    def target(self, wanted: FocusRequest) -> FocusTarget:
         if self.refuse:
             raise Refusal(ErrorCode.STALE, "header.stamp: the request is 9 s old")
-        return Decision(target_of(request))
+        return FocusTarget(wanted.curvature, wanted.conic_constant, tuple(wanted.zernike))
+
+    def active_calibration(self) -> ActiveCalibration:
+        return active_calibration(self.calibration, mirror_info(), 0.01)
+
+    def hysteresis(self) -> HysteresisState | None:
+        return None
+
+    def reserve(self, text: str) -> None:
+        self.reserved.append(text)

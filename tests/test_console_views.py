@@ -23,7 +23,7 @@ from dm_tools.console.drawing.heat_map import SAG_COLOURS, heat_map
 from dm_tools.console.drawing.hexagons import outlines, sizes
 from dm_tools.console.drawing.svg import nice_ticks
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
-from dm_tools.console.state_observer import Following
+from dm_tools.console.state_observer import StateObserver
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
 from dm_tools.console.widgets.actuators import towards
 from dm_tools.console.widgets.recipes import evenly
@@ -248,7 +248,7 @@ def test_the_change_of_an_effective_signal_is_read_off_two_maps() -> None:
 
 
 def test_following_tells_what_stood_when_a_map_was_taken() -> None:
-    following = Following()
+    following = StateObserver()
     for second, value in ((1, 0.0), (2, 0.5), (3, -0.5)):
         shape = state([value] * COUNT, turns=second)
         shape.header.stamp.sec = second
@@ -262,7 +262,7 @@ def test_following_tells_what_stood_when_a_map_was_taken() -> None:
 def test_a_calibration_that_is_published_again_loses_nothing() -> None:
     message, _ = calibration()
     message.hysteresis.law = "play"
-    following = Following()
+    following = StateObserver()
     following.use(message, 0.0)
     shape = state([0.5] * COUNT, turns=1)
     shape.header.stamp.sec = 1

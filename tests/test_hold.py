@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.limits import Limits
 from dm_controller.creep_hold import PERIOD_S, CreepHold
-from dm_controller.hysteresis_observer import Look
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.target import FocusTarget
@@ -23,28 +23,30 @@ DEFAULTS = {
 
 
 class Shape:
-    """A shape that was set at 0 s and is held since; `look` follows the corrections."""
+    """A shape that was set at 0 s and is held since; `estimate` follows the corrections."""
 
     def __init__(self, values: Mapping[str, Any] = {}, creep_rate: float = 0.01, known: bool = True) -> None:
         law = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.9], [0.1]]), np.zeros(0), 0.0, creep_rate, CREEP_TIMES)
         mirror = CalibratedMirror(
             perfect_model(LinearMirror(*hexagon())), Limits(-1.0, 1.0, make_mirror().limits.pairs, 2.0)
         )
-        self.loop = Planner(mirror, HysteresisFigures(law, np.full(21, 3e-10), 1e-9, 0.05))
+        self.planner = Planner(mirror, HysteresisFigures(law, np.full(21, 3e-10), 1e-9, 0.05))
         self.hold = CreepHold(DEFAULTS | dict(values))
         state = law.demagnetised(37, 0.0)
-        move = self.loop.plan(FocusTarget(0.03), state, 0.0, known, ahead=0.05)
-        self.look = Look(law.move(state, move.plan.signals, 0.0), "" if known else "a test says so")
+        move = self.planner.plan(FocusTarget(0.03), state, 0.0, known, ahead=0.05)
+        self.estimate = ActuatorEstimate(law.move(state, move.plan.signals, 0.0), "" if known else "a test says so")
         self.signals, self.effective = move.plan.signals, move.effective
-        self.hold.begin(self.loop, move.effective, self.signals, 0.0, known)
+        self.hold.begin(self.planner, move.effective, self.signals, 0.0, known)
         self.hold.driver_requested(self.signals, 0.0)
 
     def correct(self, now: float) -> np.ndarray | None:
         """The correction due at `now`, carried out at once."""
-        signals = self.hold.correction(self.look, now)
+        signals = self.hold.correction(self.estimate, now)
         if signals is not None:
-            assert self.look.state is not None
-            self.look = Look(self.loop.law.move(self.look.state, signals, now), self.look.unknown)
+            assert self.estimate.state is not None
+            self.estimate = ActuatorEstimate(
+                self.planner.law.move(self.estimate.state, signals, now), self.estimate.unknown
+            )
             self.hold.sent(signals, now)
             self.hold.driver_requested(signals, now)
         return signals
@@ -56,18 +58,18 @@ def test_corrections_come_ever_more_rarely_and_keep_the_shape() -> None:
     assert times[0] == 1.0
     assert len(times) < 400
     assert times[-1] - times[-2] > 20 * (times[1] - times[0])
-    assert shape.look.state is not None
-    assert shape.loop.drift(shape.look.state, 3600.0, shape.effective) < 4e-10
+    assert shape.estimate.state is not None
+    assert shape.planner.drift(shape.estimate.state, 3600.0, shape.effective) < 4e-10
 
 
 def test_a_shape_is_right_within_its_first_second() -> None:
     shape = Shape({"hold.period": PERIOD_S})
-    left_alone = Shape({"hold.enable": False}).look.state
-    assert left_alone is not None and shape.look.state is not None
+    left_alone = Shape({"hold.enable": False}).estimate.state
+    assert left_alone is not None and shape.estimate.state is not None
     for now in np.arange(PERIOD_S, 1.0, PERIOD_S):
         shape.correct(float(now))
-    assert shape.loop.drift(shape.look.state, 1.0, shape.effective) < 4e-10
-    assert shape.loop.drift(left_alone, 1.0, shape.effective) > 3e-9
+    assert shape.planner.drift(shape.estimate.state, 1.0, shape.effective) < 4e-10
+    assert shape.planner.drift(left_alone, 1.0, shape.effective) > 3e-9
 
 
 def test_a_correction_is_no_larger_than_allowed() -> None:
@@ -84,10 +86,10 @@ def test_less_than_half_a_step_of_the_electronics_is_not_sent() -> None:
 
 def test_no_correction_before_the_driver_has_taken_the_last() -> None:
     shape = Shape()
-    signals = shape.hold.correction(shape.look, 100.0)
+    signals = shape.hold.correction(shape.estimate, 100.0)
     assert signals is not None
     shape.hold.sent(signals, 100.0)
-    assert shape.hold.correction(shape.look, 200.0) is None
+    assert shape.hold.correction(shape.estimate, 200.0) is None
 
 
 def test_the_command_of_another_ends_it() -> None:
@@ -99,7 +101,7 @@ def test_the_command_of_another_ends_it() -> None:
 
 def test_a_command_that_the_driver_never_reports_ends_it() -> None:
     shape = Shape()
-    signals = shape.hold.correction(shape.look, 100.0)
+    signals = shape.hold.correction(shape.estimate, 100.0)
     assert signals is not None
     shape.hold.sent(signals, 100.0)
     shape.hold.driver_requested(shape.signals, 100.5)  # on its way
@@ -110,7 +112,7 @@ def test_a_command_that_the_driver_never_reports_ends_it() -> None:
 
 def test_a_history_that_gets_lost_ends_it() -> None:
     shape = Shape()
-    assert shape.hold.correction(Look(shape.look.state, "the link was lost"), 100.0) is None
+    assert shape.hold.correction(ActuatorEstimate(shape.estimate.state, "the link was lost"), 100.0) is None
     assert not shape.hold.active
 
 
@@ -122,16 +124,16 @@ def test_a_mirror_without_creep_is_not_held() -> None:
     assert not Shape(creep_rate=0.0).hold.active
 
 
-def test_it_is_looked_at_ever_more_rarely() -> None:
+def test_it_is_checked_ever_more_rarely() -> None:
     shape = Shape({"hold.period": PERIOD_S, "hold.tolerance": 1e-6})  # no correction is ever due
-    assert shape.hold.next_look == PERIOD_S
+    assert shape.hold.next_check == PERIOD_S
     for now in (1.0, 10.0, 100.0):
         assert shape.correct(now) is None
-        np.testing.assert_allclose(shape.hold.next_look, 1.1 * now)
+        np.testing.assert_allclose(shape.hold.next_check, 1.1 * now)
     assert shape.correct(50.0) is None  # the clock was set back
-    assert shape.hold.next_look < 56.0
+    assert shape.hold.next_check < 56.0
     shape.hold.end("a test says so")
-    assert shape.hold.next_look == np.inf
+    assert shape.hold.next_check == np.inf
 
 
 def test_a_clock_that_is_set_back_stops_nothing_for_long() -> None:

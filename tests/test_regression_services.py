@@ -6,6 +6,7 @@ from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,8 @@ from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
+from dm_controller.forecast import ForecastClient, hysteresis_share, surface_control_error_rms
 from dm_controller.planning.mirror_model import CalibratedMirror
-from dm_controller.prediction import ForecastClient, hysteresis_share, surface_control_error_rms
 from hysteretic_mirror import MIRROR, calibrated, calibrated_by_pokes
 from linear_mirror import RADIUS
 from studies.comparison.simulated_bench import influence_model
@@ -211,24 +212,30 @@ def test_epsilon_is_a_parameter(node: NodeProcess, observer: Observer, tmp_path:
 def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, observer: Observer) -> None:
     model = influence_model(calibrated()[1], RADIUS)
     mirror = CalibratedMirror(model, Limits(-1.0, 1.0, np.zeros((0, 2), dtype=np.intp), 2.0))
-    changes: list[None] = []
-    client = ForecastClient(observer.node, lambda: changes.append(None))
-    assert client.forecast(0.01, 5e-9) is None
+    active: Any = SimpleNamespace(
+        calibration=SimpleNamespace(id="whole"),
+        planner=SimpleNamespace(hysteresis=None),
+        mirror=mirror,
+        reachable_range=lambda target, tolerance: (-0.02, 0.02),
+    )
+    client = ForecastClient(observer.node)
+    assert client.share is None
     load(observer, "whole")
 
     def ready() -> bool:
-        client.use("whole", mirror, (-0.02, 0.02))
-        return bool(changes)
+        client.use(active, 2e-8)
+        return client.share is not None
 
     wait_until(ready, 60, node.output)
-    forecast = client.forecast(0.015, 5e-9)
-    assert forecast is not None
+    share = client.share
+    assert share is not None
+    forecast = share.forecast(0.015, 5e-9)
     assert 5e-9 <= forecast.lower < forecast.rms < forecast.upper < 1e-6
-    wider = client.forecast(0.015, 50e-9)
-    assert wider is not None and wider.rms == pytest.approx(np.sqrt(forecast.rms**2 - 25e-18 + 2500e-18))
-    assert len(changes) == 1
-    client.use("", None, (float("nan"), float("nan")))
-    assert client.forecast(0.0, 0.0) is None
+    assert share.forecast(0.015, 50e-9).rms == pytest.approx(np.sqrt(forecast.rms**2 - 25e-18 + 2500e-18))
+    client.use(active, 2e-8)
+    assert client.share is share
+    client.use(None, 2e-8)
+    assert client.share is None
 
 
 def test_share_of_the_hysteresis() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.procedure import Progress
-from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move
 from dm_controller.planning.recipes import find

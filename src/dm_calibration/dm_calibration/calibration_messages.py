@@ -16,7 +16,7 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.procedure.applied_history import Report
 from dm_calibration.store.update_storage import Updates
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied
 from dm_common.messages import doubles, recipe_book_message, stamp_ns, time_message
 
 Floats = NDArray[np.float64]

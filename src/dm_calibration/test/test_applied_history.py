@@ -7,7 +7,7 @@ import pytest
 
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError, Report
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied
 
 #: A signal with a backlash of half-width 0.3 that carries half of it.
 LAW = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.5], [0.5]]), np.zeros(0), 0.0, 0.0, np.zeros(0))

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from dm_msgs.msg import ActuatorHysteresis, MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo, ZernikeCoefficients
 from dm_msgs.msg import Recipe as RecipeMsg
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.observer import Applied
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
@@ -101,6 +102,23 @@ def measurement_from(response: Any) -> Measurement:
         camera=(response.info.width, response.info.height),
         centre=(response.info.centre_x, response.info.centre_y),
         radius_px=response.info.aperture_radius_px,
+    )
+
+
+def applied_from(message: ActuatorState) -> Applied:
+    """What the driver reports as applied."""
+    signals = np.array(message.applied, dtype=np.float64)
+    turned_at = np.array(message.turned_at, dtype=np.float64)
+    return Applied(
+        time=1e-9 * stamp_ns(message.header.stamp),
+        signals=signals,
+        turns=message.turns,
+        turned_at=turned_at if turned_at.shape == signals.shape else None,
+        degausses=message.degausses,
+        history_known=message.history_known,
+        moving=message.moving,
+        requested=np.array(message.requested, dtype=np.float64),
+        active=message.driver_state == ActuatorState.STATE_ACTIVE,
     )
 
 

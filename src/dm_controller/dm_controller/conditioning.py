@@ -1,24 +1,18 @@
-"""Conditioning: a degauss by the driver, in a worker thread, and after it the newest of the requests that wait.
+"""A degauss on the way to a shape: which order waits for it, how long it takes, and when it has failed.
 
-A degauss that was begun goes on: a newer request takes the place of the one that waits, a cancelled one leaves the
-mirror at mid range with its history known.
+A degauss that was begun goes on: a newer order takes the place of the one that waits, a cancelled one leaves the mirror
+at mid range with its history known. Steady times, s, are given with each call.
 """
 
 from __future__ import annotations
 
 import math
-import threading
-import time
-from collections.abc import Callable, Mapping
-from typing import Any
-
-from dm_msgs.msg import FocusRequest, FocusState
-from dm_msgs.srv import Degauss
-from rclpy.node import Node
+from dataclasses import dataclass
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.worker import ServiceCallError, call
-from dm_controller.driver_watch import DriverWatch
+from dm_controller.driver_monitor import DriverMonitor
+from dm_controller.focus_types import Order
+from dm_controller.planning.active_calibration import ActiveCalibration
 
 #: Half-swings that the driver does when it is not told how many, as far as can be known from here.
 STEPS_ASSUMED = 100
@@ -26,70 +20,50 @@ STEPS_ASSUMED = 100
 REPORT_S = 2.0
 
 
-class Waiting:
-    """A request that waits for the end of a degauss.
+@dataclass
+class _Run:
+    """A degauss under way.
 
     Attributes:
-        request: what is to be carried out.
-        state: what became of it; None until then.
+        number: of the run.
+        steps: half-swings; 0 = as configured in the driver.
+        began: s.
+        degausses, starts: of the driver, before it.
+        answered: s, when the driver said that it is done; None = not yet.
     """
 
-    def __init__(self, request: FocusRequest) -> None:
-        self.request = request
-        self.state: FocusState | None = None
-        self._done = threading.Event()
+    number: int
+    steps: int
+    began: float
+    degausses: int
+    starts: int
+    answered: float | None = None
+
+
+class Conditioning:
+    """At most one degauss at a time, and the order that waits for its end.
+
+    Attributes:
+        order: that waits; None = none does.
+    """
+
+    def __init__(self) -> None:
+        self.order: Order | None = None
+        self._run: _Run | None = None
+        self._number = 0
+        self._learnt: dict[int, float] = {}
 
     @property
-    def done(self) -> bool:
-        return self._done.is_set()
+    def busy(self) -> bool:
+        """Whether a degauss is under way."""
+        return self._run is not None
 
-    def finish(self, state: FocusState) -> None:
-        """Tell what became of it; only the first call counts."""
-        if not self.done:
-            self.state = state
-            self._done.set()
+    @property
+    def steps(self) -> int:
+        """Half-swings of the degauss under way; 0 = as configured in the driver."""
+        return self._run.steps if self._run is not None else 0
 
-
-class Conditioner:
-    """Degausses through the service of the driver.
-
-    Args:
-        node: hosts the client.
-        values: parameter `condition.timeout`.
-        turn: held while a request is judged and carried out, so that none comes between; `submit` needs it.
-        carry_out: executes a request right after a degauss of `steps` half-swings; called in the worker thread.
-        refuse: makes, and publishes, the state of a request that could not be conditioned for.
-        degausses: the driver's count, as far as it has been followed.
-        driver: tells when a driver that degausses is no longer there.
-        on_learnt: called when the time that a degauss takes has been measured.
-
-    Attributes:
-        busy: a degauss of this node is under way.
-        steps: half-swings of it; 0 = as configured in the driver.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        values: Mapping[str, Any],
-        turn: threading.RLock,
-        carry_out: Callable[[FocusRequest, int], FocusState],
-        refuse: Callable[[FocusRequest, Refusal], FocusState],
-        degausses: Callable[[], int],
-        driver: DriverWatch,
-        on_learnt: Callable[[], None],
-    ) -> None:
-        self._driver = driver
-        self._values, self._turn = values, turn
-        self._carry_out, self._refuse, self._degausses, self._on_learnt = carry_out, refuse, degausses, on_learnt
-        self._client = node.create_client(Degauss, "degauss")
-        self._waiting: Waiting | None = None
-        self.busy = False
-        self._begun = 0.0
-        self._learnt: dict[int, float] = {}
-        self.steps = 0
-
-    def duration(self, steps: int, slew_rate: float, span: float) -> float:
+    def duration(self, steps: int, active: ActiveCalibration) -> float:
         """Time in s that a degauss of `steps` half-swings (0 = as the driver does) takes; 0 = not known.
 
         As the last one took; before the first from the way, which is half the span per half-swing, and the slew rate.
@@ -99,81 +73,74 @@ class Conditioner:
         for known, seconds in self._learnt.items():
             if known and steps:
                 return seconds * steps / known
-        if not math.isfinite(slew_rate):
+        if not math.isfinite(active.slew_rate):
             return 0.0
-        return (0.5 * span * (steps or STEPS_ASSUMED) + span) / slew_rate
+        return (0.5 * active.span * (steps or STEPS_ASSUMED) + active.span) / active.slew_rate
 
-    def remaining(self, slew_rate: float, span: float) -> float:
-        """Time in s until the degauss under way should end."""
-        return max(0.0, self.duration(self.steps, slew_rate, span) - (time.monotonic() - self._begun))
+    def prospect(self, active: ActiveCalibration, configured: int, now: float) -> tuple[int, bool, float]:
+        """Half-swings of the next degauss to end, whether it has begun, and s until it ends if it has."""
+        run = self._run
+        if run is None:
+            return active.degauss_steps(configured), False, 0.0
+        return run.steps, True, max(0.0, self.duration(run.steps, active) - (now - run.began))
 
-    def check_service(self) -> None:
-        """Raise Refusal when there is no driver that could degauss."""
-        if not self._client.service_is_ready():
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "service degauss: pdm_driver does not offer it (yet)")
+    def begin(self, steps: int, monitor: DriverMonitor, now: float) -> int:
+        """A degauss begins; returns the number of the run."""
+        self._number += 1
+        report = monitor.latest
+        degausses = report.applied.degausses if report is not None else 0
+        self._run = _Run(self._number, steps, now, degausses, monitor.starts)
+        return self._number
 
-    def submit(self, request: FocusRequest, steps: int) -> Waiting:
-        """Carry out `request` after a degauss of `steps`, or after the one under way; the newest request wins."""
-        waiting = Waiting(request)
-        with self._turn:
-            old, self._waiting = self._waiting, waiting
-            begin, self.busy = not self.busy, True
-            if begin:
-                self.steps, self._begun = steps, time.monotonic()
-            if old is not None:
-                self._preempt(old)
-        if begin:
-            threading.Thread(target=self._work, args=(steps,), daemon=True).start()
-        return waiting
+    def wait(self, order: Order) -> Order | None:
+        """Let `order` wait; returns the one whose place it takes."""
+        before, self.order = self.order, order
+        order.pending = True
+        return before
 
-    def drop(self, waiting: Waiting) -> bool:
-        """Do not carry out `waiting` after all; the degauss under way goes on. False = it is too late for that."""
-        with self._turn:
-            dropped = self._waiting is waiting
-            if dropped:
-                self._waiting = None
-            return dropped
+    def withdraw(self, order: Order) -> bool:
+        """Do not carry out `order` after all; False = it does not wait (any more)."""
+        waits = self.order is order
+        if waits:
+            self.order, order.pending = None, False
+        return waits
 
-    def _preempt(self, old: Waiting) -> None:
-        refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
-        old.finish(self._refuse(old.request, refusal))
+    def answered(self, number: int, duration: float, now: float) -> None:
+        """The driver has answered run `number`, which took `duration` s, as done."""
+        run = self._run
+        if run is not None and run.number == number:
+            run.answered = now
+            self._learnt[run.steps] = duration
 
-    def _work(self, steps: int) -> None:
-        refusal: Refusal | None = None
-        try:
-            self._degauss(steps)
-        except Refusal as error:
-            refusal = error
-        except Exception as error:  # a defect must not leave the node waiting for ever
-            refusal = Refusal(ErrorCode.INTERNAL, f"{type(error).__name__}: {error}")
-        with self._turn:
-            waiting, self._waiting, self.busy = self._waiting, None, False
-            if waiting is None:
-                return
-            if refusal is not None:
-                waiting.finish(self._refuse(waiting.request, refusal))
-            else:
-                waiting.finish(self._carry_out(waiting.request, steps))
+    def reported(self, monitor: DriverMonitor) -> bool:
+        """Whether the driver has answered and reported the degauss as complete."""
+        run, report = self._run, monitor.latest
+        if run is None or run.answered is None or report is None:
+            return False
+        return report.applied.degausses > run.degausses
 
-    def _degauss(self, steps: int) -> None:
-        before, starts = self._degausses(), self._driver.starts
+    def failure(self, monitor: DriverMonitor, timeout: float, now: float) -> Refusal | None:
+        """The reason why the degauss under way will not end as it should; None = it may."""
+        run = self._run
+        if run is None:
+            return None
+        if run.answered is not None:
+            if now - run.answered <= REPORT_S:
+                return None
+            return Refusal(ErrorCode.TIMEOUT, "conditioning: the driver did not report the degauss as complete")
+        # A driver that is killed or stopped never answers; its successor knows nothing of the degauss.
+        gone = "pdm_driver was restarted" if monitor.starts != run.starts else monitor.stopped(now)
+        if not gone and now - run.began > timeout:
+            gone = f"degauss: no answer within {timeout:g} s"
+        return Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {gone}") if gone else None
 
-        def gone() -> str:
-            return "pdm_driver was restarted" if self._driver.starts != starts else self._driver.stopped
+    def is_run(self, number: int) -> bool:
+        """Whether run `number` is under way."""
+        return self._run is not None and self._run.number == number
 
-        try:
-            # A driver that is killed or stopped never answers; its successor knows nothing of the degauss.
-            response = call(
-                self._client, Degauss.Request(steps=steps), self._values["condition.timeout"], lambda: bool(gone())
-            )
-        except ServiceCallError as error:
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {gone() or error}") from error
-        if response.error_code != ErrorCode.OK:
-            raise Refusal(response.error_code, f"conditioning: {response.message}")
-        self._learnt[steps] = response.duration
-        self._on_learnt()
-        deadline = time.monotonic() + REPORT_S
-        while self._degausses() <= before:
-            if time.monotonic() > deadline:
-                raise Refusal(ErrorCode.TIMEOUT, "conditioning: the driver did not report the degauss as complete")
-            time.sleep(0.002)
+    def end(self) -> Order | None:
+        """The degauss has ended; returns the order that waited for it."""
+        order, self.order, self._run = self.order, None, None
+        if order is not None:
+            order.pending = False
+        return order

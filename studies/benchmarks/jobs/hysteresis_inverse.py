@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.prepared_inverse import PreparedInverse
 from dm_common.limits import Limits
+from dm_controller.planning.fast_path import PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import SETTLE_S, Planner
 from dm_controller.planning.target import FocusTarget

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.tracker import Applied, HysteresisTracker
+from dm_common.hysteresis.observer import Applied, HysteresisTracker
 
 Floats = NDArray[np.float64]
 

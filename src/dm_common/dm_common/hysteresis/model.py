@@ -115,6 +115,10 @@ class HysteresisModel:
         """Whether the effective signal depends on anything but the signal."""
         return len(self.play_radius) > 1 or bool(self.duhem_slope.size) or self.creep_rate > 0.0
 
+    def same_as(self, other: HysteresisModel) -> bool:
+        """Whether two laws are the same, number for number."""
+        return all(np.array_equal(getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+
     @cached_property
     def _duhem(self) -> DuhemOperator | None:
         return DuhemOperator(self.duhem_slope) if self.duhem_slope.size else None

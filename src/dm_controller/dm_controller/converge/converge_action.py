@@ -13,18 +13,15 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import Converge
-from dm_msgs.msg import Calibration, MirrorInfo
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
-from dm_common.messages import doubles, limits_from
+from dm_common.messages import doubles
 from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
-from dm_controller.planning.conversions import model_of
-from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import MirrorFacts, make_solver
 
@@ -53,6 +50,9 @@ CONVERGE_PARAMETERS = (
     ),
 )
 
+#: What requests are told meanwhile.
+BUSY = "a closed loop (action converge) is running"
+
 
 class ConvergeAction:
     """Serves `converge`, one goal at a time; a newer goal is refused while one runs.
@@ -60,27 +60,12 @@ class ConvergeAction:
     Args:
         node: the hosting node.
         values: its parameters, CONVERGE_PARAMETERS among them.
-        bench: shared with `build_recipes`.
-        decide: judges a FocusRequest; returns an object with the `target` and raises an exception with an `error_code`
-            when the request cannot be carried out at all (no calibration, a stale request, no such surface).
-        known: the calibration and the mirror in use.
+        bench: shared with `build_recipes`; its host judges requests and knows the calibration in use.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        values: Mapping[str, Any],
-        bench: LoopBench,
-        decide: Callable[[Any], Any],
-        known: Callable[[], tuple[Calibration | None, MirrorInfo | None]],
-    ) -> None:
-        self._node, self._values, self._bench, self._decide, self._known = node, values, bench, decide, known
-        self._server = WorkerActionServer(node, Converge, "converge", self._run)
-
-    @property
-    def busy(self) -> bool:
-        """Whether a loop is running: other commands would disturb it."""
-        return self._server.busy
+    def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench) -> None:
+        self._node, self._values, self._bench = node, values, bench
+        WorkerActionServer(node, Converge, "converge", self._run)
 
     def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
         steps: list[LoopStep] = []
@@ -92,7 +77,7 @@ class ConvergeAction:
             )
 
         try:
-            with self._bench.reserved(lambda: bool(handle.is_cancel_requested)):
+            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested)):
                 outcome, error_code, message = self._judge(self._loop(handle.request, report))
         except Exception as error:
             outcome, error_code, message = ending(error)
@@ -108,7 +93,7 @@ class ConvergeAction:
     def _loop(self, goal: Any, report: Callable[[LoopStep], None]) -> LoopResult:
         bench = self._bench
         options = self._options(goal)
-        target: FocusTarget = self._decide(goal.request).target
+        target = bench.host.target(goal.request)
         solver = self._solver(goal.method)
         bench.check_ready()
         state = bench.state
@@ -134,15 +119,10 @@ class ConvergeAction:
         )
 
     def _solver(self, method: str) -> Solver:
-        calibration, mirror = self._known()
-        if calibration is None or mirror is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
-        facts = MirrorFacts(
-            np.asarray(mirror.actuator_x, dtype=float),
-            np.asarray(mirror.actuator_y, dtype=float),
-            np.asarray(calibration.region_weights, dtype=float) if len(calibration.region_weights) else None,
-        )
-        return make_solver(method, model_of(calibration), limits_from(mirror), facts)
+        active = self._bench.host.active_calibration()
+        weights = active.calibration.region_weights
+        facts = MirrorFacts(region_weights=np.asarray(weights, dtype=float) if len(weights) else None)
+        return make_solver(method, active.mirror.model, active.mirror.limits, facts)
 
     def _judge(self, outcome: LoopResult) -> tuple[str, int, str]:
         best = outcome.best

@@ -6,15 +6,19 @@ import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
+from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import Degauss
 from rclpy.node import Node
 
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, MeasurementError, Refusal, error_code
+from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Measurement
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.parameters import Parameter
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.target import FocusTarget
 
 #: Parameters that the hosting node declares beside those of the two actions.
 BENCH_PARAMETERS = (
@@ -30,23 +34,45 @@ BENCH_PARAMETERS = (
 MAPS_MAX = 100
 
 
+class LoopHost(Protocol):
+    """What the hosting node offers; every method may be called from any thread."""
+
+    def target(self, request: FocusRequest) -> FocusTarget:
+        """The target of a request that could be carried out; else raises Refusal."""
+
+    def active_calibration(self) -> ActiveCalibration:
+        """The calibration in use; raises Refusal when there is none."""
+
+    def hysteresis(self) -> HysteresisState | None:
+        """What is known of the actuators; None = nothing."""
+
+    def reserve(self, text: str) -> None:
+        """Refuse requests from now on, with this sentence as the reason; "" = serve them again."""
+
+
 class LoopBench(BenchServices):
     """Driver and interferometer, for one goal of either action at a time.
 
     Args:
         node: the hosting node.
         values: its parameters, BENCH_PARAMETERS among them.
+
+    Attributes:
+        host: what the node knows and can do.
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
+    def __init__(self, node: Node, values: Mapping[str, Any], host: LoopHost) -> None:
         own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
         super().__init__(node, own | {"degauss_timeout": values["recipes.degauss_timeout"]})
-        self._parameters = values
+        self.host, self._parameters = host, values
         self._goal = threading.Lock()
 
     @contextmanager
-    def reserved(self, cancelled: Callable[[], bool]) -> Iterator[None]:
+    def reserved(self, text: str, cancelled: Callable[[], bool]) -> Iterator[None]:
         """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
+
+        Args:
+            text: what the host says to requests meanwhile.
 
         Raises:
             Refusal: another goal has it.
@@ -55,8 +81,10 @@ class LoopBench(BenchServices):
             raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
         try:
             self.cancelled = cancelled
+            self.host.reserve(text)
             yield
         finally:
+            self.host.reserve("")
             self._goal.release()
 
     def degauss(self) -> None:

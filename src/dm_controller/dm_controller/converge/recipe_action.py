@@ -7,28 +7,25 @@ The mirror goes back to mid range.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from dm_msgs.action import BuildRecipes
-from dm_msgs.msg import Calibration, FocusRequest, MirrorInfo
 from dm_msgs.srv import StoreRecipes
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.tracker import Applied, HysteresisTracker
-from dm_common.messages import limits_from, recipe_book_message
+from dm_common.hysteresis.observer import Applied, HysteresisTracker
+from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeError
 from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import ServiceCallError, WorkerActionServer, call, wait_for_clock
 from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
-from dm_controller.planning.conversions import hysteresis_figures_of, model_of
-from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget, TargetError
 
@@ -50,6 +47,8 @@ RECIPE_PARAMETERS = (
 
 #: A model that leaves a larger coefficient error of a curvature, m, cannot reach it.
 UNREACHABLE_ERROR = 2e-8
+#: What requests are told meanwhile.
+BUSY = "recipes are being built (action build_recipes)"
 #: Longest wait for the calibration node to store recipes, s.
 STORE_TIMEOUT_S = 30.0
 
@@ -60,35 +59,17 @@ class BuildRecipesAction:
     Args:
         node: the hosting node.
         values: its parameters, RECIPE_PARAMETERS and BENCH_PARAMETERS among them.
-        bench: shared with `converge`.
-        decide: judges a FocusRequest; returns an object with the `target` and raises an exception with an `error_code`
-            when the request cannot be carried out at all (no calibration, no such surface).
-        known: calibration and mirror in use.
-        state: what the host knows of the actuators' hysteresis; None = nothing.
+        bench: shared with `converge`; its host knows the calibration in use and the actuators' hysteresis.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        values: Mapping[str, Any],
-        bench: LoopBench,
-        decide: Callable[[Any], Any],
-        known: Callable[[], tuple[Calibration | None, MirrorInfo | None]],
-        state: Callable[[], HysteresisState | None] = lambda: None,
-    ) -> None:
+    def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench) -> None:
         self._node, self._values, self._bench = node, values, bench
-        self._decide, self._known, self._state = decide, known, state
         self._store = node.create_client(StoreRecipes, "store_recipes")
-        self._server = WorkerActionServer(node, BuildRecipes, "build_recipes", self._run)
-
-    @property
-    def busy(self) -> bool:
-        """Whether recipes are being built: other commands would disturb it."""
-        return self._server.busy
+        WorkerActionServer(node, BuildRecipes, "build_recipes", self._run)
 
     def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
         try:
-            with self._bench.reserved(lambda: bool(handle.is_cancel_requested)):
+            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested)):
                 outcome, result = self._build_and_store(handle)
         except Exception as error:
             outcome, error_code, message = ending(error)
@@ -110,16 +91,10 @@ class BuildRecipesAction:
         """
         goal, bench = handle.request, self._bench
         options = self._options(goal)
-        target: FocusTarget = self._decide(FocusRequest(conic_constant=goal.conic_constant)).target
-        calibration, mirror = self._known()
-        if calibration is None or mirror is None:
-            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration: run `./dm calibrate` or load_calibration")
-        loop = Planner(
-            CalibratedMirror(model_of(calibration), limits_from(mirror)),
-            hysteresis_figures_of(calibration),
-            mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf,
-        )
-        targets = self._targets(goal, target, loop)
+        target = FocusTarget(0.0, goal.conic_constant)
+        active = bench.host.active_calibration()
+        planner, calibration = active.planner, active.calibration
+        targets = self._targets(goal, target, planner)
         bench.check_ready()
         clock = self._node.get_clock()
         wait_for_clock(clock)
@@ -136,21 +111,21 @@ class BuildRecipesAction:
             )
 
         builder = RecipeBuilder(
-            loop,
+            planner,
             bench,
             now,
             options,
-            state=self._state() or self._guess(loop.law, now()),
+            state=bench.host.hysteresis() or self._guess(planner.law, now()),
             on_step=report,
             cancelled=bench.cancelled,
         )
         recipes, code, text = self._build(builder, targets)
         result = BuildRecipes.Result(maps=builder.maps, residual_rms=math.nan, max_zernike=math.nan)
-        rest = bench.rest(np.full(calibration.actuators, 0.5 * (mirror.signal_min + mirror.signal_max)))
+        rest = bench.rest(np.full(calibration.actuators, active.middle))
         if recipes:
             result.residual_rms = max(recipe.rms for recipe in recipes)
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
-            book = recipe_book(recipes, loop, self._values["recipes.degauss_steps"], clock.now().nanoseconds)
+            book = recipe_book(recipes, planner, self._values["recipes.degauss_steps"], clock.now().nanoseconds)
             result.interpolation_error = book.interpolation_error
             stored, reason = self._stored(
                 StoreRecipes.Request(calibration_id=calibration.id, recipes=recipe_book_message(book))
@@ -202,11 +177,11 @@ class BuildRecipesAction:
         tolerance = goal.tolerance or values["recipes.tolerance"]
         return BuildOptions(tolerance, maps, average, float(values["converge.settle_time"]))
 
-    def _targets(self, goal: Any, target: FocusTarget, loop: Planner) -> list[FocusTarget]:
+    def _targets(self, goal: Any, target: FocusTarget, planner: Planner) -> list[FocusTarget]:
         if not goal.curvatures:
             raise ValueError("curvatures: empty; name at least one, 1/m")
         try:
-            return recipe_targets(list(goal.curvatures), target.conic_constant, loop, UNREACHABLE_ERROR)
+            return recipe_targets(list(goal.curvatures), target.conic_constant, planner, UNREACHABLE_ERROR)
         except UnreachableError as error:
             raise Refusal(ErrorCode.UNREACHABLE, str(error)) from error
         except (RecipeError, TargetError) as error:

@@ -29,7 +29,7 @@ class ActiveCalibration:
         calibration: as received.
         mirror: its influence function inside the limits.
         certain: the same inside what is within reach whatever the actuators remember.
-        loop: plans moves.
+        planner: of its moves.
         recipes: may be empty.
         middle: signal of mid range, where a degauss ends.
         slew_rate: 1/s, of the signals; infinite = not limited.
@@ -39,7 +39,7 @@ class ActiveCalibration:
     calibration: Calibration
     mirror: CalibratedMirror
     certain: CalibratedMirror
-    loop: Planner
+    planner: Planner
     recipes: RecipeBook
     middle: float
     slew_rate: float
@@ -48,6 +48,10 @@ class ActiveCalibration:
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
         """See :meth:`CalibratedMirror.reachable_range`; within reach from any history."""
         return self.certain.reachable_range(target, tolerance)
+
+    def degauss_steps(self, configured: int) -> int:
+        """Half-swings of the degauss that conditions: as `configured`, else as for the recipes; 0 = the driver's."""
+        return configured or (self.recipes.degauss_steps if self.recipes.recipes else 0)
 
     @property
     def conditioned_error(self) -> float:
@@ -59,14 +63,14 @@ class ActiveCalibration:
 
     def error_bound(self, history_known: bool) -> float:
         """m, 95 % bound of the largest coefficient error of a direct move."""
-        hysteresis = self.loop.hysteresis
+        hysteresis = self.planner.hysteresis
         if hysteresis is None:
             return float(self.calibration.held_out_max_zernike)
-        unknown = 0.0 if history_known else self.loop.unknown_max_zernike
+        unknown = 0.0 if history_known else self.planner.unknown_max_zernike
         return math.hypot(hysteresis.held_out_max_zernike, unknown)
 
     def stale(self, now_ns: int, age_max_s: float) -> str:
-        """Why the calibration should be renewed, in words; "" = it is fresh, or of unknown age."""
+        """The reason why the calibration should be renewed; "" = it is fresh, or of unknown age."""
         seen = stamp_ns(self.calibration.checked) or stamp_ns(self.calibration.header.stamp)
         age = 1e-9 * (now_ns - seen)
         if not age_max_s or not seen or age <= age_max_s:
@@ -107,10 +111,10 @@ def active_calibration(
         recipes = recipe_book_from(calibration.recipes)
         if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
-        loop = Planner(calibrated, hysteresis_figures_of(calibration), slew_rate)
+        planner = Planner(calibrated, hysteresis_figures_of(calibration), slew_rate)
         certain = calibrated
-        if loop.law.remembers:
-            reach = certain_reach(loop.law, limits.low, limits.high)
+        if planner.law.remembers:
+            reach = certain_reach(planner.law, limits.low, limits.high)
             share = (reach[1] - reach[0]) / (limits.high - limits.low)
             certain = CalibratedMirror(
                 calibrated.model,
@@ -124,4 +128,5 @@ def active_calibration(
     except (ValueError, np.linalg.LinAlgError) as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
     low, high = mirror.signal_min, mirror.signal_max
-    return ActiveCalibration(calibration, calibrated, certain, loop, recipes, 0.5 * (low + high), slew_rate, high - low)
+    middle = 0.5 * (low + high)
+    return ActiveCalibration(calibration, calibrated, certain, planner, recipes, middle, slew_rate, high - low)

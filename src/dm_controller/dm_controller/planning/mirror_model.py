@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
-from dm_controller.planning.closed_form import ClosedForm
+from dm_controller.planning.fast_path import ClosedForm
 from dm_controller.planning.target import FocusTarget
 
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
@@ -85,18 +83,6 @@ class Plan:
     saturated: NDArray[np.bool_]
 
 
-class Commanded(NamedTuple):
-    """A command and the largest coefficient error that it leaves, m; `judged()` works out the rest.
-
-    Attributes:
-        signals: (N,).
-    """
-
-    signals: NDArray[np.float64]
-    max_zernike: float
-    judged: Callable[[], Plan]
-
-
 def rms_bounds(rms: float, spread: float) -> tuple[float, float]:
     """95 % interval of an rms, m, when an independent error with the rms `spread` (m) comes on top, in squares."""
     reach = (1.96 * spread) ** 2
@@ -153,7 +139,7 @@ class CalibratedMirror:
             model.zernike_offset,
             model.sag_offset,
             lambda coefficients, sag: self._programme.unlimited(self.rows(coefficients, sag)),
-            self._errors,
+            self._coefficient_errors,
         )
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
@@ -190,23 +176,24 @@ class CalibratedMirror:
         Raises:
             TargetError: no such surface exists over the aperture.
         """
-        return self.command(target).judged()
+        return self.predict(target, self.command(target)[0])
 
-    def command(self, target: FocusTarget) -> Commanded:
-        """Find the command for `target`, and leave the rest of its prediction for later.
+    def command(self, target: FocusTarget) -> tuple[NDArray[np.float64], float]:
+        """The command (N,) for `target`, and the largest coefficient error that it leaves, m.
 
         Raises:
             TargetError: no such surface exists over the aperture.
         """
         found = self._closed_form.find(target)
-        if found is not None and self.limits.allow(found.signals):
-            signals, largest, remaining = found
-            return Commanded(
-                signals, largest, lambda: self._plan(signals, math.sqrt(float(remaining @ remaining)), largest)
-            )
+        if found is not None and self.limits.allow(found[0]):
+            return found
+        return self.solve_target(target)
+
+    def solve_target(self, target: FocusTarget) -> tuple[NDArray[np.float64], float]:
+        """As :meth:`command`, by the bounded programme on the exact sag of `target`."""
         coefficients, sag = self._wanted(target)
-        plan = self._judged(self.solve(self.rows(coefficients, sag)), coefficients, sag)
-        return Commanded(plan.signals, plan.max_zernike, lambda: plan)
+        signals = self.solve(self.rows(coefficients, sag))
+        return signals, float(np.abs(self._coefficient_errors(signals, coefficients)).max())
 
     def predict(self, target: FocusTarget, signals: NDArray[np.float64]) -> Plan:
         """What `signals` (N,) are expected to do when `target` is wanted.
@@ -214,7 +201,20 @@ class CalibratedMirror:
         Raises:
             TargetError: no such surface exists over the aperture.
         """
-        return self._judged(signals, *self._wanted(target))
+        model = self.model
+        coefficients, sag = self._wanted(target)
+        rms = float(np.linalg.norm(self._reduce(model.influence_sag @ signals - sag, self._tilt_free)))
+        largest = float(np.abs(self._coefficient_errors(signals, coefficients)).max())
+        lower, upper = rms_bounds(rms, model.held_out_rms)
+        return Plan(
+            signals=signals,
+            rms=rms,
+            rms_lower=lower,
+            rms_upper=upper,
+            max_zernike=largest,
+            max_zernike_upper=largest + model.held_out_max_zernike,
+            saturated=self.limits.at_limit(signals),
+        )
 
     def _wanted(self, target: FocusTarget) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Coefficients (K,) and sag (P,) of `target` less those at zero signals, m."""
@@ -222,31 +222,12 @@ class CalibratedMirror:
         coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
         return coefficients, target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
 
-    def _judged(
-        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64], sag: NDArray[np.float64]
-    ) -> Plan:
-        zernike_error, sag_error = self._errors(signals, coefficients, sag)
-        return self._plan(signals, float(np.linalg.norm(sag_error)), float(np.abs(zernike_error).max()))
-
-    def _errors(
-        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64], sag: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Coefficient errors beyond tilt (K - 3,) and weighted sag errors (P,), piston and tilt removed, or columns."""
-        model = self.model
-        zernike_error = model.influence_zernike[PISTON_TILT:] @ signals - coefficients[PISTON_TILT:]
-        return zernike_error, self._reduce(model.influence_sag @ signals - sag, self._tilt_free)
-
-    def _plan(self, signals: NDArray[np.float64], rms: float, largest: float) -> Plan:
-        lower, upper = rms_bounds(rms, self.model.held_out_rms)
-        return Plan(
-            signals=signals,
-            rms=rms,
-            rms_lower=lower,
-            rms_upper=upper,
-            max_zernike=largest,
-            max_zernike_upper=largest + self.model.held_out_max_zernike,
-            saturated=self.limits.at_limit(signals),
-        )
+    def _coefficient_errors(
+        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Coefficient errors beyond tilt, m: (K - 3,) of signals (N,), or columns of each."""
+        errors: NDArray[np.float64] = self.model.influence_zernike[PISTON_TILT:] @ signals - coefficients[PISTON_TILT:]
+        return errors
 
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
         """Smallest and largest curvature [1/m] with the target's conic constant and added terms that the limits permit.
@@ -257,7 +238,7 @@ class CalibratedMirror:
         return self._range_cached(target.with_curvature(0.0), tolerance)
 
     def _find_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
-        if self.plan(target).max_zernike > tolerance:
+        if self.command(target)[1] > tolerance:
             return (float("nan"), float("nan"))
         # Beyond this the stroke of all actuators together could not follow (defocus of a sphere is c r^2 / 4).
         defocus_stroke = float(np.abs(self.model.influence_zernike[3]).sum())
@@ -269,7 +250,7 @@ class CalibratedMirror:
         near = 0.0
         while abs(far - near) > 1e-5:
             middle = 0.5 * (near + far)
-            if self.plan(target.with_curvature(middle)).max_zernike <= tolerance:
+            if self.command(target.with_curvature(middle))[1] <= tolerance:
                 near = middle
             else:
                 far = middle

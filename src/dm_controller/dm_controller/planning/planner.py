@@ -1,7 +1,7 @@
-"""Open loop that remembers: from a target and the state of the actuators to a command, with what it is expected to do.
+"""From a target and the state of the actuators to a command, with what it is expected to do.
 
 The influence function acts on effective signals; the bounded programme finds those of the target, the inverse of the
-memory law the command that brings them about from where the mirror stands. Holding the shape is the same inversion
+hysteresis model the signals that bring them about from where the mirror stands. Holding the shape is the same inversion
 again, a little later: creep has changed what the same signals do.
 """
 
@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from dm_msgs.msg import FocusRequest
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.prepared_inverse import PreparedInverse
-from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT
+from dm_controller.planning.fast_path import PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
 
@@ -34,13 +34,15 @@ DRAWS = 4000
 YOUNGEST_MAP_S = 1.0
 #: Uncertainty of that extrapolation.
 YOUNG_SHARE = 0.1
-#: Part of the expected error beyond which effective signals that a limit denies count, normalised.
+#: Effective signals that a limit denies count from here on, normalised.
 MISSED_MAX = 1e-6
+#: A message's constants are properties of its class, which take longer to look up.
+_DIRECT = FocusRequest.MODE_DIRECT
 
 
 @dataclass(frozen=True, eq=False)
 class HysteresisFigures:
-    """What a calibration says of its memory law; fields as in dm_msgs/ActuatorHysteresis."""
+    """What a calibration says of its hysteresis model; fields as in dm_msgs/ActuatorHysteresis."""
 
     law: HysteresisModel
     zernike_sigma: Floats
@@ -53,17 +55,25 @@ class Move:
     """A planned move.
 
     Attributes:
+        target: the wanted surface.
         signals: (N,) what the electronics get.
         effective: (N,) effective signals aimed at: what holding the shape means.
-        duration: s that the way takes at the slew rate.
         max_zernike: m, expected largest coefficient error.
+        known: whether the state that it begins from can be trusted.
+        duration: s until the shape is right.
+        mode: FocusRequest.MODE_DIRECT or MODE_CONDITIONED.
+        degauss: half-swings of the degauss to begin with, 0 = as the driver does; None = go at once.
     """
 
+    target: FocusTarget
     signals: Floats
     effective: Floats
-    duration: float
     max_zernike: float
+    known: bool
+    duration: float
     _predict: Callable[[], Plan]
+    mode: int = _DIRECT
+    degauss: int | None = None
 
     @cached_property
     def plan(self) -> Plan:
@@ -76,7 +86,7 @@ class Planner:
 
     Args:
         mirror: its influence function acts on effective signals.
-        memory: None = the mirror's memory is not identified: effective signals are signals.
+        hysteresis: None = it is not identified: effective signals are signals.
         slew_rate: of the signals, 1/s; infinite = moves take no time.
     """
 
@@ -117,12 +127,11 @@ class Planner:
         Raises:
             TargetError: no such surface exists over the aperture.
         """
-        limits = self.mirror.limits
+        mirror, law = self.mirror, self.law
         if effective is None:
-            aim, largest, judged = self.mirror.command(target)
+            aim, largest = mirror.command(target)
         else:
-            given = self.mirror.predict(target, effective)
-            aim, largest, judged = effective, given.max_zernike, lambda: given
+            aim, largest = effective, mirror.predict(target, effective).max_zernike
         if error is not None:
             largest = min(largest, error)
         travel = 0.0
@@ -130,29 +139,32 @@ class Planner:
             travel = float(np.maximum.reduce(np.abs(aim - state.signals))) / self.slew_rate
         if self.hysteresis is None:
 
-            def predict_at_once() -> Plan:
-                plan = judged()
+            def predict_linear() -> Plan:
+                plan = mirror.predict(target, aim)
                 return plan if error is None else replace(plan, max_zernike=largest, max_zernike_upper=error)
 
-            return Move(aim, aim, travel, largest, predict_at_once)
+            return Move(target, aim, aim, largest, known, travel + ahead, predict_linear)
         if state is None:
-            state, known = self.law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
+            limits = mirror.limits
+            state, known = law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
         # A move counts from its last write; older creep goes on during the way.
         begun, arrival = state, time + travel
         signals, missed = self._inverted(begun, arrival, aim, ahead)
-        if missed is not None and np.abs(missed).max() > MISSED_MAX and effective is None:
-            short = self.mirror.predict(target, aim - missed)
-            largest, judged = short.max_zernike, lambda: short
+        reached = aim
+        if missed is not None and np.abs(missed).max() > MISSED_MAX:
+            reached = aim - missed
+            if effective is None:
+                largest = mirror.predict(target, reached).max_zernike
 
         def predict() -> Plan:
-            plan = judged()
+            plan = mirror.predict(target, reached if effective is None else aim)
             if error is not None:
                 plan = replace(plan, max_zernike=min(plan.max_zernike, error), max_zernike_upper=error)
             # But for creep, how far the actuators go.
-            step = (aim if missed is None else aim - missed) - self.law.effective(self.law.advance(begun, arrival))
+            step = (aim if missed is None else aim - missed) - law.effective(law.advance(begun, arrival))
             return self._bounded(plan, signals, known, self._young_creep(step, ahead), error)
 
-        return Move(signals, aim, travel, largest, predict)
+        return Move(target, signals, aim, largest, known, travel + ahead, predict)
 
     def _inverted(
         self, state: HysteresisState, arrival: float, aim: Floats, ahead: float
@@ -238,6 +250,3 @@ class Planner:
         largest = np.abs(miss @ model.influence_zernike[PISTON_TILT:].T).max(axis=1)
         area = model.sample_weight[:, None] * np.square(model.influence_sag)
         return float(np.quantile(largest, 0.95)), float(sigma * np.sqrt(area.sum()))
-
-
-__all__ = ["HysteresisFigures", "Limits", "Move", "Planner"]

@@ -68,3 +68,24 @@ class FocusTarget:
     def with_curvature(self, curvature: float) -> FocusTarget:
         """The same target at another curvature."""
         return FocusTarget(curvature, self.conic_constant, self.zernike)
+
+
+@dataclass(frozen=True)
+class Request:
+    """A wanted surface and the way to it; fields as in dm_msgs/FocusRequest.
+
+    Attributes:
+        curvature: 1/m.
+        conic_constant: 0 = sphere.
+        zernike: m, added sag, Born & Wolf; empty = none.
+        mode: FocusRequest.MODE_AUTO, MODE_DIRECT or MODE_CONDITIONED.
+        time_budget: s that AUTO may take; 0 = as configured.
+        stamp_ns: when it was made; 0 = now.
+    """
+
+    curvature: float = 0.0
+    conic_constant: float = 0.0
+    zernike: tuple[float, ...] = ()
+    mode: int = 0
+    time_budget: float = 0.0
+    stamp_ns: int = 0

@@ -39,7 +39,7 @@ from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.rosout import LogTail
 from dm_common.ros.worker import ServiceCallError, answers_arrive, call
 from dm_tools.console.external_goals import ExternalGoals
-from dm_tools.console.state_observer import Following
+from dm_tools.console.state_observer import StateObserver
 
 TOPICS = {
     "mirror_info": (MirrorInfo, qos.LATCHED),
@@ -116,7 +116,7 @@ class ConsoleNode:
         self._bench_time = 0.0
         self._goals: dict[str, Any] = {}
         self._beginning: dict[str, bool] = {}  # goals that are not accepted yet; True = to be cancelled
-        self.following = Following()
+        self.following = StateObserver()
         self.log = LogTail(self.node)
         for topic, (message_type, profile) in TOPICS.items():
             self._subscribe(message_type, topic, profile)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dm_common.messages import stamp_ns
 from dm_tools.console.console_node import Snapshot
-from dm_tools.console.state_observer import Following, Standing
+from dm_tools.console.state_observer import SettledState, StateObserver
 from dm_tools.console.surfaces import Surface, SurfaceModel, difference, measured_surface
 from dm_tools.verify import map_of
 
@@ -34,8 +34,8 @@ class SurfaceView:
         when: whether the map is of the present shape, in words.
     """
 
-    def __init__(self, following: Following) -> None:
-        self._following = following
+    def __init__(self, state_observer: StateObserver) -> None:
+        self._state_observer = state_observer
         self.version = 0
         self.measured: Surface | None = None
         self.predicted: Surface | None = None
@@ -47,7 +47,7 @@ class SurfaceView:
         self._model: SurfaceModel | None = None
         self._calibration: Any = None
         self._map: tuple[int, Any] = (0, None)
-        self._at_map: Standing | None = None
+        self._at_map: SettledState | None = None
         self._effective: NDArray[np.float64] | None = None
 
     @property
@@ -88,7 +88,7 @@ class SurfaceView:
         if image is self._map[1]:
             return False
         self._map = (stamp, image)
-        self._at_map = self._following.at(1e-9 * stamp)
+        self._at_map = self._state_observer.at(1e-9 * stamp)
         try:
             self.measured, self.why_no_map = measured_surface(map_of(image), info), ""
         except ValueError as error:
@@ -100,7 +100,7 @@ class SurfaceView:
             changed = self.predicted is not None
             self.predicted, self.doubt = None, ""
             return changed
-        standing = self._following.now(snapshot.bench_time)
+        standing = self._state_observer.now(snapshot.bench_time)
         if standing.effective is None or standing.effective.shape != (self._model.actuators,):
             changed = self.predicted is not None
             self.predicted, self.why_no_prediction = None, standing.doubt or "the calibration is of another mirror"
@@ -113,7 +113,7 @@ class SurfaceView:
         ):
             return False
         self._effective, self.doubt = standing.effective, standing.doubt
-        self.remark = CREEP_BEFORE if self._following.creep_before else ""
+        self.remark = CREEP_BEFORE if self._state_observer.creep_before else ""
         self.predicted = self._model.surface(standing.effective)
         return True
 

@@ -9,7 +9,7 @@ import pytest
 
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.prepared_inverse import EXACT, PreparedInverse
+from dm_controller.planning.fast_path import EXACT, PreparedInverse
 from example_hysteresis import plays, rich
 
 ACTUATORS = 37

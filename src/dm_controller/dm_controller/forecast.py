@@ -1,15 +1,14 @@
-"""The residual to expect of a focus command, with an interval that knows of the actuators' memory.
+"""The residual to expect of a focus command, with an interval that knows of the actuators' hysteresis.
 
-An influence function predicts a residual as if actuators had no memory. Service `predict_error` of the calibration node
-tells the error of a command over many histories. Its answers for some commands over the reachable range are fetched
-once per calibration, in the background; what they hold beyond the influence function's own error is the share of the
-memory, which then only has to be looked up.
+An influence function predicts a residual as if actuators had no hysteresis. Service `predict_error` of the calibration
+node tells the error of a command over many histories. Its answers for some commands over the reachable range are
+fetched once per calibration, in the background; what they hold beyond the influence function's own error is the share
+of hysteresis, which then only has to be looked up.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,12 +20,13 @@ from rclpy.node import Node
 from dm_common.errors import ErrorCode
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
-from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
 
-#: Number of curvatures over the reachable range for which the memory's share is fetched.
+#: Number of curvatures over the reachable range for which the share of hysteresis is fetched.
 GRID = 11
 #: Answers that have not come within this time are asked for again, s: a server that has not discovered the client yet
 #: answers into the void.
@@ -44,7 +44,7 @@ class Forecast:
 
 @dataclass(frozen=True, eq=False)
 class HysteresisShare:
-    """Mean square residual that the actuators' memory adds, over curvature.
+    """Mean square residual that the actuators' hysteresis adds, over curvature.
 
     Attributes:
         curvature: (K,) 1/m, rising.
@@ -55,14 +55,14 @@ class HysteresisShare:
     square: Floats
 
     def forecast(self, curvature: float, model_rms: float) -> Forecast:
-        """The residual to expect: what the influence function predicts (`Plan.rms`, m) and the memory, independent."""
+        """The residual to expect: what the influence function predicts (`Plan.rms`, m) and hysteresis, independent."""
         squares = [np.interp(curvature, self.curvature, column) + model_rms**2 for column in self.square.T]
         rms, lower, upper = (float(value) for value in np.sqrt(squares))
         return Forecast(rms, lower, upper)
 
 
 def hysteresis_share(curvature: Floats, answers: Floats, modelled: Floats) -> HysteresisShare:
-    """From answers of `predict_error` to the share of the memory in them.
+    """From answers of `predict_error` to the share of hysteresis in them.
 
     Args:
         curvature: (K,) 1/m of the commands.
@@ -85,38 +85,42 @@ def surface_control_error_rms(model: InfluenceModel, signals: Floats) -> float:
 
 
 class ForecastClient:
-    """Keeps the share of the memory for the calibration in use; nothing here waits.
+    """Keeps the share of hysteresis for the calibration in use; nothing here waits.
 
     Attributes:
         share: None before all answers are there, and where the calibration has no sample surfaces.
     """
 
-    def __init__(self, node: Node, on_change: Callable[[], None] = lambda: None) -> None:
-        """`on_change` is called, in the executor, when there is a new share."""
+    def __init__(self, node: Node) -> None:
         self.share: HysteresisShare | None = None
-        self._node, self._on_change = node, on_change
+        self._node = node
         self._client = node.create_client(PredictError, "predict_error")
         self._calibration_id = ""
         self._asked_at = -float("inf")
         self._refused = False
         self._pending: list[Any] = []
 
-    def use(self, calibration_id: str, mirror: CalibratedMirror | None, curvatures: tuple[float, float]) -> None:
-        """Have the share for this calibration fetched. Call it with every calibration and every request.
+    def use(self, active: ActiveCalibration | None, tolerance: float) -> None:
+        """Have the share for a calibration fetched that does not know the hysteresis itself.
 
-        It returns at once. When the calibration node does not answer, a later call asks again.
+        Call it with every calibration and every request: it returns at once, and when the calibration node does not
+        answer, a later call asks again.
 
         Args:
-            calibration_id: "" = none.
-            mirror: that calibration's.
-            curvatures: 1/m, range to fetch it for; NaN = nothing is reachable.
+            active: the calibration in use; None = none.
+            tolerance: m, largest coefficient error at which a curvature counts as reachable.
         """
+        wanted = active if active is not None and active.planner.hysteresis is None else None
+        calibration_id = wanted.calibration.id if wanted is not None else ""
         if calibration_id != self._calibration_id:
             self._calibration_id, self._refused, self.share = calibration_id, False, None
             self._asked_at = -float("inf")
         if self.share is not None or self._refused or time.monotonic() < self._asked_at + RETRY_S:
             return
-        if not calibration_id or mirror is None or not np.isfinite(curvatures).all():
+        if wanted is None:
+            return
+        mirror, curvatures = wanted.mirror, wanted.reachable_range(FocusTarget(0.0), tolerance)
+        if not np.isfinite(curvatures).all():
             return
         if not self._client.service_is_ready():
             return
@@ -135,10 +139,6 @@ class ForecastClient:
                 lambda done, row=row: self._on_answer(calibration_id, row, done, grid, answers, modelled)
             )
 
-    def forecast(self, curvature: float, model_rms: float) -> Forecast | None:
-        """See :meth:`HysteresisShare.forecast`; None while there is no share."""
-        return None if self.share is None else self.share.forecast(curvature, model_rms)
-
     def _on_answer(
         self, calibration_id: str, row: int, future: Any, grid: Floats, answers: Floats, modelled: Floats
     ) -> None:
@@ -153,4 +153,3 @@ class ForecastClient:
         answers[row] = answer.predicted_rms, answer.lower, answer.upper
         if self.share is None and np.isfinite(answers).all():
             self.share = hysteresis_share(grid, answers, modelled)
-            self._on_change()

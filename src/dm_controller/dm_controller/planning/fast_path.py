@@ -1,20 +1,22 @@
-"""The inverse of the memory law with everything done beforehand that does not depend on the request.
+"""The quick way from a target to its command: what does not depend on the request is done before one comes.
 
-A mirror waits longer for a request than a request may wait for its command. From the state that the driver reported
-follow, for either way and every actuator, the places where the play operators set in and the law between them. There
-its inverse is smooth: a cubic that meets values and slopes at both ends of a piece. What a request still needs is to
-look its pieces up and to sum three powers.
-
-Where that is not exact enough, or a limit is met, :func:`dm_common.hysteresis.inverse.invert` has to be asked.
+A mirror waits longer for a request than a request may wait for its command. Both halves give what the plain path gives,
+:meth:`CalibratedMirror.solve_target` and :func:`dm_common.hysteresis.inverse.invert`, or say that the plain path has to
+be taken: where a series is too short, a piece not exact enough, or a limit is met.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.inverse import Pieces, horner, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.optics.conic_series import ORDERS, series, series_coefficients, series_sag
+from dm_common.optics.zernike import TERMS, basis
+from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
 
@@ -25,8 +27,62 @@ EXACT = 1e-5
 APART = 1e3
 
 
+class ClosedForm:
+    """Command and largest coefficient error of a target as one product of a matrix with its few amplitudes.
+
+    As long as no limit binds, the command is linear in the wanted sag, and wanted sag is linear in the amplitudes of a
+    short series in the radius, the added Zernike terms and the figure.
+
+    Args:
+        radius: of the aperture, m.
+        points: (x, y) of the P points, unit disc.
+        coefficients_offset: (21,) m at zero signals.
+        sag_offset: (P,) m at zero signals.
+        solve: commands (N, M) without limits for wanted coefficients (21, M) and sag (P, M).
+        errors: coefficient errors beyond tilt (E, M) of commands (N, M) and wanted coefficients (21, M).
+    """
+
+    def __init__(
+        self,
+        radius: float,
+        points: tuple[Floats, Floats],
+        coefficients_offset: Floats,
+        sag_offset: Floats,
+        solve: Callable[[Floats, Floats], Floats],
+        errors: Callable[[Floats, Floats], Floats],
+    ) -> None:
+        self._radius = radius
+        x, y = points
+        # Columns: the figure with the amplitude 1, the series, the added terms.
+        coefficients = np.column_stack([-coefficients_offset, series_coefficients(), np.eye(len(TERMS))])
+        sag = np.column_stack([-sag_offset, series_sag(x, y), basis(x, y)])
+        signals = solve(coefficients, sag)
+        self._signals = len(signals)
+        self._all_terms = np.ascontiguousarray(np.vstack([signals, errors(signals, coefficients)]))
+        self._conic_only = np.ascontiguousarray(self._all_terms[:, : 1 + ORDERS])
+
+    def find(self, target: FocusTarget) -> tuple[Floats, float] | None:
+        """Signals (N,) that no limit knows of yet, and the largest coefficient error that they leave, m.
+
+        None where the series is too short for the target, which is then solved by its exact sag.
+        """
+        conic = series(target.curvature, target.conic_constant, self._radius)
+        if conic is None:
+            return None
+        if target.zernike:
+            result = self._all_terms @ np.array([1.0, *conic, *target.zernike])
+        else:
+            result = self._conic_only @ np.array((1.0, *conic))
+        errors = np.abs(result[self._signals :])
+        return result[: self._signals], float(np.maximum.reduce(errors))
+
+
 class PreparedInverse:
-    """From one state, at any time after it.
+    """The inverse of the hysteresis model from one state, at any time after it.
+
+    From the state that the driver reported follow, for either way and every actuator, the places where the play
+    operators set in and the law between them. There its inverse is smooth: a cubic that meets values and slopes at both
+    ends of a piece. What a request still needs is to look its pieces up and to sum three powers.
 
     Args:
         law: that remembers.

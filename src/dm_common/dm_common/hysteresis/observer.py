@@ -1,0 +1,287 @@
+"""Where the actuators stand and what their hysteresis holds, followed through what the driver reports as applied.
+
+Planning never changes it: reports do. So a command that was refused, lost, cut short or sent by somebody else leaves no
+wrong state behind.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+
+Floats = NDArray[np.float64]
+
+#: Reports kept for a law that is identified later: a calibration run makes some hundred.
+LOG_LENGTH = 5_000
+#: Estimates kept for maps that arrive late.
+ESTIMATES_KEPT = 500
+#: What to do about an unknown history.
+CURE = "a degauss over the full range (service degauss) makes it known"
+
+
+@dataclass(frozen=True, eq=False)
+class Applied:
+    """What a driver reports; fields as in dm_msgs/ActuatorState.
+
+    Attributes:
+        time: s, stamp of the last write.
+        signals: (N,) applied.
+        turns, turned_at: how often the way has bent since activation, and (N,) where it did last; None = never.
+        degausses: over the full range, since activation.
+        history_known: no write was lost since the last of them.
+        moving: on the way to another shape.
+        requested: (N,) what it moves to; None = not known.
+        active: the electronics follow.
+    """
+
+    time: float
+    signals: Floats
+    turns: int
+    turned_at: Floats | None
+    degausses: int
+    history_known: bool
+    moving: bool = False
+    requested: Floats | None = None
+    active: bool = True
+
+
+class HysteresisTracker:
+    """The hysteresis state of one mirror under one law, from reports in the order sent.
+
+    A move is straight between turns, and hysteresis depends on the turns only: reports may be lost as long as no two
+    turns happen between two that arrive. A degauss over the full range begins a new history.
+
+    Attributes:
+        law: the law that is followed.
+        state: the best guess; None before the first report.
+        unknown: the reason why the state is a guess only; "" = it is known.
+    """
+
+    def __init__(self, law: HysteresisModel, middle: float = 0.0) -> None:
+        self.law = law
+        self.state: HysteresisState | None = None
+        self.unknown = "the driver has not reported yet"
+        self._middle = middle
+        self._last: Applied | None = None
+        self._set_off: HysteresisState | None = None  # the state when the move under way began
+
+    @property
+    def known(self) -> bool:
+        """Whether the state can be trusted."""
+        return not self.unknown
+
+    def observe(self, report: Applied) -> None:
+        """Take the next report.
+
+        Raises:
+            ValueError: another number of actuators than before, or signals that are not finite.
+        """
+        if not np.isfinite(report.signals).all():
+            raise ValueError("applied: holds values that are not finite")
+        last, self._last = self._last, report
+        if self.state is not None and len(report.signals) != len(self.state.signals):
+            raise ValueError(f"applied: {len(report.signals)} signals, before there were {len(self.state.signals)}")
+        if last is None or self.state is None:
+            self._guess(report, "it moved before this node followed it")
+            return
+        if report.time < self.state.time:
+            # Hysteresis knows no time; creep stands still until the clock has caught up.
+            self.state = replace(self.state, time=report.time)
+        if report.turns < last.turns or report.degausses < last.degausses:
+            # It stood where the driver left it or came up, which this report tells, from about then on.
+            self.state = self.law.move(self.state, report.signals, self.state.time)
+            self._guess_keeping_creep(report, "the driver was started or activated again")
+            return
+        if report.degausses > last.degausses:
+            self._degaussed(report, last)
+            return
+        if report.moving and (not last.moving or report.turns > last.turns):
+            self._set_off = self.law.advance(self.state, report.time)
+        if not report.history_known:
+            self._guess_keeping_creep(report, "writes were lost, or a degauss was left")
+            return
+        if report.turns > last.turns + 1:
+            self._guess_keeping_creep(report, f"{report.turns - last.turns - 1} turns were not seen")
+            return
+        self._follow(report, last)
+
+    def _follow(self, report: Applied, last: Applied) -> None:
+        assert self.state is not None
+        if report.turns > last.turns and report.turned_at is not None:
+            self.state = self.law.move(self.state, report.turned_at, report.time)
+        self.state = self.law.move(self.state, report.signals, report.time)
+
+    def _degaussed(self, report: Applied, last: Applied) -> None:
+        """Begin a new history; moves since the degauss are known if there was at most one turn."""
+        assert self.state is not None
+        # While it swings about the middle, creep follows the middle.
+        began = self._set_off or self.state
+        self.state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
+        self._set_off = None
+        # The end of the degauss is a turn itself, and one left for it may precede.
+        seen = report.turns - last.turns <= 2 and report.degausses == last.degausses + 1
+        self.unknown = "" if seen and report.history_known else "moves after the degauss were not seen"
+        if report.turned_at is not None:
+            self.state = self.law.move(self.state, report.turned_at, report.time)
+        self.state = self.law.move(self.state, report.signals, report.time)
+
+    def _guess(self, report: Applied, reason: str) -> None:
+        fresh = self.law.demagnetised(len(report.signals), report.time, self._middle)
+        moved = self.law.move(fresh, report.signals, report.time)
+        settled = np.repeat(moved.position[:, None], moved.crept.shape[1], axis=1)
+        self.state, self.unknown = replace(moved, crept=settled), reason
+
+    def _guess_keeping_creep(self, report: Applied, reason: str) -> None:
+        """Where the mirror stands is known, on which branch is not."""
+        assert self.state is not None
+        self.state = self.law.move(self.state, report.signals, report.time)
+        self.unknown = reason
+
+
+class ActuatorEstimate(NamedTuple):
+    """The actuators at one moment.
+
+    Attributes:
+        state: None before the first report.
+        unknown: the reason why the state is a guess only; "" = it is known.
+    """
+
+    state: HysteresisState | None
+    unknown: str
+
+    @property
+    def known(self) -> bool:
+        """Whether the state can be trusted."""
+        return not self.unknown
+
+    def after_degauss(self, law: HysteresisModel, actuators: int, time: float, middle: float) -> ActuatorEstimate:
+        """The actuators after a degauss that ends at `time` (s)."""
+        if self.state is None:
+            return ActuatorEstimate(law.demagnetised(actuators, time, middle), "")
+        return ActuatorEstimate(law.degaussed(self.state, time, middle), "")
+
+
+class Observed(NamedTuple):
+    """A report and the estimate that follows from it."""
+
+    report: Applied
+    estimate: ActuatorEstimate
+
+
+class HysteresisObserver:
+    """Follows one mirror under the law in use. May be asked from any thread.
+
+    Attributes:
+        law: that is followed; without an identified hysteresis the linear one.
+        latest: the driver's last report; None before the first.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self.law = HysteresisModel.linear()
+        self.latest: Applied | None = None
+        self._middle = 0.0
+        self._tracker = HysteresisTracker(self.law)
+        self._log: deque[Applied] = deque(maxlen=LOG_LENGTH)
+        self._observed: deque[Observed] = deque(maxlen=ESTIMATES_KEPT)
+
+    def use(self, law: HysteresisModel, middle: float) -> None:
+        """Follow another law, through all that was reported so far; a degauss ends at `middle`."""
+        with self._lock:
+            same = law.same_as(self.law) and middle == self._middle
+            self.law, self._middle = law, middle
+            if same:
+                return
+            self._tracker = HysteresisTracker(law, middle)
+            self._observed.clear()
+            for report in list(self._log):
+                self._track(report)
+
+    def observe(self, report: Applied) -> None:
+        """Take the driver's next report. One without signals, of a driver that knows none yet, is kept as the latest.
+
+        Raises:
+            ValueError: another number of actuators, or numbers that are none; the observer begins anew.
+        """
+        with self._lock:
+            self.latest = report
+            if not report.signals.size:
+                return
+            # What a later law must know: where the way bent, and how a move under way began.
+            if len(self._log) >= 2 and _between(self._log[-2], self._log[-1], report):
+                self._log.pop()
+            self._log.append(report)
+            try:
+                self._track(report)
+            except ValueError as error:
+                self._log.clear()
+                self._observed.clear()
+                self._tracker = HysteresisTracker(self.law, self._middle)
+                self._tracker.unknown = f"actuator_state: {error}"
+                raise
+
+    def _track(self, report: Applied) -> None:
+        self._tracker.observe(report)
+        self._observed.append(Observed(report, ActuatorEstimate(self._tracker.state, self._unknown(report))))
+
+    @property
+    def unknown(self) -> str:
+        """The reason why the history is not known; "" = it is."""
+        with self._lock:
+            return self._unknown(self.latest)
+
+    @property
+    def state(self) -> HysteresisState | None:
+        """As of the last report; None before it."""
+        return self._tracker.state
+
+    def _unknown(self, latest: Applied | None) -> str:
+        tracker = self._tracker
+        if tracker.state is None or latest is None:
+            return tracker.unknown
+        if not latest.history_known:
+            return tracker.unknown or "writes were lost, or a degauss is under way"
+        return tracker.unknown if self.law.remembers else ""
+
+    def estimate(self, now: float, slew_rate: float = np.inf) -> ActuatorEstimate:
+        """The actuators at `now` (s, of the clock that reports are stamped with).
+
+        A move under way is followed to where it should be by now: a new command makes it turn about there.
+        """
+        with self._lock:
+            state, unknown, last = self._tracker.state, self._unknown(self.latest), self.latest
+        if last is None or state is None:
+            return ActuatorEstimate(None, unknown)
+        if last.moving and not unknown and last.requested is not None and last.requested.shape == state.signals.shape:
+            gap = last.requested - state.signals
+            largest = float(np.abs(gap).max())
+            share = min(1.0, max(0.0, now - state.time) * slew_rate / largest) if largest > 0.0 else 0.0
+            state = self.law.move(state, state.signals + share * gap, now)
+        return ActuatorEstimate(state, unknown)
+
+    def at(self, time: float) -> ActuatorEstimate | None:
+        """As of the last report at or before `time` (s), if that is recent enough to be kept."""
+        return next((seen.estimate for seen in reversed(self.recent()) if seen.report.time <= time), None)
+
+    def recent(self) -> list[Observed]:
+        """The latest reports, in the order they came, with what follows from each."""
+        with self._lock:
+            return list(self._observed)
+
+
+def _between(before: Applied, between: Applied, after: Applied) -> bool:
+    """Whether a law needs no report of `between`: the same move, or the same rest, goes on."""
+    if not _phase(before) == _phase(between) == _phase(after):
+        return False
+    return before.time <= between.time <= after.time and (between.moving or between.time == after.time)
+
+
+def _phase(report: Applied) -> tuple[int, int, bool, bool]:
+    return report.turns, report.degausses, report.history_known, report.moving

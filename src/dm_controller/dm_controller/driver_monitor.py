@@ -1,0 +1,180 @@
+"""What the driver last said, whether it still says anything, whether it took the last command, and how quickly.
+
+A driver that is stopped or was killed tells nobody: its last report says for ever that it is active. So reports grow
+old here, by the steady clock, and a command that no report confirms is told of.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from dm_msgs.msg import ActuatorState
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_controller.focus_types import DriverReport, Floats, Order, Progress, SendCommand
+
+#: A message's constants are properties of its class, which take longer to look up.
+_ACTIVE = ActuatorState.STATE_ACTIVE
+#: States from which a driver does not come back by itself, as it does from a lost link.
+_STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
+#: Moves over which the latency is taken.
+MOVES = 20
+#: A first write later than this is of another clock, or of a report that came too late, s.
+LATENCY_MAX_S = 1.0
+#: Signals that differ less are the same command.
+SAME_SIGNAL = 1e-9
+#: How an order ends whose shape somebody else replaced.
+SUPERSEDED = Progress(failed=Refusal(ErrorCode.PREEMPTED, "another command took over"))
+
+
+class _Sent(NamedTuple):
+    command: SendCommand
+    order: Order | None
+    at: float
+
+
+class DriverMonitor:
+    """Steady times, s, are given with each call.
+
+    Args:
+        values: parameters `driver_timeout` and `move_timeout`.
+
+    Attributes:
+        latest: the driver's last report; None before the first.
+        starts: how often the driver was activated anew, as far as reports tell.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        self.latest: DriverReport | None = None
+        self.starts = 0
+        self._heard = 0.0
+        self._sent: _Sent | None = None
+        self._asked: Floats = np.zeros(0)  # signals of the last order's command; empty = its shape is not to be kept
+        self._last: Floats = np.zeros(0)  # signals of the last command: those, or with creep corrected
+        self._awaited: SendCommand | None = None
+        self._latencies: deque[float] = deque(maxlen=MOVES)
+
+    @property
+    def latency(self) -> float:
+        """s from a command to the driver's first write of it, median; 0 = not known."""
+        return statistics.median(self._latencies) if self._latencies else 0.0
+
+    def observe(self, report: DriverReport, now: float) -> bool:
+        """Take the driver's next report; returns whether the latency is known from now on."""
+        before, self.latest, self._heard = self.latest, report, now
+        if before is not None and report.sequence < before.sequence:
+            self.starts += 1
+        sent = self._sent
+        if sent is not None and np.array_equal(report.requested, sent.command.signals):
+            self._sent = None
+        command = self._awaited
+        if command is None or not np.array_equal(report.requested, command.signals):
+            return False
+        self._awaited = None
+        seconds = 1e-9 * (report.stamp_ns - command.stamp_ns)
+        if not 0.0 <= seconds <= LATENCY_MAX_S:
+            return False
+        self._latencies.append(seconds)
+        return len(self._latencies) == 1
+
+    def sent(self, command: SendCommand, order: Order | None, now: float) -> None:
+        """This command went out, for `order` or, None, to correct the shape of the last one or to stop its move."""
+        self._sent, self._awaited, self._last = _Sent(command, order, now), command, command.signals
+        if order is not None:
+            self._asked = command.signals
+
+    def silent(self, now: float) -> str:
+        """That the driver does not report any more, as a sentence; "" = it does, or never did."""
+        limit = self._values["driver_timeout"]
+        age = now - self._heard
+        if self.latest is None or not limit or age <= limit:
+            return ""
+        return f"pdm_driver has not reported for {age:.1f} s (driver_timeout {limit:g} s): is it running?"
+
+    def check(self, now: float) -> None:
+        """Raise Refusal when the driver, by its last report and the age of that, takes no commands."""
+        report = self.latest
+        if report is None:
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no actuator_state from pdm_driver yet: is the driver running?")
+        if report.driver_state != _ACTIVE:
+            reason = f": {report.message}" if report.message else ""
+            raise Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
+        if silent := self.silent(now):
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
+
+    def stopped(self, now: float) -> str:
+        """The reason why what was begun with the driver will not end any more; "" = it may: a lost link comes back."""
+        report = self.latest
+        if report is not None and report.driver_state in _STOPPED:
+            return "pdm_driver left its active state" + (f": {report.message}" if report.message else "")
+        return self.silent(now)
+
+    def keeps(self, order: Order) -> bool:
+        """Whether the last command is to keep the shape of `order`, be it corrected for creep."""
+        move = order.outcome.move if order.outcome is not None else None
+        if move is None or move.signals.shape != self._asked.shape:
+            return False
+        return bool(np.allclose(move.signals, self._asked, rtol=0.0, atol=SAME_SIGNAL))
+
+    def release(self) -> None:
+        """The last order's shape is not to be kept any more."""
+        self._asked = np.zeros(0)
+
+    def progress(self, order: Order, now: float) -> Progress:
+        """How far the driver is with `order`."""
+        assert order.outcome is not None
+        if order.outcome.refusal is not None:
+            return Progress(failed=order.outcome.refusal)
+        assert order.outcome.move is not None
+        if order.pending:
+            expected = order.outcome.move.duration
+            return Progress(True, min(1.0, (now - order.began) / expected) if expected > 0.0 else 0.0)
+        if not self.keeps(order):
+            return SUPERSEDED
+        signals = order.outcome.move.signals
+        report = self.latest
+        if report is not None and report.driver_state != _ACTIVE:
+            text = f"the driver left its active state: {report.message}"
+            return Progress(failed=Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, text))
+        if silent := self.silent(now):
+            return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent))
+        gap = share = 0.0
+        if report is not None and report.requested.shape == report.applied.signals.shape == signals.shape:
+            gap = float(np.abs(report.applied.signals - signals).max())
+            order.gap = max(order.gap, gap)
+            share = 1.0 - gap / order.gap if order.gap else 1.0
+            ours = any(np.allclose(report.requested, own, rtol=0.0, atol=SAME_SIGNAL) for own in (signals, self._last))
+            if ours and not report.applied.moving:
+                return Progress(share=1.0, remaining=gap, stands=True)
+            if order.taken and not ours:
+                return SUPERSEDED
+            order.taken = ours
+        if now - order.began > self._values["move_timeout"]:
+            text = report.message if report is not None else ""
+            return Progress(failed=Refusal(ErrorCode.TIMEOUT, text or "the driver did not report the shape"))
+        return Progress(share=share, remaining=gap)
+
+    def untaken(self, now: float) -> tuple[Order | None, Refusal] | None:
+        """The order whose command the driver has not confirmed in time, and the reason; each is told once.
+
+        None = there is none. A command that went out later is the one that counts: the latest wins at the driver too.
+        """
+        sent, limit = self._sent, self._values["driver_timeout"]
+        if sent is None or not limit or now - sent.at <= limit:
+            return None
+        self._sent = None
+        text = f"the driver has not taken the command within {limit:g} s"
+        try:
+            self.check(now)
+        except Refusal as refusal:
+            return sent.order, Refusal(refusal.error_code, f"{text}: {refusal}")
+        report = self.latest
+        assert report is not None  # else the check had refused
+        if report.error_code != ErrorCode.OK:
+            return sent.order, Refusal(report.error_code, f"{text}: {report.message}")
+        return sent.order, Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another one")

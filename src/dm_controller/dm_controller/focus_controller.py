@@ -1,0 +1,298 @@
+"""Open-loop focus control without ROS: requests, driver reports and time in, commands and events out.
+
+One object holds all that changes: the calibration in use, the estimate of the actuators, the shape that is held against
+creep, a degauss on the way and the order that waits for it. Whoever drives it calls one method at a time and carries
+out the effects in the order given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dm_msgs.msg import ActuatorState
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.hysteresis.observer import HysteresisObserver
+from dm_controller.conditioning import Conditioning
+from dm_controller.creep_hold import CreepHold
+from dm_controller.driver_monitor import DriverMonitor
+from dm_controller.focus_types import (
+    DriverReport,
+    Effect,
+    Floats,
+    Log,
+    Moment,
+    Order,
+    Outcome,
+    PublishCapabilities,
+    PublishState,
+    SendCommand,
+    StartDegauss,
+)
+from dm_controller.planning.active_calibration import NO_CALIBRATION, ActiveCalibration, active_calibration
+from dm_controller.planning.choice import PlanningContext, check_reachable, choose_move
+from dm_controller.planning.planner import Move
+from dm_controller.planning.target import Request
+
+#: A message's constants are properties of its class, which take longer to look up.
+_ACTIVE = ActuatorState.STATE_ACTIVE
+#: How often a held shape is checked while no correction can be due sooner, s.
+SLOW_PERIOD_S = 1.0
+
+
+class FocusController:
+    """Takes one mirror to the shapes that are asked for.
+
+    Args:
+        values: parameters of the node `focus_controller`, live.
+
+    Attributes:
+        active: the calibration in use; None = there is none.
+        not_calibrated: the reason for that.
+        observer: follows the actuators.
+        monitor: follows the driver.
+        hold: corrects the shape that stands for creep.
+        conditioning: a degauss on the way, and the order that waits for it.
+        requests, refused: counts since the start.
+        degauss_offered: the driver offers the service `degauss`, as far as whoever drives this knows.
+        reserved: what has the mirror for itself, as a sentence; "" = nothing does.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        self.active: ActiveCalibration | None = None
+        self.not_calibrated = Refusal(ErrorCode.NOT_CALIBRATED, NO_CALIBRATION)
+        self.observer, self.monitor, self.hold = HysteresisObserver(), DriverMonitor(values), CreepHold(values)
+        self.conditioning = Conditioning()
+        self._reported: tuple[object, ...] = ()  # what the last capabilities said of the driver
+        self.requests = self.refused = 0
+        self.degauss_offered = False
+        self.reserved = ""
+
+    # --- what is known ---
+
+    def use(self, calibration: Any, mirror: Any) -> list[Effect]:
+        """Use a dm_msgs/Calibration if it belongs to the mirror of dm_msgs/MirrorInfo; None = not known.
+
+        Else requests are refused with the reason.
+        """
+        effects: list[Effect] = []
+        before = self.active
+        try:
+            active = active_calibration(calibration, mirror, self._values["aperture_tolerance"])
+            # A new revision leaves the shape that stands as it is: so it can be held on.
+            if before is None or before.calibration.id != active.calibration.id:
+                self.hold.end("another calibration is used")
+            elif not before.planner.law.same_as(active.planner.law):
+                self.hold.end("the hysteresis model changed")
+            self.observer.use(active.planner.law, active.middle)
+            self.active = active
+            effects.append(Log("info", f"using calibration {active.calibration.id} of {mirror.serial}"))
+        except Refusal as refusal:
+            self.active, self.not_calibrated = None, refusal
+            self.hold.end("there is no calibration to hold it with")
+            if refusal.error_code in (ErrorCode.CALIBRATION_MISMATCH, ErrorCode.CALIBRATION_UNREADABLE):
+                effects.append(Log("error", str(refusal)))
+        return [*effects, PublishCapabilities()]
+
+    def driver_report(self, report: DriverReport, now: Moment) -> list[Effect]:
+        """Take the driver's next report."""
+        latency_learnt = self.monitor.observe(report, now.steady)
+        try:
+            self.observer.observe(report.applied)
+        except ValueError:
+            pass  # the observer says so as long as the history is unknown, and begins anew
+        if report.driver_state != _ACTIVE:
+            self.hold.end("the driver is not active")
+        elif self.hold.active:
+            self.hold.driver_requested(report.requested, now.time)
+        state = self.observer.state
+        if self.active is not None and state is not None and not report.applied.moving:
+            self.active.planner.prepare(state)
+        effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
+        known = report.driver_state, self.observer.unknown
+        if latency_learnt or self._reported != known:
+            self._reported = known
+            effects.append(PublishCapabilities())
+        return effects
+
+    # --- requests ---
+
+    def request(self, request: Request, now: Moment, dry_run: bool = False) -> tuple[Order, list[Effect]]:
+        """Judge a request and, unless it is refused or a dry run, send its command, or have the mirror degaussed first.
+
+        The newest request wins.
+        """
+        self.requests += 1
+        return self._attempt(Order(request, began=now.steady), now, dry_run)
+
+    def judge(self, request: Request, now: Moment, degaussed: int | None = None) -> Move:
+        """The move that a request asks for, from the mirror as it is.
+
+        Args:
+            degaussed: half-swings of a degauss that has just ended; None = the request is new.
+
+        Raises:
+            Refusal: it cannot be carried out whatever the driver does: no calibration, too old, no such surface.
+        """
+        values, active = self._values, self.active
+        limit, age = values["request_age"], 1e-9 * (now.ns - request.stamp_ns)
+        if degaussed is None and limit and request.stamp_ns and not -limit <= age <= limit:
+            raise Refusal(ErrorCode.STALE, f"header.stamp: the request is {age:.3f} s old; allowed: {limit:g} s")
+        if active is None:
+            raise self.not_calibrated
+        steps, begun, wait = degaussed, degaussed is not None, 0.0
+        if steps is None:
+            steps, begun, wait = self.conditioning.prospect(active, values["condition.degauss_steps"], now.steady)
+        context = PlanningContext(
+            active,
+            self.observer.estimate(now.time, active.slew_rate),
+            now.time,
+            values["settle_time"],
+            steps,
+            begun,
+            wait,
+            self.conditioning.duration(steps, active),
+        )
+        return choose_move(request, values["time_budget"], context)
+
+    def _attempt(
+        self, order: Order, now: Moment, dry_run: bool = False, degaussed: int | None = None
+    ) -> tuple[Order, list[Effect]]:
+        effects: list[Effect] = []
+        move = refusal = None
+        applied = False
+        try:
+            move = self.judge(order.request, now, degaussed)
+            assert self.active is not None
+            check_reachable(move, self.active, self._values["reachable_tolerance"])
+            if not dry_run:
+                self.monitor.check(now.steady)
+                if self.reserved:
+                    raise Refusal(ErrorCode.BUSY, f"{self.reserved}; cancel it first")
+                if degaussed is not None or (move.degauss is None and not self.conditioning.busy):
+                    effects.append(self._go(order, move, now))
+                    applied = True
+                else:
+                    effects += self._condition(order, move, now)
+        except Refusal as error:
+            refusal = error
+        order.outcome = Outcome(
+            order.request,
+            now.ns,
+            self.active,
+            move,
+            applied=applied,
+            pending=order.pending,
+            unknown=self.observer.unknown,
+            creep_held=self.active is not None and self.hold.would_keep(self.active.planner.law),
+            refusal=refusal,
+        )
+        if refusal is not None:
+            self.refused += 1
+            effects.append(Log("warning", f"refused: {refusal}"))
+        if not dry_run:
+            effects.append(PublishState(order.outcome))
+        return order, effects
+
+    def _refuse(self, order: Order, refusal: Refusal, now: Moment) -> list[Effect]:
+        """Refuse an order that was not refused at once."""
+        self.refused += 1
+        order.outcome = Outcome(order.request, now.ns, refusal=refusal)
+        return [Log("warning", f"refused: {refusal}"), PublishState(order.outcome)]
+
+    def _go(self, order: Order, move: Move, now: Moment) -> SendCommand:
+        """The command of `move`, whose shape is held from now on."""
+        assert self.active is not None
+        order.began = now.steady
+        self.hold.begin(self.active.planner, move.effective, move.signals, now.time, move.known)
+        return self._send(move.signals, now, order)
+
+    def _send(self, signals: Floats, now: Moment, order: Order | None = None, expected_turns: int = 0) -> SendCommand:
+        command = SendCommand(signals, now.ns, expected_turns)
+        self.monitor.sent(command, order, now.steady)
+        return command
+
+    # --- a degauss on the way ---
+
+    def _condition(self, order: Order, move: Move, now: Moment) -> list[Effect]:
+        """Have the mirror degaussed before `order` is carried out, unless it is already."""
+        if not self.degauss_offered:
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "service degauss: pdm_driver does not offer it (yet)")
+        self.hold.end("the mirror is conditioned")
+        effects: list[Effect] = []
+        before = self.conditioning.wait(order)
+        if before is not None:
+            before.pending = False
+            refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
+            effects += self._refuse(before, refusal, now)
+        if not self.conditioning.busy:
+            steps = move.degauss or 0
+            effects.append(StartDegauss(self.conditioning.begin(steps, self.monitor, now.steady), steps))
+        return effects
+
+    def degauss_answered(
+        self, number: int, now: Moment, duration: float = 0.0, refusal: Refusal | None = None
+    ) -> list[Effect]:
+        """The driver has answered the degauss of run `number`: done in `duration` s, or refused."""
+        if not self.conditioning.is_run(number):
+            return []
+        if refusal is not None:
+            return self._degauss_ended(now, refusal)
+        self.conditioning.answered(number, duration, now.steady)
+        ended = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
+        return [PublishCapabilities(), *ended]
+
+    def _degauss_ended(self, now: Moment, refusal: Refusal | None) -> list[Effect]:
+        steps = self.conditioning.steps
+        order = self.conditioning.end()
+        if order is None:
+            return []
+        if refusal is not None:
+            return self._refuse(order, refusal, now)
+        return self._attempt(order, now, degaussed=steps)[1]
+
+    # --- time ---
+
+    def tick(self, now: Moment) -> list[Effect]:
+        """Do what is due: creep corrections, and refusals of what the driver did not take or does not finish."""
+        effects: list[Effect] = []
+        failure = self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady)
+        if failure is not None:
+            effects += self._degauss_ended(now, failure)
+        untaken = self.monitor.untaken(now.steady)
+        if untaken is not None:
+            order, refusal = untaken
+            self.hold.end("the driver did not take the command")
+            # A correction, or the end of a move, answers no order.
+            effects += self._refuse(order, refusal, now) if order is not None else [Log("warning", str(refusal))]
+        return [*effects, *self._compensate_creep(now)]
+
+    def quick_ticks(self, now: Moment) -> bool:
+        """Whether something can be due before `SLOW_PERIOD_S` has passed."""
+        return self.conditioning.busy or self.hold.next_check - now.time <= SLOW_PERIOD_S
+
+    def _compensate_creep(self, now: Moment) -> list[Effect]:
+        report = self.monitor.latest
+        if not self.hold.active or report is None or report.applied.moving:
+            return []
+        if self.reserved:
+            self.hold.end(self.reserved)
+            return []
+        signals = self.hold.correction(self.observer.estimate(now.time), now.time)
+        if signals is None:
+            return []
+        self.hold.sent(signals, now.time)
+        return [self._send(signals, now, expected_turns=report.applied.turns)]
+
+    def stop(self, order: Order, now: Moment) -> list[Effect] | None:
+        """Leave the move of `order` where it is; None = another shape was asked for since, and nothing is sent."""
+        if not self.monitor.keeps(order):
+            return None
+        self.hold.end("the move was cancelled")
+        self.monitor.release()
+        report = self.monitor.latest
+        if report is None or not report.applied.signals.size:
+            return []
+        return [self._send(report.applied.signals, now)]

@@ -1,0 +1,154 @@
+"""Between the messages of the focus controller's node and the types it works with."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from dm_msgs.msg import ActuatorCommand, ActuatorState, Capabilities, FocusRequest, FocusState, MirrorInfo
+
+from dm_common.errors import Refusal
+from dm_common.hysteresis.observer import CURE
+from dm_common.messages import applied_from, doubles, stamp_ns, time_message
+from dm_controller.focus_controller import FocusController
+from dm_controller.focus_types import DriverReport, Moment, Outcome, SendCommand
+from dm_controller.forecast import HysteresisShare
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.target import FocusTarget, Request
+
+
+def request_from(message: FocusRequest) -> Request:
+    """What a dm_msgs/FocusRequest asks for."""
+    return Request(
+        message.curvature,
+        message.conic_constant,
+        tuple(message.zernike),
+        message.mode,
+        message.time_budget,
+        stamp_ns(message.header.stamp),
+    )
+
+
+def driver_report_from(message: ActuatorState) -> DriverReport:
+    """What a dm_msgs/ActuatorState reports."""
+    applied = applied_from(message)
+    assert applied.requested is not None
+    return DriverReport(
+        applied,
+        applied.requested,
+        stamp_ns(message.header.stamp),
+        message.driver_state,
+        message.sequence,
+        message.error_code,
+        message.message,
+    )
+
+
+def command_message(command: SendCommand) -> ActuatorCommand:
+    """A command to publish."""
+    message = ActuatorCommand(signals=doubles(command.signals), expected_turns=command.expected_turns)
+    message.header.stamp = time_message(command.stamp_ns)
+    return message
+
+
+def state_message(outcome: Outcome, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:
+    """What came of a request, with the prediction in full.
+
+    Args:
+        values: parameters of the node.
+        share: knows of the actuators' hysteresis where the calibration does not; None = nothing does.
+    """
+    request, move, active, refusal = outcome.request, outcome.move, outcome.active, outcome.refusal
+    state = FocusState(
+        curvature=request.curvature,
+        power=2 * request.curvature,
+        conic_constant=request.conic_constant,
+        mode=request.mode,
+        applied=outcome.applied,
+    )
+    state.header.stamp = time_message(outcome.stamp_ns)
+    if move is not None and active is not None:
+        plan = move.plan
+        state.calibration_id = active.calibration.id
+        state.signals = doubles(plan.signals)
+        state.predicted_rms = plan.rms
+        state.predicted_rms_lower, state.predicted_rms_upper = plan.rms_lower, plan.rms_upper
+        if share is not None:
+            forecast = share.forecast(request.curvature, plan.rms)
+            state.predicted_rms_lower = forecast.lower
+            state.predicted_rms_upper = max(plan.rms_upper, forecast.upper)
+        state.predicted_max_zernike = plan.max_zernike
+        state.predicted_max_zernike_upper = plan.max_zernike_upper
+        state.predicted_duration = move.duration
+        state.saturated = bool(plan.saturated.any())
+        state.saturated_actuators = array.array("I", (np.flatnonzero(plan.saturated) + 1).astype("uint32").tobytes())
+        state.curvature_min, state.curvature_max = active.reachable_range(move.target, values["reachable_tolerance"])
+        state.history_known = move.known
+        state.mode = move.mode
+        state.creep_held = outcome.creep_held
+        state.message = remarks(active, outcome.unknown, values, outcome.stamp_ns)
+        if outcome.pending:
+            first = f"the mirror is degaussed first; the shape stands in about {move.duration:.1f} s"
+            state.message = "; ".join(filter(None, (first, state.message)))
+    if refusal is not None:
+        state.error_code, state.message = refusal.error_code, str(refusal)
+    return state
+
+
+def remarks(active: ActiveCalibration, unknown: str, values: Mapping[str, Any], now_ns: int) -> str:
+    """What makes predictions worse than they could be, as sentences; "" = nothing."""
+    history = f"the history of the actuators is not known ({unknown}): {CURE}" if unknown else ""
+    stale = active.stale(now_ns, values["calibration_age_max"])
+    return "; ".join(filter(None, (history if active.planner.hysteresis is not None else "", stale)))
+
+
+def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment) -> str:
+    """The reason why requests are refused, or predictions worse than they could be; "" = all is well."""
+    if controller.active is None:
+        return str(controller.not_calibrated)
+    try:
+        controller.monitor.check(now.steady)
+    except Refusal as refusal:
+        return str(refusal)
+    return remarks(controller.active, controller.observer.unknown, values, now.ns)
+
+
+def capabilities_message(
+    controller: FocusController, mirror: MirrorInfo | None, values: Mapping[str, Any], now: Moment
+) -> Capabilities:
+    """What the mirror can do now.
+
+    Args:
+        controller: of the mirror.
+        mirror: None = not known.
+        values: parameters of the node.
+        now: for the header.
+    """
+    active, unknown, tolerance = controller.active, controller.observer.unknown, values["reachable_tolerance"]
+    message = Capabilities(residual_tolerance=tolerance, latency=controller.monitor.latency)
+    message.header.stamp = time_message(now.ns)
+    if mirror is not None and mirror.slew_rate_max > 0.0:
+        # From the first write to the settled shape over the full range.
+        message.settling = (mirror.signal_max - mirror.signal_min) / mirror.slew_rate_max
+    if active is None:
+        message.quality, message.message = Capabilities.UNCALIBRATED, str(controller.not_calibrated)
+        return message
+    low, high = active.reachable_range(FocusTarget(0.0), tolerance)
+    sentences = [f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
+    if unknown and active.planner.hysteresis is not None:
+        sentences.append(f"wider error bound: {unknown}")
+    if stale := active.stale(now.ns, values["calibration_age_max"]):
+        sentences.append(stale)
+    message.calibration_id, message.quality = active.calibration.id, active.calibration.quality
+    message.curvature_min, message.curvature_max = low, high
+    message.power_min, message.power_max = 2 * low, 2 * high
+    message.aperture_radius = active.calibration.aperture_radius
+    message.error_bound = active.error_bound(not unknown)
+    message.error_bound_conditioned = active.conditioned_error
+    message.condition_time = controller.conditioning.duration(
+        active.degauss_steps(values["condition.degauss_steps"]), active
+    )
+    message.message = "; ".join(sentences)
+    return message

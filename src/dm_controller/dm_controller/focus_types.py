@@ -1,0 +1,166 @@
+"""What goes into the focus controller and what comes out of it, without ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.errors import Refusal
+from dm_common.hysteresis.observer import Applied
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.planner import Move
+from dm_controller.planning.target import Request
+
+Floats = NDArray[np.float64]
+
+
+class Moment(NamedTuple):
+    """Now, by two clocks.
+
+    Attributes:
+        ns: ROS time, that commands, reports and creep go by; a simulator may let it run fast, or stop it.
+        steady: s, of a clock that goes on whatever ROS time does: silence and patience go by it.
+    """
+
+    ns: int
+    steady: float
+
+    @property
+    def time(self) -> float:
+        """ROS time, s."""
+        return 1e-9 * self.ns
+
+
+@dataclass(frozen=True, eq=False)
+class DriverReport:
+    """What the driver says; fields as in dm_msgs/ActuatorState.
+
+    Attributes:
+        applied: what stands at the actuators, or is on its way; `requested` is given there, empty = nothing yet.
+        stamp_ns: of the last write.
+        driver_state: ActuatorState.STATE_ACTIVE or another of these.
+        sequence: of reports, rising while the driver runs.
+        error_code: why a command is not followed.
+        message: the same as a sentence.
+    """
+
+    applied: Applied
+    requested: Floats
+    stamp_ns: int
+    driver_state: int
+    sequence: int = 0
+    error_code: int = 0
+    message: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of a request so far.
+
+    Attributes:
+        request: what was asked for.
+        stamp_ns: of the command, where one went out; else of the judgement.
+        active: the calibration in use; None = there was none.
+        move: None = refused before one was planned.
+        applied: the command went out.
+        pending: the mirror is degaussed first.
+        unknown: the reason why the actuators' history is not known; "" = it is.
+        creep_held: the shape is corrected for creep from now on.
+        refusal: None = not refused.
+    """
+
+    request: Request
+    stamp_ns: int
+    active: ActiveCalibration | None = None
+    move: Move | None = None
+    applied: bool = False
+    pending: bool = False
+    unknown: str = ""
+    creep_held: bool = False
+    refusal: Refusal | None = None
+
+
+@dataclass(eq=False)
+class Order:
+    """A request on its way through the controller, which alone changes it.
+
+    Attributes:
+        outcome: the latest.
+        pending: the mirror is degaussed first.
+        began: s, steady, when it was given or its command went out.
+        taken: the driver was seen to follow its command.
+        gap: largest distance from its shape seen, normalised.
+    """
+
+    request: Request
+    outcome: Outcome | None = None
+    pending: bool = False
+    began: float = 0.0
+    taken: bool = False
+    gap: float = 0.0
+
+
+class Progress(NamedTuple):
+    """How far an order is.
+
+    Attributes:
+        planning: the mirror is being degaussed for it.
+        share: 0 to 1 of that, or of the way.
+        remaining: normalised distance to the shape.
+        stands: the driver reports the shape.
+        failed: the refusal that ended it; None = it goes on.
+    """
+
+    planning: bool = False
+    share: float = 0.0
+    remaining: float = 0.0
+    stands: bool = False
+    failed: Refusal | None = None
+
+
+# --- commands and events ---
+
+
+@dataclass(frozen=True, eq=False)
+class SendCommand:
+    """Publish this actuator command.
+
+    Attributes:
+        signals: (N,)
+        stamp_ns: of its header.
+        expected_turns: it counts only while the driver reports so many; 0 = in any case.
+    """
+
+    signals: Floats
+    stamp_ns: int
+    expected_turns: int = 0
+
+
+class StartDegauss(NamedTuple):
+    """Have the driver degauss by `steps` half-swings (0 = as it does), and report the end of run `number`."""
+
+    number: int
+    steps: int
+
+
+class PublishState(NamedTuple):
+    """Publish what came of a request."""
+
+    outcome: Outcome
+
+
+class PublishCapabilities(NamedTuple):
+    """What the mirror can do has changed."""
+
+
+class Log(NamedTuple):
+    """A line for the log; `level` is "info", "warning" or "error"."""
+
+    level: str
+    text: str
+
+
+Effect = SendCommand | StartDegauss | PublishState | PublishCapabilities | Log

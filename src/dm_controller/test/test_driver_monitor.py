@@ -1,0 +1,100 @@
+"""What is made of a driver's reports, and of their absence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from dm_msgs.msg import ActuatorState
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.hysteresis.observer import Applied
+from dm_controller.driver_monitor import DriverMonitor
+from dm_controller.focus_types import DriverReport, Order, SendCommand
+from dm_controller.planning.target import Request
+
+TIMEOUT = 2.0
+HERE, THERE = np.full(37, 0.1), np.full(37, 0.2)
+#: Steady time of the last report and the command after it, s.
+BEGAN = 100.0
+
+
+def report(requested: np.ndarray = HERE, sequence: int = 1, **fields: Any) -> DriverReport:
+    fields.setdefault("driver_state", ActuatorState.STATE_ACTIVE)
+    applied = Applied(0.0, requested, 0, None, 0, True, requested=requested)
+    return DriverReport(applied, requested, fields.pop("stamp_ns", 0), sequence=sequence, **fields)
+
+
+def monitor(timeout: float = TIMEOUT) -> DriverMonitor:
+    made = DriverMonitor({"driver_timeout": timeout})
+    made.observe(report(), BEGAN)
+    made.sent(SendCommand(THERE, 10**9), Order(Request(curvature=0.01)), BEGAN)
+    return made
+
+
+def test_a_driver_that_never_reported_is_unavailable() -> None:
+    with pytest.raises(Refusal, match="is the driver running"):
+        DriverMonitor({"driver_timeout": TIMEOUT}).check(BEGAN)
+
+
+@pytest.mark.parametrize(("timeout", "refused"), [(TIMEOUT, True), (0.0, False)])
+def test_reports_grow_old(timeout: float, refused: bool) -> None:
+    driver = monitor(timeout)
+    driver.check(BEGAN + TIMEOUT)
+    later = BEGAN + TIMEOUT + 0.1
+    assert bool(driver.silent(later)) == bool(driver.stopped(later)) == refused
+    if refused:
+        with pytest.raises(Refusal, match=r"has not reported for 2.1 s \(driver_timeout 2 s\)") as caught:
+            driver.check(later)
+        assert caught.value.error_code == ErrorCode.DRIVER_UNAVAILABLE
+    else:
+        driver.check(later)
+
+
+def test_a_command_that_is_confirmed_is_not_told_of() -> None:
+    driver = monitor()
+    driver.observe(report(THERE), BEGAN + 0.5)
+    assert driver.untaken(BEGAN + 10.5) is None
+
+
+@pytest.mark.parametrize(
+    ("last", "code", "text"),
+    [
+        (report(), ErrorCode.PREEMPTED, "follows another one"),
+        (report(error_code=ErrorCode.STALE, message="too old"), ErrorCode.STALE, "too old"),
+        (report(driver_state=ActuatorState.STATE_INACTIVE), ErrorCode.DRIVER_INACTIVE, "not active"),
+        (None, ErrorCode.DRIVER_UNAVAILABLE, "has not reported"),
+    ],
+)
+def test_a_command_that_is_not_confirmed_is_told_of_once(last: DriverReport | None, code: int, text: str) -> None:
+    driver = monitor()
+    assert driver.untaken(BEGAN) is None
+    later = BEGAN + TIMEOUT + 0.1
+    if last is not None:
+        driver.observe(last, later)
+    untaken = driver.untaken(later)
+    assert untaken is not None
+    order, refusal = untaken
+    assert order is not None and order.request.curvature == 0.01
+    assert refusal.error_code == code
+    assert text in str(refusal)
+    assert driver.untaken(later) is None
+
+
+def test_a_driver_that_was_started_anew_is_noticed() -> None:
+    driver = monitor()
+    driver.observe(report(sequence=7), BEGAN)
+    assert driver.starts == 0
+    driver.observe(report(sequence=2), BEGAN)
+    assert driver.starts == 1
+
+
+def test_the_latency_is_from_the_command_to_its_first_write() -> None:
+    driver = monitor()
+    assert driver.latency == 0.0
+    assert driver.observe(report(THERE, stamp_ns=10**9 + 2_000_000), BEGAN)
+    assert driver.latency == pytest.approx(2e-3)
+    driver.sent(SendCommand(HERE, 10**9), None, BEGAN)
+    assert not driver.observe(report(HERE, stamp_ns=10**9 + 4_000_000), BEGAN)
+    assert driver.latency == pytest.approx(3e-3)

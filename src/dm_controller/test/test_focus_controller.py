@@ -1,0 +1,524 @@
+"""The focus controller in simulated time, before a driver that is played here: no process, no ROS."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from dm_msgs.msg import ActuatorHysteresis, ActuatorState, Calibration, FocusRequest, MirrorInfo, Recipe, RecipeBook
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
+from dm_common.hysteresis.observer import Applied
+from dm_common.messages import doubles
+from dm_common.optics.zernike import basis
+from dm_controller.focus_controller import FocusController
+from dm_controller.focus_types import (
+    DriverReport,
+    Effect,
+    Log,
+    Moment,
+    Order,
+    Outcome,
+    PublishCapabilities,
+    PublishState,
+    SendCommand,
+    StartDegauss,
+)
+from dm_controller.planning.target import Request
+
+ACTUATORS, POINTS, RADIUS = 37, 300, 11e-3
+CONDITIONED = FocusRequest.MODE_CONDITIONED
+#: Creep is quick, so that a shape needs corrections soon.
+LAW = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.85], [0.15]]), np.zeros(0), 0.0, 0.05, CREEP_TIMES)
+VALUES: dict[str, Any] = {
+    "reachable_tolerance": 5e-8,
+    "request_age": 1.0,
+    "settle_time": 0.05,
+    "move_timeout": 10.0,
+    "driver_timeout": 3.0,
+    "time_budget": 0.0,
+    "condition.degauss_steps": 0,
+    "condition.timeout": 20.0,
+    "hold.enable": True,
+    "hold.period": 0.02,
+    "hold.tolerance": 2e-10,
+    "hold.slew": 0.02,
+    "hold.resolution": 3e-5,
+    "calibration_age_max": 0.0,
+    "aperture_tolerance": 0.02,
+}
+
+
+def calibration(name: str = "known", law: HysteresisModel = LAW, **fields: Any) -> Calibration:
+    """Of a mirror whose actuators lift a bell of the surface each."""
+    random = np.random.default_rng(1)
+    angle, distance = random.uniform(0.0, 2.0 * np.pi, POINTS), np.sqrt(random.uniform(0.0, 1.0, POINTS))
+    x, y = distance * np.cos(angle), distance * np.sin(angle)
+    ring = [(0.0, 0.0)] + [
+        (0.4 * r * np.cos(k * np.pi / (3 * r)), 0.4 * r * np.sin(k * np.pi / (3 * r)))
+        for r in (1, 2, 3)
+        for k in range(6 * r)
+    ]
+    influence = np.array([2e-6 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.3) for a, b in ring]).T
+    terms = basis(x, y)
+    return Calibration(
+        id=name,
+        mirror_serial="M1",
+        actuators=ACTUATORS,
+        terms=21,
+        points=POINTS,
+        aperture_radius=RADIUS,
+        influence_zernike=doubles(np.linalg.lstsq(terms, influence, rcond=None)[0]),
+        zernike_offset=doubles(np.zeros(21)),
+        sample_x=doubles(x),
+        sample_y=doubles(y),
+        sample_weight=doubles(np.full(POINTS, 1.0 / POINTS)),
+        influence_sag=doubles(influence),
+        sag_offset=doubles(np.zeros(POINTS)),
+        held_out_rms=1e-9,
+        held_out_max_zernike=1e-9,
+        hysteresis=ActuatorHysteresis(
+            law="play",
+            play_radius=doubles(law.play_radius),
+            play_weight=doubles(law.play_weight),
+            powers=1,
+            creep_rate=law.creep_rate,
+            creep_time=doubles(law.creep_time),
+            zernike_sigma=doubles(np.full(21, 3e-10)),
+            held_out_max_zernike=1e-9,
+            unknown_sigma=0.05,
+        ),
+        **fields,
+    )
+
+
+MIRROR = MirrorInfo(
+    serial="M1",
+    actuators=ACTUATORS,
+    actuator_x=doubles(np.arange(37.0)),
+    actuator_y=doubles(np.zeros(37)),
+    working_aperture_diameter=2.0 * RADIUS,
+    signal_min=-1.0,
+    signal_max=1.0,
+    neighbour_difference_max=2.0,
+    slew_rate_max=100.0,
+)
+
+
+class Bench:
+    """A controller, and a driver that takes commands at once while `obeys`."""
+
+    def __init__(self, **values: Any) -> None:
+        self.controller = FocusController(VALUES | values)
+        self.controller.degauss_offered = True
+        self.time = 1000.0
+        self.signals, self.requested = np.zeros(ACTUATORS), np.zeros(0)
+        self.turns = self.degausses = self.sequence = 0
+        self.turned_at: np.ndarray | None = None
+        self.history_known, self.obeys = False, True
+        self.state = ActuatorState.STATE_ACTIVE
+        self.commands: list[SendCommand] = []
+        self.outcomes: list[Outcome] = []
+        self.degauss_runs: list[StartDegauss] = []
+        self.capabilities = 0
+        self.log: list[str] = []
+        self.mirror = LAW.demagnetised(ACTUATORS, self.time)
+        self.do(self.controller.use(calibration(), MIRROR))
+        self.report()
+
+    @property
+    def now(self) -> Moment:
+        return Moment(round(1e9 * self.time), self.time)
+
+    def do(self, effects: Iterable[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, SendCommand):
+                self.commands.append(effect)
+                if self.obeys and effect.expected_turns in (0, self.turns):
+                    self.move(effect.signals)
+            elif isinstance(effect, PublishState):
+                self.outcomes.append(effect.outcome)
+            elif isinstance(effect, StartDegauss):
+                self.degauss_runs.append(effect)
+            elif isinstance(effect, PublishCapabilities):
+                self.capabilities += 1
+            elif isinstance(effect, Log):
+                self.log.append(effect.text)
+
+    def move(self, signals: np.ndarray) -> None:
+        self.turns, self.turned_at = self.turns + 1, self.signals
+        self.signals = self.requested = signals
+        self.mirror = LAW.move(self.mirror, signals, self.time)
+        self.report()
+
+    def report(self, moving: bool = False, message: str = "") -> None:
+        self.sequence += 1
+        applied = Applied(
+            self.time, self.signals, self.turns, self.turned_at, self.degausses, self.history_known, moving,
+            self.requested,
+        )  # fmt: skip
+        report = DriverReport(applied, self.requested, self.now.ns, self.state, self.sequence, message=message)
+        self.do(self.controller.driver_report(report, self.now))
+
+    def degauss(self) -> None:
+        """The driver has degaussed, and says so."""
+        self.signals = self.requested = np.zeros(ACTUATORS)
+        self.turns, self.degausses, self.turned_at, self.history_known = self.turns + 1, self.degausses + 1, None, True
+        self.mirror = LAW.degaussed(self.mirror, self.time)
+        self.report()
+
+    def ask(self, curvature: float = 0.01, dry_run: bool = False, **fields: Any) -> Order:
+        order, effects = self.controller.request(Request(curvature, **fields), self.now, dry_run)
+        self.do(effects)
+        return order
+
+    def wait(self, seconds: float, step: float = 0.02) -> None:
+        """Let time pass, with ticks as often as the node makes them, and a report every half a second."""
+        end, next_report = self.time + seconds, self.time + 0.5
+        while self.time < end:
+            self.time += step
+            if self.obeys and self.time >= next_report:
+                next_report += 0.5
+                self.report()
+            self.do(self.controller.tick(self.now))
+
+    def refusal(self) -> Refusal:
+        refusal = self.outcomes[-1].refusal
+        assert refusal is not None
+        return refusal
+
+    def error(self, effective: np.ndarray) -> float:
+        """Largest distance of the effective signals from `effective`."""
+        return float(np.abs(LAW.effective(LAW.advance(self.mirror, self.time)) - effective).max())
+
+
+@pytest.fixture
+def bench() -> Bench:
+    made = Bench()
+    made.degauss()
+    return made
+
+
+def move_of(order: Order) -> Any:
+    assert order.outcome is not None and order.outcome.move is not None
+    return order.outcome.move
+
+
+def test_it_needs_no_ros() -> None:
+    code = "import sys, dm_controller.focus_controller; sys.exit('rclpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_request_becomes_a_command_and_then_a_state(bench: Bench) -> None:
+    order, effects = bench.controller.request(Request(0.01), bench.now)
+    assert [type(effect) for effect in effects] == [SendCommand, PublishState]
+    bench.do(effects)
+    assert bench.outcomes == [order.outcome]
+    assert bench.outcomes[0].applied and bench.outcomes[0].creep_held and bench.outcomes[0].unknown == ""
+    assert bench.controller.monitor.progress(order, bench.time).stands
+    assert bench.controller.monitor.latency == 0.0
+    bench.time += 0.05
+    assert bench.error(move_of(order).effective) < 1e-6
+
+
+def test_a_dry_run_changes_nothing(bench: Bench) -> None:
+    order = bench.ask(dry_run=True)
+    assert order.outcome is not None and order.outcome.move is not None
+    assert not (bench.commands or bench.outcomes)
+    assert not bench.controller.hold.active
+
+
+@pytest.mark.parametrize(
+    ("fields", "code", "text"),
+    [
+        ({"curvature": float("nan")}, ErrorCode.INVALID_ARGUMENT, "curvature = nan"),
+        ({"curvature": 9.0}, ErrorCode.UNREACHABLE, "reachable:"),
+        ({"mode": 7}, ErrorCode.INVALID_ARGUMENT, "mode = 7"),
+        ({"time_budget": -1.0}, ErrorCode.INVALID_ARGUMENT, "time_budget = -1.0 s"),
+        ({"stamp_ns": 1}, ErrorCode.STALE, "header.stamp"),
+        ({"mode": CONDITIONED}, ErrorCode.NOT_SUPPORTED, "no recipes"),
+    ],
+)
+def test_a_request_that_makes_no_sense_is_refused(bench: Bench, fields: dict[str, Any], code: int, text: str) -> None:
+    bench.ask(**fields)
+    assert bench.commands == []
+    assert bench.refusal().error_code == code
+    assert text in str(bench.refusal())
+    assert bench.log[-1].startswith("refused: ")
+
+
+def test_the_newest_request_wins(bench: Bench) -> None:
+    first, second = bench.ask(0.01), bench.ask(0.02)
+    assert len(bench.commands) == 2
+    failed = bench.controller.monitor.progress(first, bench.time).failed
+    assert failed is not None and failed.error_code == ErrorCode.PREEMPTED
+    assert bench.controller.monitor.progress(second, bench.time).stands
+    assert bench.controller.stop(first, bench.now) is None
+    bench.do(bench.controller.stop(second, bench.now) or [])
+    assert not bench.controller.hold.active
+    assert not bench.controller.monitor.keeps(second)
+
+
+def test_a_closed_loop_has_the_mirror_for_itself(bench: Bench) -> None:
+    bench.ask(0.01)
+    bench.controller.reserved = "a closed loop is running"
+    bench.ask(0.02)
+    assert bench.refusal().error_code == ErrorCode.BUSY
+    bench.wait(2.0)
+    assert len(bench.commands) == 1
+
+
+def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:
+    bench = Bench()
+    before = bench.ask(dry_run=True)
+    assert before.outcome is not None and "moved before" in before.outcome.unknown
+    told = bench.capabilities
+    bench.degauss()
+    assert bench.capabilities > told
+    after = bench.ask(dry_run=True)
+    assert after.outcome is not None and after.outcome.unknown == ""
+    assert move_of(after).plan.max_zernike_upper < 0.1 * move_of(before).plan.max_zernike_upper
+
+
+def test_lost_turns_make_the_history_unknown(bench: Bench) -> None:
+    bench.turns += 5
+    bench.move(np.full(ACTUATORS, 0.1))
+    outcome = bench.ask(dry_run=True).outcome
+    assert outcome is not None and "turns were not seen" in outcome.unknown
+
+
+# --- a degauss on the way ---
+
+
+def test_a_degauss_on_the_way(bench: Bench) -> None:
+    bench.history_known = False
+    bench.report()
+    order = bench.ask(0.01, time_budget=60.0)
+    (run,) = bench.degauss_runs
+    assert order.pending and bench.commands == [] and bench.outcomes[-1].pending
+    assert bench.controller.monitor.progress(order, bench.time).planning
+    bench.time += 2.0
+    bench.do(bench.controller.degauss_answered(run.number, bench.now, 2.0))
+    assert bench.commands == []  # the report is still to come
+    bench.degauss()
+    assert len(bench.commands) == 1 and bench.outcomes[-1].applied and bench.outcomes[-1].unknown == ""
+    assert not order.pending and bench.controller.monitor.progress(order, bench.time).stands
+    active = bench.controller.active
+    assert active is not None and bench.controller.conditioning.duration(0, active) == 2.0
+
+
+def test_the_newest_request_follows_the_degauss(bench: Bench) -> None:
+    bench.history_known = False
+    bench.report()
+    first, second = bench.ask(0.01, time_budget=60.0), bench.ask(0.02)
+    assert len(bench.degauss_runs) == 1
+    assert first.outcome is not None and first.outcome.refusal is not None
+    assert first.outcome.refusal.error_code == ErrorCode.PREEMPTED
+    bench.ask(9.0)  # refused; the one before goes on waiting
+    assert second.pending
+    bench.degauss()
+    bench.do(bench.controller.degauss_answered(bench.degauss_runs[0].number, bench.now, 0.2))
+    assert [outcome.request.curvature for outcome in bench.outcomes if outcome.applied] == [0.02]
+
+
+def test_a_withdrawn_order_leaves_the_mirror_degaussed(bench: Bench) -> None:
+    bench.history_known = False
+    bench.report()
+    order = bench.ask(0.01, time_budget=60.0)
+    assert bench.controller.conditioning.withdraw(order)
+    assert not bench.controller.conditioning.withdraw(order)
+    bench.degauss()
+    bench.do(bench.controller.degauss_answered(bench.degauss_runs[0].number, bench.now, 0.2))
+    assert bench.commands == [] and not bench.controller.conditioning.busy
+
+
+def stopped(bench: Bench) -> None:
+    bench.state = ActuatorState.STATE_INACTIVE
+    bench.report(message="deactivated")
+
+
+def restarted(bench: Bench) -> None:
+    bench.sequence = 0
+    bench.report()
+
+
+def silent(bench: Bench) -> None:
+    bench.obeys = False
+    bench.wait(4.0)
+
+
+def refused(bench: Bench) -> None:
+    refusal = Refusal(ErrorCode.BUSY, "conditioning: a degauss is under way")
+    bench.do(bench.controller.degauss_answered(bench.degauss_runs[-1].number, bench.now, refusal=refusal))
+
+
+def unanswered(bench: Bench) -> None:
+    bench.wait(21.0)
+
+
+def unreported(bench: Bench) -> None:
+    bench.do(bench.controller.degauss_answered(bench.degauss_runs[-1].number, bench.now, 0.2))
+    bench.wait(2.5)
+
+
+@pytest.mark.parametrize(
+    ("accident", "code", "text"),
+    [
+        (stopped, ErrorCode.DRIVER_UNAVAILABLE, "left its active state: deactivated"),
+        (restarted, ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver was restarted"),
+        (silent, ErrorCode.DRIVER_UNAVAILABLE, "has not reported"),
+        (refused, ErrorCode.BUSY, "a degauss is under way"),
+        (unanswered, ErrorCode.DRIVER_UNAVAILABLE, "no answer within 20 s"),
+        (unreported, ErrorCode.TIMEOUT, "did not report the degauss"),
+    ],
+)
+def test_a_degauss_that_fails_ends_the_order(
+    bench: Bench, accident: Callable[[Bench], None], code: int, text: str
+) -> None:
+    bench.history_known = False
+    bench.report()
+    order = bench.ask(0.01, time_budget=60.0)
+    accident(bench)
+    bench.do(bench.controller.tick(bench.now))
+    assert bench.refusal().error_code == code and text in str(bench.refusal())
+    assert order.outcome is bench.outcomes[-1] and bench.commands == []
+    # An answer that comes too late counts for nothing.
+    assert bench.controller.degauss_answered(bench.degauss_runs[0].number, bench.now, 0.2) == []
+
+
+def test_a_recipe_follows_its_degauss(bench: Bench) -> None:
+    effective = np.random.default_rng(3).uniform(-0.4, 0.4, ACTUATORS)
+    recipe = Recipe(curvature=0.01, effective=doubles(effective), signals=doubles(effective), max_zernike=5e-10)
+    bench.do(
+        bench.controller.use(calibration("recipes", recipes=RecipeBook(degauss_steps=60, recipes=[recipe])), MIRROR)
+    )
+    bench.ask(0.01, mode=CONDITIONED)
+    assert bench.degauss_runs[-1].steps == 60
+    bench.degauss()
+    bench.do(bench.controller.degauss_answered(bench.degauss_runs[-1].number, bench.now, 1.0))
+    assert bench.outcomes[-1].applied
+    bench.time += 0.05
+    assert bench.error(effective) < 1e-6
+
+
+# --- the driver ---
+
+
+def test_a_lost_driver(bench: Bench) -> None:
+    order = bench.ask(0.01)
+    bench.obeys = False
+    bench.wait(4.0)
+    failed = bench.controller.monitor.progress(order, bench.time).failed
+    assert failed is not None and failed.error_code == ErrorCode.DRIVER_UNAVAILABLE
+    bench.ask(0.02)
+    assert "has not reported" in str(bench.refusal())
+    bench.obeys = True
+    bench.report()
+    bench.ask(0.02)
+    assert bench.outcomes[-1].applied
+
+
+def test_a_driver_that_is_not_active(bench: Bench) -> None:
+    bench.ask(0.01)
+    bench.state = ActuatorState.STATE_LINK_LOST
+    bench.report(message="the link is lost")
+    assert not bench.controller.hold.active
+    bench.ask(0.02)
+    assert bench.refusal().error_code == ErrorCode.DRIVER_INACTIVE and "the link is lost" in str(bench.refusal())
+
+
+def test_a_driver_that_does_not_take_the_command(bench: Bench) -> None:
+    bench.obeys = False
+    order = bench.ask(0.01)
+    assert bench.outcomes[-1].applied
+    for _ in range(8):
+        bench.time += 0.5
+        bench.report()
+        bench.do(bench.controller.tick(bench.now))
+    assert bench.refusal().error_code == ErrorCode.PREEMPTED
+    assert "not taken the command within 3 s" in str(bench.refusal())
+    assert order.outcome is bench.outcomes[-1] and len(bench.outcomes) == 2
+    assert not bench.controller.hold.active
+
+
+def test_an_order_that_takes_too_long(bench: Bench) -> None:
+    order = bench.ask(0.01)
+    bench.report(moving=True)
+    bench.time += 11.0
+    bench.report(moving=True, message="the slew rate is low")
+    failed = bench.controller.monitor.progress(order, bench.time).failed
+    assert failed is not None and failed.error_code == ErrorCode.TIMEOUT and "slew rate" in str(failed)
+
+
+# --- holding a shape ---
+
+
+def test_a_held_shape_is_corrected_for_creep(bench: Bench) -> None:
+    order = bench.ask(0.02)
+    left_alone = bench.mirror
+    bench.wait(20.0)
+    corrections = bench.commands[1:]
+    assert len(corrections) > 5
+    # Each counts only for the shape before it.
+    assert [command.expected_turns for command in corrections] == list(range(2, 2 + len(corrections)))
+    effective = move_of(order).effective
+    drifted = np.abs(LAW.effective(LAW.advance(left_alone, bench.time)) - effective).max()
+    assert bench.error(effective) < 0.05 * drifted
+    assert bench.controller.monitor.progress(order, bench.time).stands
+    assert len(bench.outcomes) == 1
+
+
+def test_a_correction_never_undoes_the_command_of_another(bench: Bench) -> None:
+    bench.ask(0.02)
+    shape = np.full(ACTUATORS, 0.1)
+    # It reaches the driver first; its report is on the way when the correction goes out.
+    bench.time += 0.5
+    report = bench.controller.driver_report
+    bench.controller.driver_report = lambda *_: []  # type: ignore[method-assign, assignment]
+    bench.move(shape)
+    bench.do(bench.controller.tick(bench.now))
+    bench.controller.driver_report = report  # type: ignore[method-assign]
+    assert bench.commands[-1].expected_turns == bench.turns - 1
+    assert (bench.signals == shape).all()
+    bench.wait(3.0)
+    assert (bench.signals == shape).all() and not bench.controller.hold.active
+
+
+def test_a_new_calibration_while_a_shape_is_held(bench: Bench) -> None:
+    bench.ask(0.02)
+    bench.do(bench.controller.use(calibration(revision=2), MIRROR))
+    assert bench.controller.hold.active  # the same calibration, improved by a map
+    assert bench.controller.observer.unknown == ""
+    bench.do(bench.controller.use(calibration("another"), MIRROR))
+    assert not bench.controller.hold.active and "another calibration" in bench.controller.hold.ended
+    assert bench.controller.observer.unknown == ""  # what was reported is followed under the new law, too
+    sent = len(bench.commands)
+    bench.wait(5.0)
+    assert len(bench.commands) == sent
+    bench.ask(0.01)
+    assert bench.outcomes[-1].applied
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        (None, ErrorCode.NOT_CALIBRATED),
+        (calibration(), ErrorCode.CALIBRATION_MISMATCH),
+        (calibration(), ErrorCode.CALIBRATION_UNREADABLE),
+    ],
+)
+def test_a_calibration_that_cannot_be_used_ends_the_hold(bench: Bench, message: Any, code: int) -> None:
+    if code == ErrorCode.CALIBRATION_MISMATCH:
+        message.mirror_serial = "M2"
+    elif message is not None:
+        message.hysteresis.creep_rate = 3.0
+    bench.ask(0.02)
+    bench.do(bench.controller.use(message, MIRROR))
+    assert not bench.controller.hold.active
+    bench.ask(0.01)
+    assert bench.refusal().error_code == code
