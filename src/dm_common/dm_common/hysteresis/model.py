@@ -117,7 +117,8 @@ class HysteresisModel:
 
     def same_as(self, other: HysteresisModel) -> bool:
         """Whether two laws are the same, number for number."""
-        return all(np.array_equal(getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        names = (item.name for item in fields(self))
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     @cached_property
     def _duhem(self) -> DuhemOperator | None:
