@@ -479,7 +479,7 @@ def test_a_correction_never_undoes_the_command_of_another(bench: Bench) -> None:
     # It reaches the driver first; its report is on the way when the correction goes out.
     bench.time += 0.5
     report = bench.controller.driver_report
-    bench.controller.driver_report = lambda *_: []  # type: ignore[method-assign, assignment]
+    bench.controller.driver_report = lambda *_: []  # type: ignore[method-assign]
     bench.move(shape)
     bench.do(bench.controller.tick(bench.now))
     bench.controller.driver_report = report  # type: ignore[method-assign]
