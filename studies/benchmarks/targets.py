@@ -172,7 +172,7 @@ TARGETS: tuple[Target, ...] = (
         lambda f: {"bench": f["calibration"]["full"]["bench_s"]},
     ),
     Target(
-        "the same, plan MEMORY",
+        "the same, plan HYSTERESIS",
         "s",
         lambda f: f["calibration"]["hysteresis"]["compute_s"],
         lambda f: 0.05 * f["calibration"]["hysteresis"]["bench_s"],
