@@ -1,4 +1,4 @@
-"""Faults around all real processes of a calibration, judged by the monitor in the emulated electronics."""
+"""Faults around all real processes of a calibration, checked by the monitor in the emulated electronics."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from fault_injection.fault import run_faults
 from fault_injection.faults.calibration_faults import FAULTS
-from fault_injection.faults.fault import run_faults
 
 pytestmark = pytest.mark.processes
 

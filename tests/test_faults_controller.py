@@ -7,7 +7,7 @@ from random import Random
 
 import pytest
 
-from fault_injection.faults.fault import FaultRecord, run_faults
+from fault_injection.fault import FaultRecord, run_faults
 from fault_injection.faults.registry import GROUPS, OTHERS, select
 from fault_injection.rigs.focus_rig import FocusRig
 

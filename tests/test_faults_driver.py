@@ -1,4 +1,4 @@
-"""Faults around a real driver process, judged by the monitor in the emulated electronics."""
+"""Faults around a real driver process, checked by the monitor in the emulated electronics."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from random import Random
 import numpy as np
 import pytest
 
+from fault_injection.fault import Fault, FaultRecord, run_faults
 from fault_injection.faults.driver_faults import REGISTRY, select
-from fault_injection.faults.fault import Fault, FaultRecord, run_faults
 from fault_injection.rigs.driver_rig import DriverRig
 
 pytestmark = pytest.mark.processes

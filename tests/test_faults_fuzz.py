@@ -12,10 +12,10 @@ import pytest
 from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
 from dm_calibration.store.hdf5_image import ImageError, read_image, write_image
 from dm_calibration.store.hdf5_sandbox import Hdf5Sandbox, SandboxError
-from fault_injection.fuzz.classify import Verdict, judge
+from fault_injection.fuzz.classify import Verdict, classify
 from fault_injection.fuzz.fuzz import fuzz
 from fault_injection.fuzz.mutations import Mutation, mutate
-from fault_injection.fuzz.reference_files import FORMATS, XYZ_UNIT, ReferenceFile, intact
+from fault_injection.fuzz.reference_files import FORMATS, XYZ_UNIT, ReferenceFile, reference_file
 
 pytestmark = pytest.mark.processes
 
@@ -34,13 +34,13 @@ def test_no_damaged_file_crashes_hangs_or_becomes_a_wrong_map(name: str, tmp_pat
 
 
 def test_a_damaged_file_can_be_made_again() -> None:
-    file = intact("datx")
+    file = reference_file("datx")
     assert mutate(file, 1, 17) == mutate(file, 1, 17)
     assert len({mutate(file, 1, number).content for number in range(30)}) > 25
 
 
-def read_intact(name: str, folder: Path) -> tuple[ReferenceFile, SurfaceMap]:
-    file = intact(name)
+def read_reference(name: str, folder: Path) -> tuple[ReferenceFile, SurfaceMap]:
+    file = reference_file(name)
     path = folder / f"whole{file.suffix}"
     path.write_bytes(file.content)
     return file, read_map(path, xyz_unit=XYZ_UNIT)
@@ -48,24 +48,24 @@ def read_intact(name: str, folder: Path) -> tuple[ReferenceFile, SurfaceMap]:
 
 @pytest.mark.parametrize("name", ["dat", "datx", "asc", "xyz"])
 def test_maps_that_the_damage_does_not_explain_are_called_wrong(name: str, tmp_path: Path) -> None:
-    file, whole = read_intact(name, tmp_path)
+    file, whole = read_reference(name, tmp_path)
     nothing = Mutation("none", file.content)
-    assert judge(file, whole, nothing, whole) is Verdict.INTACT
+    assert classify(file, whole, nothing, whole) is Verdict.INTACT
     for sag in (2 * whole.sag, np.roll(whole.sag, 1), whole.sag.T, np.where(whole.sag > 0, whole.sag, np.nan)):
-        assert judge(file, whole, nothing, replace(whole, sag=sag)) is Verdict.WRONG_MAP
-    assert judge(file, whole, nothing, replace(whole, wavelength=5e-7)) is Verdict.WRONG_MAP
-    assert judge(file, whole, nothing, replace(whole, pitch=None)) is Verdict.WRONG_MAP
+        assert classify(file, whole, nothing, replace(whole, sag=sag)) is Verdict.WRONG_MAP
+    assert classify(file, whole, nothing, replace(whole, wavelength=5e-7)) is Verdict.WRONG_MAP
+    assert classify(file, whole, nothing, replace(whole, pitch=None)) is Verdict.WRONG_MAP
 
 
 def test_a_changed_sample_and_a_changed_scale_are_told_apart(tmp_path: Path) -> None:
-    file, whole = read_intact("dat", tmp_path)
+    file, whole = read_reference("dat", tmp_path)
     for place, verdict in (("samples", Verdict.OTHER_SAMPLES), ("scale", Verdict.OTHER_HEADER)):
         content = bytearray(file.content)
         ((start, end),) = file.places[place]
         content[(start + end) // 2 + 1] ^= 1
         path = tmp_path / "changed.dat"
         path.write_bytes(content)
-        assert judge(file, whole, Mutation("one bit", bytes(content)), read_map(path)) is verdict
+        assert classify(file, whole, Mutation("one bit", bytes(content)), read_map(path)) is verdict
 
 
 def test_a_reader_that_kills_its_process_is_told_and_the_next_file_is_read(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_a_reader_that_kills_its_process_is_told_and_the_next_file_is_read(tmp_p
     try:
         with pytest.raises(SandboxError, match="ended the helper process with status 1"):
             sandbox.read("no such reader", b"")
-        file = intact("datx")
+        file = reference_file("datx")
         answer = sandbox.read("datx", file.content)
         assert answer.arrays["sag"].shape == (20, 24)
     finally:
@@ -106,7 +106,7 @@ def test_promises_of_gigabytes_cost_nothing(tmp_path: Path) -> None:
     ],
 )
 def test_sizes_of_a_dat_file_that_contradict_each_other(tmp_path: Path, place: int, value: bytes, words: str) -> None:
-    content = bytearray(intact("dat").content)
+    content = bytearray(reference_file("dat").content)
     content[place : place + len(value)] = value
     path = tmp_path / "a.dat"
     path.write_bytes(content)
@@ -126,7 +126,7 @@ def test_values_of_a_datx_file_that_contradict_each_other(
     tmp_path: Path, name: str, value: np.ndarray, words: str
 ) -> None:
     path = tmp_path / "a.datx"
-    path.write_bytes(intact("datx").content)
+    path.write_bytes(reference_file("datx").content)
     with h5py.File(path, "r+") as file:
         (surface,) = file["Data/Surface"].values()
         surface.attrs[name] = value
@@ -136,7 +136,7 @@ def test_values_of_a_datx_file_that_contradict_each_other(
 
 def test_a_datx_file_that_goes_on_beyond_its_end_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.datx"
-    path.write_bytes(intact("datx").content + b"more")
+    path.write_bytes(reference_file("datx").content + b"more")
     with pytest.raises(MapFileError, match="longer than its superblock says"):
         read_map(path)
 
@@ -155,7 +155,7 @@ def test_texts_that_are_no_text_disagree_with_the_hash(tmp_path: Path) -> None:
 @pytest.mark.parametrize("shift", [-256, -128, -8, 8, 32, 640])
 def test_a_damaged_address_of_a_datx_map_is_noticed(tmp_path: Path, shift: int) -> None:
     """Nothing in the format tells twice where the values stand."""
-    file = intact("datx")
+    file = reference_file("datx")
     ((start, _end),) = file.places["samples"]
     old, new = (address.to_bytes(8, "little") for address in (start, start + shift))
     assert file.content.count(old) == 1

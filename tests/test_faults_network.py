@@ -9,10 +9,10 @@ from random import Random
 
 import pytest
 
-from fault_injection.faults import fault as faults
-from fault_injection.faults.fault import Fault, FaultRecord, run_faults
+from fault_injection import fault as faults
+from fault_injection.fault import Fault, FaultRecord, run_faults
 from fault_injection.faults.registry import select
-from fault_injection.rigs.netem import Netem, bad_cable
+from fault_injection.rigs.netem import Netem, bad_network
 from studies.network_namespaces import NotPermittedError, inside
 
 pytestmark = pytest.mark.processes
@@ -24,7 +24,7 @@ DATAGRAMS = 2000
 def wire() -> Iterator[tuple[Netem, socket.socket, socket.socket]]:
     """A cable, and a socket on each of its hosts."""
     try:
-        with bad_cable(Random(3)) as (left, right, cable):
+        with bad_network(Random(3)) as (left, right, cable):
             ends: list[socket.socket] = []
             for number, host in enumerate((left, right), 1):
                 with inside(host):

@@ -7,8 +7,8 @@ from random import Random
 
 import pytest
 
+from fault_injection.fault import run_faults
 from fault_injection.faults import process_faults, wire_faults
-from fault_injection.faults.fault import run_faults
 from fault_injection.faults.wire_faults import Storm
 
 pytestmark = pytest.mark.processes

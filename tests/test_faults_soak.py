@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fault_injection.soak import NODES, RATE, WINDOWS, SoakResult, Window, soak
+from fault_injection.soak import RATE, WINDOWS, soak
+from fault_injection.soak_result import NODES, SoakResult, Window
 
 pytestmark = pytest.mark.processes
 

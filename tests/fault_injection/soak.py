@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -42,6 +41,7 @@ from dm_bringup.suite import Suite, stop_processes
 from dm_common.ros import qos
 from dm_common.ros.executor import make_executor
 from dm_tools.demo.demo import bench_config
+from fault_injection.soak_result import NODES, SoakResult, Window
 from studies.benchmarks import stand_in_mirror
 
 RATE = 200.0  # 1/s
@@ -49,110 +49,12 @@ RATE = 200.0  # 1/s
 RELAY_SHARE = 10
 LAW, TWIN_LAW, CREEP = "Prandtl-Ishlinskii", "prandtl_ishlinskii", 0.01
 REACH = 0.01  # 1/m: the way takes less than a period
-NODES = ("virtual_bench", "pdm_driver", "focus_controller")
 #: Longest wait for the nodes, and for the last answers, s.
 PATIENCE_S, LAST_S = 60.0, 2.0
 #: Share of the run that does not count, caches and logs of fixed length fill up meanwhile; and its bounds, s.
 WARM_UP, WARM_UP_LEAST_S, WARM_UP_MOST_S = 0.2, 5.0, 180.0
 #: Windows that what counts is cut into; start and end are the medians over the first and the last fifth of them.
 WINDOWS = 20
-#: What may be added from start to end before it counts as growth.
-GROWTH_MB, GROWTH_COUNT = 8.0, 2
-
-
-@dataclass
-class Window:
-    """What was seen in a part of the run.
-
-    Attributes:
-        latency_us: from a request to its command, one each.
-        relay_us: the same of the bare relay.
-        rss_mb, handles, threads: by node, at the end of the window.
-    """
-
-    latency_us: list[float] = field(default_factory=list)
-    relay_us: list[float] = field(default_factory=list)
-    rss_mb: dict[str, float] = field(default_factory=dict)
-    handles: dict[str, int] = field(default_factory=dict)
-    threads: dict[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class SoakResult:
-    """How a long run went.
-
-    Attributes:
-        seconds: from the first request to the last, warm-up included.
-        requests: sent.
-        answered: requests of which `focus_state` told; the others were overtaken by a newer one.
-        refused: of them.
-        limit_violations: frames at the emulated electronics beyond a limit.
-        windows: after the warm-up, in order.
-    """
-
-    seconds: float
-    requests: int
-    answered: int
-    refused: int
-    limit_violations: int
-    windows: tuple[Window, ...]
-
-    def growth(self, name: str) -> dict[str, float]:
-        """By node: of `rss_mb`, `handles` or `threads`, from start to end."""
-        rows = [getattr(window, name) for window in self.windows]
-        return {node: _end(values) - _start(values) for node in NODES if (values := [row[node] for row in rows])}
-
-    def p99_us(self, name: str = "latency_us") -> tuple[float, float]:
-        """99th percentile of the latency at start and end; of the relay with the name `relay_us`."""
-        samples = [getattr(window, name) for window in self.windows]
-        levels = [float(np.percentile(each, 99)) for each in samples if each]
-        return (_start(levels), _end(levels)) if levels else (float("nan"), float("nan"))
-
-    def complaints(self) -> list[str]:
-        """What was harmed, lost or has grown, in words."""
-        found = []
-        if self.limit_violations:
-            found.append(f"{self.limit_violations} frames beyond a limit")
-        if self.refused:
-            found.append(f"{self.refused} requests refused")
-        for name, most in (("rss_mb", GROWTH_MB), ("handles", GROWTH_COUNT), ("threads", GROWTH_COUNT)):
-            found += [
-                f"{name} of {node} grew by {grown:.1f}" for node, grown in self.growth(name).items() if grown > most
-            ]
-        return found
-
-    def figures(self) -> dict[str, Any]:
-        """For JSON."""
-        start, end = self.p99_us()
-        relay_start, relay_end = self.p99_us("relay_us")
-        by_node = self.growth("rss_mb")
-        return {
-            "minutes": self.seconds / 60.0,
-            "requests": self.requests,
-            "answered": self.answered,
-            "refused": self.refused,
-            "rate": self.requests / self.seconds,
-            "limit_violations": self.limit_violations,
-            "rss_growth_mb": max(by_node.values()),
-            "rss_growth_mb_by_node": by_node,
-            "rss_mb": self.windows[-1].rss_mb,
-            "handles_growth": max(self.growth("handles").values()),
-            "threads_growth": max(self.growth("threads").values()),
-            "handles": self.windows[-1].handles,
-            "threads": self.windows[-1].threads,
-            "p99_start_us": start,
-            "p99_end_us": end,
-            "p99_ratio_end_to_start": end / start,
-            "relay_p99_ratio_end_to_start": relay_end / relay_start,
-        }
-
-
-def _start(values: list[float]) -> float:
-    return float(np.median(values[: max(len(values) // 5, 1)]))
-
-
-def _end(values: list[float]) -> float:
-    return float(np.median(values[-max(len(values) // 5, 1) :]))
 
 
 def look_at_processes(pids: dict[str, int], window: Window) -> None:

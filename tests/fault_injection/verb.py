@@ -88,11 +88,12 @@ def faults(
 ) -> None:
     """Inject faults into real processes, damage files, run for long; exit status 1 when anything was harmed or lost."""
     from dm_bringup.suite import own_domain
-    from fault_injection.faults.fault import run_faults
+    from fault_injection.fault import run_faults
     from fault_injection.faults.registry import OTHERS, select
     from fault_injection.fuzz.fuzz import fuzz_all
     from fault_injection.fuzz.reference_files import FORMATS
-    from fault_injection.soak import SoakResult, soak
+    from fault_injection.soak import soak
+    from fault_injection.soak_result import SoakResult
 
     names = [name.strip() for name in only.split(",") if name.strip()]
     single = [name for name in names if name not in OTHERS]

@@ -26,9 +26,9 @@ from dm_calibration.procedure.run_journal import read_run
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.worker import answers_arrive
-from fault_injection.faults.fault import Fault, FaultRecord
+from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import RigError
-from fault_injection.rigs.parts import judged
+from fault_injection.rigs.parts import checked
 from fault_injection.rigs.process_rig import ProcessRig
 
 #: Push and pull of 37 actuators, a reference frame before each ten and at the end.
@@ -122,7 +122,7 @@ class _Runs:
 
 @contextmanager
 def _runs(folder: Path, domain: int, record: FaultRecord) -> Iterator[_Runs]:
-    with ProcessRig(folder, domain, _NODES, limits__slew_rate=40.0, degauss__steps=20) as rig, judged(rig, record):
+    with ProcessRig(folder, domain, _NODES, limits__slew_rate=40.0, degauss__steps=20) as rig, checked(rig, record):
         rig.all_works()
         yield _Runs(rig, record)
 

@@ -1,4 +1,4 @@
-"""Faults around the focus controller: its calibration, its driver, its clients, and goals that end half way."""
+"""Faults around the focus controller: its calibration, its driver, its clients."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from dm_msgs.action import Converge, MoveFocus
 from dm_msgs.msg import ActuatorState, Capabilities, ErrorCode, FocusRequest
-from dm_msgs.srv import Degauss
 from lifecycle_msgs.msg import Transition
 
-from fault_injection.faults.fault import Fault, FaultRecord
-from fault_injection.rigs.driver_rig import PATIENCE_S, RigError
+from fault_injection.fault import Fault, FaultRecord
+from fault_injection.rigs.driver_rig import RigError
 from fault_injection.rigs.focus_rig import ANSWER_S, DRIVER_TIMEOUT_S, FocusRig
-from fault_injection.rigs.parts import judged
+from fault_injection.rigs.parts import checked
 
 #: Injections per start of the nodes.
 ROUNDS = 3
@@ -33,7 +32,7 @@ CLIENTS, CLIENT_PROCESSES, REQUESTS = 100, 4, 8
 CLIENTS_S = 240.0
 
 Injection = Callable[[FocusRig, Random, FaultRecord], None]
-_REGISTRY: dict[str, Fault] = {}
+REGISTRY: dict[str, Fault] = {}
 
 
 def fault(words: str, rounds: int = ROUNDS, **parameters: Any) -> Callable[[Injection], Injection]:
@@ -41,20 +40,21 @@ def fault(words: str, rounds: int = ROUNDS, **parameters: Any) -> Callable[[Inje
 
     def register(inject: Injection) -> Injection:
         def run(folder: Path, domain: int, random: Random, record: FaultRecord) -> None:
-            with FocusRig(folder, domain, **parameters) as rig, judged(rig, record):
+            with FocusRig(folder, domain, **parameters) as rig, checked(rig, record):
                 rig.refocus(random)
                 for _ in range(rounds):
                     inject(rig, random, record)
                     record.injected += 1
                     record.recovery_s.append(rig.refocus(random))
 
-        _REGISTRY[inject.__name__] = Fault(inject.__name__, words, run)
+        REGISTRY[inject.__name__] = Fault(inject.__name__, words, run)
         return inject
 
     return register
 
 
-def _lost(record: FaultRecord, words: str) -> None:
+def lost(record: FaultRecord, words: str) -> None:
+    """Count a loss, with the reason."""
     record.lost += 1
     record.remarks.append(words)
 
@@ -64,10 +64,10 @@ def _expect_refusal(rig: FocusRig, random: Random, record: FaultRecord, *codes: 
     before = rig.frames
     state = rig.set_focus(rig.curvature(random))
     if state.error_code not in codes or not state.message:
-        _lost(record, f"must be refused with {codes}: error code {state.error_code}, {state.message!r}")
+        lost(record, f"must be refused with {codes}: error code {state.error_code}, {state.message!r}")
     time.sleep(0.1)
     if rig.frames != before:
-        _lost(record, "the mirror moved after a request that was refused")
+        lost(record, "the mirror moved after a request that was refused")
 
 
 # The calibration
@@ -90,7 +90,7 @@ def stale_calibration(rig: FocusRig, random: Random, record: FaultRecord) -> Non
     rig.wait(lambda: rig.capabilities[-1].calibration_id == "old", "the old calibration")
     state = rig.set_focus(rig.curvature(random))
     if "stale" not in state.message or "stale" not in rig.capabilities[-1].message:
-        _lost(record, f"a stale calibration was used without a word: {state.message!r}")
+        lost(record, f"a stale calibration was used without a word: {state.message!r}")
     rig.account_for(state, record)
     rig.calibrate()
 
@@ -146,11 +146,11 @@ def _without_driver(rig: FocusRig, random: Random, record: FaultRecord) -> None:
     deadline = time.monotonic() + DRIVER_TIMEOUT_S + ANSWER_S
     while (state := rig.set_focus(rig.curvature(random))).error_code == ErrorCode.OK:
         if time.monotonic() > deadline:
-            _lost(record, "requests are accepted though there is no driver")
+            lost(record, "requests are accepted though there is no driver")
             return
         time.sleep(0.2)
     if state.error_code != ErrorCode.DRIVER_UNAVAILABLE or not state.message:
-        _lost(record, f"no driver: error code {state.error_code}, {state.message!r}")
+        lost(record, f"no driver: error code {state.error_code}, {state.message!r}")
 
 
 @fault("kill -9 of the driver in the middle of a move that somebody waits for")
@@ -164,7 +164,7 @@ def driver_dies_in_move(rig: FocusRig, random: Random, record: FaultRecord) -> N
         # The driver was quick enough to end the move; its last frames may still be on their way to the unit.
         rig.account_for(outcome.state, record)
     elif not outcome.message:
-        _lost(record, f"a move without driver: error code {outcome.error_code}, without a word")
+        lost(record, f"a move without driver: error code {outcome.error_code}, without a word")
     _without_driver(rig, random, record)
     rig.start()
 
@@ -211,7 +211,7 @@ def driver_stopped_in_loop(rig: FocusRig, random: Random, record: FaultRecord) -
     outcome = result.result().result
     ended = outcome.error_code == ErrorCode.OK and rig.near(outcome.signals)  # before the driver was stopped
     if not ended and (outcome.error_code == ErrorCode.OK or not outcome.message):
-        _lost(record, f"a loop without driver: error code {outcome.error_code}, {outcome.message!r}")
+        lost(record, f"a loop without driver: error code {outcome.error_code}, {outcome.message!r}")
     rig.send_signal(signal.SIGCONT)
 
 
@@ -257,113 +257,4 @@ def hundred_clients(rig: FocusRig, random: Random, record: FaultRecord) -> None:
         record.remarks.append(f"not answered {unanswered}, {dict(figures)}")
 
 
-# Goals that end half way
-
-
-def _end_somehow(rig: FocusRig, random: Random, handle: Any, result: Any) -> Any:
-    """Cancel at some moment; returns the result."""
-    time.sleep(random.choice((0.0, random.uniform(0.0, 0.02), random.uniform(0.0, 1.0))))
-    handle.cancel_goal_async()
-    rig.wait(result.done, "the result of a goal that was cancelled", ANSWER_S)
-    return result.result().result
-
-
-def _check_ended(record: FaultRecord, outcome: Any, *codes: int) -> None:
-    if outcome.error_code not in codes or not outcome.message:
-        _lost(record, f"ended with error code {outcome.error_code}, {outcome.message!r}; expected {codes}")
-
-
-def _check_at_rest(rig: FocusRig, record: FaultRecord) -> None:
-    """The mirror must come to rest and stay there."""
-    rig.wait(lambda: rig.states and not rig.states[-1].moving, "the end of all moves")
-    try:
-        rig.wait(lambda: _rests(rig), "rest", PATIENCE_S / 2)
-    except RigError:
-        _lost(record, "the mirror does not come to rest")
-
-
-def _rests(rig: FocusRig) -> bool:
-    before = rig.frames
-    time.sleep(0.3)
-    return rig.frames == before
-
-
-@fault("move_focus cancelled at any moment", rounds=20)
-def move_cancelled(rig: FocusRig, random: Random, record: FaultRecord) -> None:
-    goal = MoveFocus.Goal(request=FocusRequest(curvature=rig.far_curvature(random)))
-    handle, result = rig.goal(MoveFocus, goal)
-    _check_ended(record, _end_somehow(rig, random, handle, result), ErrorCode.OK, ErrorCode.CANCELED)
-
-
-@fault("goals of move_focus that pre-empt each other at any moment; the newest must stand", rounds=10)
-def move_preempted(rig: FocusRig, random: Random, record: FaultRecord) -> None:
-    goals = []
-    for _ in range(random.randint(2, 6)):
-        goal = MoveFocus.Goal(request=FocusRequest(curvature=rig.curvature(random)))
-        goals.append(rig.goal(MoveFocus, goal))
-        time.sleep(random.choice((0.0, random.uniform(0.0, 0.02), random.uniform(0.0, 0.3))))
-    for _handle, result in goals:
-        rig.wait(result.done, "the result of every goal", ANSWER_S)
-    for _handle, result in goals[:-1]:
-        _check_ended(record, result.result().result, ErrorCode.OK, ErrorCode.PREEMPTED)
-    newest = goals[-1][1].result().result
-    _check_ended(record, newest, ErrorCode.OK)
-    if newest.error_code == ErrorCode.OK and not rig.near(newest.state.signals):
-        _lost(record, "an older goal stands in the place of the newest")
-
-
-@fault("a goal of move_focus is cancelled after a newer request went another way; that one must stand", rounds=10)
-def cancel_after_newer_request(rig: FocusRig, random: Random, record: FaultRecord) -> None:
-    handle, result = rig.goal(MoveFocus, MoveFocus.Goal(request=FocusRequest(curvature=rig.far_curvature(random))))
-    time.sleep(random.uniform(0.0, 0.2))
-    newer = rig.set_focus(rig.far_curvature(random))
-    outcome = _end_somehow(rig, random, handle, result)
-    _check_ended(record, outcome, ErrorCode.OK, ErrorCode.CANCELED, ErrorCode.PREEMPTED)
-    rig.account_for(newer, record)
-
-
-@fault("a move that waits for a degauss: cancelled, pre-empted or overtaken at any moment", rounds=6)
-def conditioned_move_ended(rig: FocusRig, random: Random, record: FaultRecord) -> None:
-    request = FocusRequest(curvature=rig.curvature(random), mode=FocusRequest.MODE_CONDITIONED)
-    handle, result = rig.goal(MoveFocus, MoveFocus.Goal(request=request))
-    time.sleep(random.uniform(0.0, 3.0))
-    way = random.choice(("cancel", "preempt", "overtake"))
-    if way == "cancel":
-        outcome = _end_somehow(rig, random, handle, result)
-        _check_ended(record, outcome, ErrorCode.OK, ErrorCode.CANCELED)
-        if outcome.error_code == ErrorCode.CANCELED:
-            _check_at_rest(rig, record)
-    elif way == "preempt":
-        request = FocusRequest(curvature=rig.curvature(random), mode=FocusRequest.MODE_CONDITIONED)
-        _handle, second = rig.goal(MoveFocus, MoveFocus.Goal(request=request))
-        rig.wait(lambda: result.done() and second.done(), "both results", ANSWER_S)
-        _check_ended(record, result.result().result, ErrorCode.OK, ErrorCode.PREEMPTED)
-        _check_ended(record, second.result().result, ErrorCode.OK)
-    else:
-        newer = rig.set_focus(rig.curvature(random))
-        rig.wait(result.done, "the result of the goal", ANSWER_S)
-        _check_ended(record, result.result().result, ErrorCode.OK, ErrorCode.PREEMPTED)
-        rig.account_for(newer, record)
-
-
-@fault("converge cancelled at any moment, and requests that come meanwhile", rounds=6)
-def loop_cancelled(rig: FocusRig, random: Random, record: FaultRecord) -> None:
-    goal = Converge.Goal(request=FocusRequest(curvature=rig.far_curvature(random)), max_maps=20, tolerance=1e-10)
-    handle, result = rig.goal(Converge, goal)
-    if random.random() < 0.5:
-        rig.account_for(rig.set_focus(rig.curvature(random)), record)
-    outcome = _end_somehow(rig, random, handle, result)
-    _check_ended(record, outcome, ErrorCode.OK, ErrorCode.CANCELED, ErrorCode.NOT_CONVERGED)
-    _check_at_rest(rig, record)
-
-
-@fault("a degauss that somebody else began when requests come: carried out after it, or refused in words", rounds=2)
-def foreign_degauss(rig: FocusRig, random: Random, record: FaultRecord) -> None:
-    future = rig.begin(Degauss, Degauss.Request(steps=10))
-    rig.wait_moving(random.randint(2, 30))
-    state = rig.set_focus(rig.curvature(random))
-    rig.account_for(state, record)
-    rig.wait_answer(future)
-
-
-FAULTS: tuple[Fault, ...] = tuple(_REGISTRY.values())
+FAULTS: tuple[Fault, ...] = tuple(REGISTRY.values())

@@ -18,9 +18,9 @@ from lifecycle_msgs.msg import Transition
 from numpy.typing import NDArray
 from rosgraph_msgs.msg import Clock
 
-from fault_injection.faults.fault import Fault, FaultRecord
+from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import ACTUATORS, DriverRig
-from fault_injection.rigs.parts import judged, other_client
+from fault_injection.rigs.parts import checked, other_client
 
 ROUNDS = 3  # injections per start of a driver, where one driver can take several
 
@@ -48,7 +48,7 @@ def fault(words: str, rounds: int = ROUNDS, **rig_options: Any) -> Callable[[Inj
     def register(inject: Injection) -> Injection:
         def run(folder: Path, domain: int, random: Random, record: FaultRecord) -> None:
             with DriverRig(folder, domain, **rig_options) as rig:
-                with judged(rig, record):
+                with checked(rig, record):
                     rig.recover(shape(random))
                     for _ in range(rounds):
                         inject(rig, random, record)

@@ -20,11 +20,11 @@ from random import Random
 from dm_msgs.action import MoveFocus
 from dm_msgs.msg import Capabilities, ErrorCode, FocusRequest, FocusState
 
-from fault_injection.faults.fault import Fault, FaultRecord
+from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import RigError
 from fault_injection.rigs.focus_rig import ANSWER_S, DRIVER_TIMEOUT_S
 from fault_injection.rigs.network_rig import NetworkRig
-from fault_injection.rigs.parts import judged
+from fault_injection.rigs.parts import checked
 from studies.network_namespaces import NotPermittedError
 
 LOSS, DELAY_S = 0.05, 0.05
@@ -92,7 +92,7 @@ def main() -> int:
     inject, rounds = _INJECTIONS[name]
     record, random = FaultRecord(name), Random(int(seed))
     try:
-        with NetworkRig(Path(folder), int(domain), random) as rig, judged(rig, record):
+        with NetworkRig(Path(folder), int(domain), random) as rig, checked(rig, record):
             rig.refocus(random)
             for _ in range(rounds):
                 inject(rig, random, record)
@@ -123,13 +123,13 @@ def _requests(rig: NetworkRig, random: Random, record: FaultRecord) -> None:
 
 @fault(f"{LOSS:.0%} of all frames are lost, in both directions")
 def frames_lost(rig: NetworkRig, random: Random, record: FaultRecord) -> None:
-    rig.cable.loss = LOSS
+    rig.netem.loss = LOSS
     _requests(rig, random, record)
 
 
 @fault(f"every frame takes {DELAY_S * 1e3:.0f} ms, in each direction")
 def frames_delayed(rig: NetworkRig, random: Random, record: FaultRecord) -> None:
-    rig.cable.delay_s = DELAY_S
+    rig.netem.delay_s = DELAY_S
     _requests(rig, random, record)
 
 
@@ -138,13 +138,13 @@ def partition(rig: NetworkRig, random: Random, record: FaultRecord) -> None:
     goal = MoveFocus.Goal(request=FocusRequest(curvature=rig.far_curvature(random)))
     _handle, result = rig.goal(MoveFocus, goal)
     rig.wait_moving(random.randint(1, 4))
-    rig.cable.plugged = False
+    rig.netem.plugged = False
     end = time.monotonic() + CUTS_S[record.injected % len(CUTS_S)]
     states = [rig.set_focus(rig.curvature(random))]
     while time.monotonic() < end:
         states.append(rig.set_focus(rig.curvature(random)))
         time.sleep(min(PERIOD_S, max(end - time.monotonic(), 0.0)))
-    rig.cable.plugged = True
+    rig.netem.plugged = True
     rig.wait(result.done, "the result of the move", ANSWER_S)
     outcome = result.result().result
     if outcome.error_code != ErrorCode.OK and not outcome.message:
@@ -159,7 +159,7 @@ def partition(rig: NetworkRig, random: Random, record: FaultRecord) -> None:
 def late_joiner(rig: NetworkRig, random: Random, record: FaultRecord) -> None:
     rig.kill_controller()
     rig.capabilities.clear()
-    rig.cable.loss, rig.cable.delay_s = LOSS, DELAY_S
+    rig.netem.loss, rig.netem.delay_s = LOSS, DELAY_S
     rig.start_controller()
     begun = time.monotonic()
     try:

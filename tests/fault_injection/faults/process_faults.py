@@ -1,6 +1,6 @@
 """Faults of the processes above the driver: each node in each state is killed, interrupted, and stopped for a while.
 
-Harm is judged by the monitor at the electronics. Lost is an end that a caller cannot understand: an exit status that is
+Harm is seen by the monitor at the electronics. Lost is an end that a caller cannot understand: an exit status that is
 not 0 after Ctrl-C, an answer that never comes from a node that goes on, a node that does not work again.
 """
 
@@ -20,10 +20,10 @@ from dm_msgs.action import Calibrate, MoveFocus
 from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_msgs.srv import IngestFile, Measure
 
+from fault_injection.fault import Fault, FaultRecord
 from fault_injection.faults import bench_faults
-from fault_injection.faults.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import ACTUATORS
-from fault_injection.rigs.parts import judged
+from fault_injection.rigs.parts import checked
 from fault_injection.rigs.process_rig import CURVATURE, ProcessRig, calibrated_rig
 
 #: Longest time for which a node is stopped, s.
@@ -153,7 +153,7 @@ def _fault(node: str, words: str, begin: Begin) -> Fault:
     """Every signal to `node` in the state that `begin` brings it into."""
 
     def run(folder: Path, domain: int, random: Random, record: FaultRecord) -> None:
-        with calibrated_rig(folder, domain) as rig, judged(rig, record):
+        with calibrated_rig(folder, domain) as rig, checked(rig, record):
             for name, number in SIGNALS.items():
                 activity = begin(rig, random)
                 try:

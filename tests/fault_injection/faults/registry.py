@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from fault_injection.fault import Fault
 from fault_injection.faults import (
     calibration_faults,
     controller_faults,
     driver_faults,
+    goal_faults,
     network_faults,
     process_faults,
     wire_faults,
 )
-from fault_injection.faults.fault import Fault
 
 #: In the order in which they run.
 GROUPS: Mapping[str, tuple[Fault, ...]] = {
     "driver": tuple(driver_faults.REGISTRY.values()),
     "wire": wire_faults.FAULTS,
-    "controller": controller_faults.FAULTS,
+    "controller": controller_faults.FAULTS + goal_faults.FAULTS,
     "processes": process_faults.FAULTS,
     "calibration": calibration_faults.FAULTS,
     "network": network_faults.FAULTS,

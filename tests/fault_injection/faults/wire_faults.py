@@ -14,10 +14,10 @@ import numpy as np
 from dm_msgs.msg import ActuatorState, ErrorCode
 from dm_msgs.srv import SetSignals
 
+from fault_injection.fault import Fault, FaultRecord
 from fault_injection.faults.driver_faults import far_shape, shape
-from fault_injection.faults.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import ACTUATORS, DriverRig
-from fault_injection.rigs.parts import judged
+from fault_injection.rigs.parts import checked
 from fault_injection.rigs.relays import DatagramRelay, VanishingLink
 
 ROUNDS = 3
@@ -45,7 +45,7 @@ def _half_open(restart: bool) -> Fault:
         with (
             VanishingLink() as link,
             DriverRig(folder, domain, via=link.port, electronics__address=link.address) as rig,
-            judged(rig, record),
+            checked(rig, record),
         ):
             link.unit_port = rig.port
             rig.recover(shape(random))
@@ -99,7 +99,7 @@ def _udp_rig(
         DatagramRelay(0, lambda datagram: [datagram]) as frames,
         DatagramRelay(0, lambda datagram: [datagram]) as discovery,
         DriverRig(folder, domain, "edac40_udp", frames.port, electronics__discovery_port=discovery.port) as rig,
-        judged(rig, record),
+        checked(rig, record),
     ):
         frames.lead_to(rig.port)
         discovery.lead_to(int(rig.bench.electronics.endpoints["discovery_port"]))
@@ -152,7 +152,7 @@ def _discovery_silent(folder: Path, domain: int, random: Random, record: FaultRe
 
 def _competing(folder: Path, domain: int, random: Random, record: FaultRecord) -> None:
     """Somebody else goes on publishing at 100 Hz while our moves run."""
-    with DriverRig(folder, domain) as rig, judged(rig, record):
+    with DriverRig(folder, domain) as rig, checked(rig, record):
         rig.recover(shape(random))
         for _ in range(ROUNDS):
             end = threading.Event()

@@ -41,7 +41,7 @@ class Verdict(StrEnum):
     HYSTERESIS = "M"
 
 
-def judge(file: ReferenceFile, whole: SurfaceMap, mutation: Mutation, found: SurfaceMap) -> Verdict:
+def classify(file: ReferenceFile, whole: SurfaceMap, mutation: Mutation, found: SurfaceMap) -> Verdict:
     """The verdict on a map that was read from a damaged file without an error."""
     if found.sag.shape != whole.sag.shape:
         return Verdict.WRONG_MAP

@@ -17,7 +17,7 @@ from typing import Any
 
 from fault_injection.fuzz.classify import Verdict
 
-#: A file that is not judged within this time counts as a hang; the readers give up long before, also on a busy machine
+#: A file that is not checked within this time counts as a hang; the readers give up long before, also on a busy machine
 #: [s].
 TIME_LIMIT_S = 120.0
 #: Time for a worker to start [s].
@@ -82,7 +82,7 @@ def fuzz(
     Args:
         folder: an existing folder of this call's own, for the files and findings.
         deadline: monotonic time at which to stop, s.
-        progress: called with the number of files judged since the last call.
+        progress: called with the number of files checked since the last call.
     """
     result = FuzzResult()
     number, end = first, first + files

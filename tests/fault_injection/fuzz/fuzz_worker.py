@@ -1,7 +1,7 @@
 """The process that reads damaged files: started by :mod:`fault_injection.fuzz.fuzz`, and expendable.
 
 `python -m fault_injection.fuzz.fuzz_worker FORMAT SEED START STOP FOLDER` writes one letter per file to standard
-output (see judge.Verdict), and what went wrong in words to FOLDER/findings.jsonl.
+output (see classify.Verdict), and what went wrong in words to FOLDER/findings.jsonl.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from dm_calibration.calibration import CalibrationFileError, to_columns
 from dm_calibration.map_files import MapFileError, read_map
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_calibration.store.hdf5_image import content_hash
-from fault_injection.fuzz.classify import Verdict, judge
+from fault_injection.fuzz.classify import Verdict, classify
 from fault_injection.fuzz.mutations import Mutation, mutate
-from fault_injection.fuzz.reference_files import CALIBRATION_ID, XYZ_UNIT, ReferenceFile, intact
+from fault_injection.fuzz.reference_files import CALIBRATION_ID, XYZ_UNIT, ReferenceFile, reference_file
 
 #: Address space that a reader may take beyond what this process had before the first damaged file [bytes].
 HYSTERESIS = 256 << 20
@@ -29,7 +29,7 @@ Reader = Callable[[Mutation], tuple[Verdict, str]]
 
 
 def map_reader(file: ReferenceFile, folder: Path) -> Reader:
-    """Reads and judges damaged map files."""
+    """Reads and classifies damaged map files."""
     path = folder / f"damaged{file.suffix}"
     path.write_bytes(file.content)
     whole = read_map(path, xyz_unit=XYZ_UNIT)
@@ -41,7 +41,7 @@ def map_reader(file: ReferenceFile, folder: Path) -> Reader:
         except MapFileError as error:
             return _refused(error)
         f"{found.instrument}{found.serial}{found.part_name}".encode()  # they are published: must be text
-        return judge(file, whole, mutation, found), ""
+        return classify(file, whole, mutation, found), ""
 
     return read
 
@@ -86,7 +86,7 @@ def main(arguments: list[str]) -> int:
     """Read the files START to STOP - 1."""
     name, seed, start, stop, folder = arguments[0], *map(int, arguments[1:4]), Path(arguments[4])
     warnings.simplefilter("ignore")
-    file = intact(name)
+    file = reference_file(name)
     read = (calibration_reader if name == "calibration" else map_reader)(file, folder)
     limit_memory()
     with (folder / "findings.jsonl").open("a") as findings:

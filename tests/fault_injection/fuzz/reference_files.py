@@ -215,7 +215,7 @@ def _calibration() -> ReferenceFile:
 FORMATS = {"dat": _dat, "datx": _datx, "asc": _asc, "xyz": _xyz, "calibration": _calibration}
 
 
-def intact(name: str) -> ReferenceFile:
+def reference_file(name: str) -> ReferenceFile:
     """The intact file of the format `name`.
 
     Raises:

@@ -38,7 +38,7 @@ from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.worker import WorkerService, answers_arrive
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
-from fault_injection.faults.fault import FaultRecord
+from fault_injection.fault import FaultRecord
 from fault_injection.rigs.driver_rig import DriverRig, RigError, end_process
 from studies.benchmarks import stand_in_mirror
 

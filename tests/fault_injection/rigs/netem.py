@@ -120,7 +120,7 @@ def _tap(name: str, host: str) -> int:
 
 
 @contextlib.contextmanager
-def bad_cable(random: Random) -> Iterator[tuple[str, str, Netem]]:
+def bad_network(random: Random) -> Iterator[tuple[str, str, Netem]]:
     """Two hosts and the cable between them, which is good at first.
 
     Raises:

@@ -23,7 +23,7 @@ from rclpy.serialization import serialize_message
 from dm_bringup.nodes import MODULES
 from fault_injection.rigs.driver_rig import end_process
 from fault_injection.rigs.focus_rig import FocusRig
-from fault_injection.rigs.netem import bad_cable
+from fault_injection.rigs.netem import bad_network
 from studies.network_namespaces import command_on, inside
 
 #: Hosts find each other only where discovery is not kept to the loopback.
@@ -42,7 +42,7 @@ class NetworkRig(FocusRig):
         self._latch: subprocess.Popen[bytes] | None = None
         self._stack = contextlib.ExitStack()
         try:
-            self.left, self.right, self.cable = self._stack.enter_context(bad_cable(random))
+            self.left, self.right, self.netem = self._stack.enter_context(bad_network(random))
             self._stack.enter_context(mock.patch.dict(os.environ, _ENVIRONMENT))
             with inside(self.left):  # the ports of the electronics are there
                 super().__init__(folder, domain, **changes)
@@ -66,7 +66,7 @@ class NetworkRig(FocusRig):
 
     def mend(self) -> None:
         """The cable is as good as new."""
-        self.cable.loss, self.cable.delay_s, self.cable.plugged = 0.0, 0.0, True
+        self.netem.loss, self.netem.delay_s, self.netem.plugged = 0.0, 0.0, True
 
     def _start(self, module: str, parameters: Path, log: Path) -> subprocess.Popen[bytes]:
         host = self.right if module == _RIGHT_SIDE else self.left

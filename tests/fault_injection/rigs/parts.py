@@ -6,12 +6,12 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from fault_injection.faults.fault import FaultRecord
+from fault_injection.fault import FaultRecord
 from fault_injection.rigs.driver_rig import PATIENCE_S, DriverRig
 
 
 @contextmanager
-def judged(rig: DriverRig, record: FaultRecord) -> Iterator[None]:
+def checked(rig: DriverRig, record: FaultRecord) -> Iterator[None]:
     """Add to `record` what the monitor saw, however the block ends."""
     try:
         yield
