@@ -75,7 +75,6 @@ def inline_commands() -> Iterator[tuple[str, str]]:
 #: Blocks that are nothing to type, by their first line.
 TEXTS = {
     "header | one word per channel | check sum | terminator": "layout of a frame",
-    "dm_msgs          messages, services, actions; nothing else": "the packages",
 }
 
 #: Run to their end on the scene, in this order; they must succeed.

@@ -80,6 +80,37 @@ def test_references_are_those_that_the_code_cites() -> None:
     assert cited == listed
 
 
+@pytest.mark.parametrize("package", sorted(path.parent.name for path in (ROOT / "src").glob("*/setup.py")))
+def test_each_package_says_what_it_holds(package: str) -> None:
+    rows = re.findall(r"(?m)^\| `(\w+)/?` \| \S", (ROOT / "src" / package / "README.md").read_text())
+    modules = {path.stem for path in (ROOT / "src" / package / package).glob("[a-z]*")}
+    assert set(rows) == modules, "the README's table and the modules differ"
+
+
+@pytest.mark.parametrize("page", [*told.PAGES, *(ROOT / "src").glob("*/README.md")], ids=str)
+def test_modules_and_files_that_are_named_exist(page: Path) -> None:
+    text = page.read_text()
+    for name in re.findall(r"`(src/[\w./-]+|tests/[\w./-]+|studies/[\w./-]+|examples/[\w./-]+)`", text):
+        assert "PACKAGE" in name or (ROOT / name).exists(), f"{page.name} names {name}"
+    for name in re.findall(r"\b(?:dm_[a-z]+|studies)(?:\.[A-Za-z_]\w*)+", text):
+        package, *parts = name.split(".")
+        top = ROOT / "src" / package / package if package.startswith("dm_") else ROOT / package
+        if parts[0] not in ("msg", "srv", "action") and top.is_dir() and page.name != "CHANGELOG.md":
+            assert is_there(top, parts), f"{page.name} names {name}"
+
+
+def is_there(folder: Path, parts: list[str]) -> bool:
+    """Whether these lead to a module, or to a name in one."""
+    for number, part in enumerate(parts):
+        if (folder / part).is_dir():
+            folder /= part
+        else:
+            module = folder / f"{part}.py"
+            names = parts[number + 1 :] if module.is_file() else parts[number:]
+            return all(name in (module if module.is_file() else folder / "__init__.py").read_text() for name in names)
+    return True
+
+
 def docstrings(path: Path) -> Iterator[str]:
     """Of the module, its classes and functions."""
     for node in ast.walk(ast.parse(path.read_text())):
