@@ -87,7 +87,9 @@ def test_each_package_says_what_it_holds(package: str) -> None:
     assert set(rows) == modules, "the README's table and the modules differ"
 
 
-@pytest.mark.parametrize("page", [*told.PAGES, *(ROOT / "src").glob("*/README.md")], ids=str)
+@pytest.mark.parametrize(
+    "page", [*told.PAGES, *(ROOT / "src").glob("*/README.md")], ids=lambda path: f"{path.parent.name}/{path.name}"
+)
 def test_modules_and_files_that_are_named_exist(page: Path) -> None:
     text = page.read_text()
     for name in re.findall(r"`(src/[\w./-]+|tests/[\w./-]+|studies/[\w./-]+|examples/[\w./-]+)`", text):

@@ -9,7 +9,7 @@ the gains. Signals are normalised, so is the effective signal: it spans 2 over a
   of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
 * Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for memory that fades.
 * Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
-  grow by `creep_rate` of a step per decade [17]; a spectrum says how much more or less each of them does.
+  grow by `creep_rate` of a step per decade [17, 18]; a spectrum says how much more or less each of them does.
 
 The weights are those of all actuators, or each actuator has its own.
 
