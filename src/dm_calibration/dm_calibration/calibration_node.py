@@ -61,11 +61,11 @@ class CalibrationNode(Node):
             lambda: int(self.get_clock().now().nanoseconds),
             self._publish,
         )
-        self._services = BenchServices(self, self._values)
+        self._bench_services = BenchServices(self, self._values)
         self._driver_facts: dict[str, Any] = {}
-        action = CalibrateAction(self, self._values, self._services, self._manager, lambda: self._driver_facts)
+        action = CalibrateAction(self, self._values, self._bench_services, self._manager, lambda: self._driver_facts)
         self._server = WorkerActionServer(self, Calibrate, "calibrate", action.run, exclusive="refuse")
-        self._listener = MapListener(self, self._values, self._manager, self._services, lambda: self._server.busy)
+        self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load)
         WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)
@@ -87,7 +87,7 @@ class CalibrationNode(Node):
         self._listener.stop()
         mirror = self._manager.mirror
         if self._server.busy and mirror is not None:
-            self.get_logger().warning(f"ended during a calibration: {self._services.rest_at_exit(mirror.rest)}")
+            self.get_logger().warning(f"ended during a calibration: {self._bench_services.rest_at_exit(mirror.rest)}")
         self._reports.end()
 
     def _log_report(self, text: str, warning: bool) -> None:
