@@ -164,7 +164,10 @@ PRELUDES = {
     ("read-the-report.md", 1): "from pathlib import Path\nfolder = Path('reports')\nfolder.mkdir(exist_ok=True)\n",
 }
 #: Run by other tests.
-PYTHON_ELSEWHERE = {("camera.md", 1): "is examples/camera_focus.py, which test_autofocus_node.py runs"}
+PYTHON_ELSEWHERE = {
+    ("camera.md", 1): "is examples/camera_focus.py, which test_autofocus_node.py runs",
+    ("calibrate.md", 1): "is the beginning of examples/calibrate_folder.py, which test_calibrate.py runs",
+}
 
 
 def classified(command: str) -> bool:

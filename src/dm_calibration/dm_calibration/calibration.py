@@ -156,8 +156,8 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
     try:
         points = SamplePoints(*(np.asarray(columns[f"points/{name}"], dtype=np.float64) for name in _POINTS))
         # Files of before it was kept do not tell when the mirror moved, nor of interruptions.
-        untold = np.zeros(len(columns["maps/stamp_ns"]), dtype=np.int64)
-        columns = {"maps/moved_ns": untold, "maps/segment": untold, **columns}
+        unknown = np.zeros(len(columns["maps/stamp_ns"]), dtype=np.int64)
+        columns = {"maps/moved_ns": unknown, "maps/segment": unknown, **columns}
         raw: dict[str, Any] = {f.name: columns[f"maps/{f.name}"] for f in fields(MapSet) if f.name != "points"}
         maps = MapSet(points=points, **raw)
         result: dict[str, Any] = {"points": points}

@@ -135,14 +135,7 @@ PARAMETERS = (
     Parameter("dead_sigmas", float, 3.0, "Dead below this many standard errors.", "", 0.0, 1e3, live=True),
     Parameter("weak_sigmas", float, 10.0, "Weak below this many standard errors.", "", 0.0, 1e3, live=True),
     Parameter(
-        "weak_share",
-        float,
-        0.4,
-        "Weak below this share of the median response of its ring.",
-        "",
-        0.0,
-        1.0,
-        live=True,
+        "weak_share", float, 0.4, "Weak below this share of the median response of its ring.", "", 0.0, 1.0, live=True
     ),
     Parameter(
         "calibrated_error_max",

@@ -112,7 +112,7 @@ class Acquisition:
             read: reads a map file, raising MapFileError for files that are not (yet) whole.
             now_ns: clock for the times in Acquired.
             on_file: called in the watching thread with each new file.
-            on_trouble: called there with a reason in words, once each: a file refused unread, or the folder unreadable.
+            on_trouble: called there with a sentence, once each: a file refused unread, or the folder unreadable.
         """
         settings.check()
         self.settings = settings

@@ -34,7 +34,7 @@ class _Candidate:
 
 
 class FileEvent(NamedTuple):
-    """A file that is ready, or refused with the reason in words.
+    """A file that is ready, or refused with the reason.
 
     `written` is the monotonic time at which its last change was seen.
     """

@@ -2,7 +2,7 @@
 
 Driving actuator i raises a broad bump over the place where that actuator stands. The bumps measured are correlated with
 bumps expected at each configured position, for the eight ways a map can be turned or mirrored, and assigned one to one
-(Hungarian method). What differs from the configuration is said in words.
+(Hungarian method). What differs from the configuration is said in sentences.
 
 A hexagonal layout looks the same after turns by 60 degrees, so that a map turned by 180 degrees cannot be told from a
 numbering that starts on the other side: such findings name both.
@@ -130,8 +130,8 @@ def check_pokes(
     findings += _place_findings(place, active, x, y)
     unlike = active[likeness[active] < LIKENESS_MIN]
     if unlike.size:
-        words = "does not look like that of one actuator"
-        findings.append(_numbered(f"answers in a way that {words}", f"answer in a way that {words}", unlike))
+        text = "does not look like that of one actuator"
+        findings.append(_numbered(f"answers in a way that {text}", f"answer in a way that {text}", unlike))
     return PokeCheck(orientation, place, sign, likeness, tuple(findings))
 
 
@@ -192,13 +192,13 @@ def cycles(place: NDArray[np.int64]) -> list[tuple[int, ...]]:
 
 
 def _place_findings(place: NDArray[np.int64], active: NDArray[np.int64], x: Floats, y: Floats) -> list[str]:
-    """The permutation in words: a symmetry of the layout when that says most of it, then exchanges and cycles."""
+    """The permutation in sentences: a symmetry of the layout when that says most of it, then exchanges and cycles."""
     if not cycles(place):
         return []
     findings = []
-    words, symmetry = _nearest_symmetry(place, active, x, y)
-    if words:
-        findings.append(words)
+    text, symmetry = _nearest_symmetry(place, active, x, y)
+    if text:
+        findings.append(text)
         inverse = np.argsort(symmetry)
         place = inverse[place]
     for cycle in cycles(place):
@@ -218,13 +218,13 @@ def _nearest_symmetry(
 ) -> tuple[str, NDArray[np.int64]]:
     """The turn or mirror image of the layout that explains most of `place`: a sentence and a permutation."""
     identity = np.arange(x.size)
-    best, best_words = identity, ""
+    best, best_text = identity, ""
     fewest = int((place != identity)[active].sum())
-    for words, permutation in layout_symmetries(x, y):
+    for text, permutation in layout_symmetries(x, y):
         wrong = int((place != permutation)[active].sum())
         if wrong < fewest and wrong <= SYMMETRY_REST * active.size:
-            fewest, best, best_words = wrong, permutation, words
-    return best_words, best
+            fewest, best, best_text = wrong, permutation, text
+    return best_text, best
 
 
 def layout_symmetries(x: Floats, y: Floats) -> list[tuple[str, NDArray[np.int64]]]:
@@ -243,13 +243,13 @@ def layout_symmetries(x: Floats, y: Floats) -> list[tuple[str, NDArray[np.int64]
             if mirrored:
                 angle_2 = 2.0 * angle
                 matrix = np.array([[np.cos(angle_2), np.sin(angle_2)], [np.sin(angle_2), -np.cos(angle_2)]])
-                words = (
+                text = (
                     f"the whole pattern is mirrored about the axis at {30 * k} degrees: "
                     "sense of the numbering in the rings, or a mirrored map"
                 )
             else:
                 matrix = np.array([[cos, -sin], [sin, cos]])
-                words = (
+                text = (
                     f"the whole pattern is turned by {60 * k} degrees counter-clockwise: "
                     "start of the numbering in the rings, or the mirror or the map is turned"
                 )
@@ -258,7 +258,7 @@ def layout_symmetries(x: Floats, y: Floats) -> list[tuple[str, NDArray[np.int64]
             distance = cdist((matrix @ centred).T, centred.T)
             permutation = distance.argmin(axis=1)
             if distance.min(axis=1).max() < 0.1 * step and np.unique(permutation).size == x.size:
-                found.append((words, permutation))
+                found.append((text, permutation))
     return found
 
 
@@ -273,8 +273,8 @@ def _sign_findings(sign: NDArray[np.int64], active: NDArray[np.int64]) -> list[s
         ]
     if 2 * negative.size > active.size:
         positive = active[sign[active] > 0]
-        words = "the opposite way to most others, which lower the surface as the signal rises"
-        return [_numbered(f"moves {words}", f"move {words}", positive)]
+        text = "the opposite way to most others, which lower the surface as the signal rises"
+        return [_numbered(f"moves {text}", f"move {text}", positive)]
     return [_numbered("moves the surface the opposite way", "move the surface the opposite way", negative)]
 
 

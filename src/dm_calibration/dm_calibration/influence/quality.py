@@ -132,14 +132,14 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
         )
     if design.drift == 1:
         sentences.append("The figure is taken as constant over the run: too few reference frames to follow its drift.")
-    for value, words in (
+    for value, text in (
         (GRADE_WEAK, "respond weakly or uncertainly"),
         (GRADE_DEAD, "show no response above the noise"),
         (GRADE_NOT_EXCITED, "were never moved and count as without effect"),
     ):
         numbers = np.flatnonzero(grades == value) + 1
         if numbers.size:
-            sentences.append(f"Actuators {', '.join(map(str, numbers))} {words}.")
+            sentences.append(f"Actuators {', '.join(map(str, numbers))} {text}.")
     if untested:
         sentences.append(
             f"{untested} maps move an actuator as no other map does; predicting them from the others would be "

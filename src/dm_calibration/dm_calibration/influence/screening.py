@@ -74,7 +74,7 @@ def worst_outlier(
     response: Floats,
     options: ScreeningOptions,
 ) -> tuple[int, str] | None:
-    """The map that stands out most from the fit, with the reason in words; None when none does.
+    """The map that stands out most from the fit, with the reason; None when none does.
 
     A fit follows a map the more, the greater the map's leverage; residual / sqrt(1 - leverage) makes up for that. A map
     is an outlier when this exceeds the median by `outlier_sigmas` robust sigmas *and* what hysteresis can explain: an

@@ -57,11 +57,11 @@ def split_header(content: bytes) -> tuple[TextHeader, bytes]:
     body = lines.pop().lstrip()
     if not body.startswith(b"#"):
         raise MapFileError(f"line {LINES + 1}: must be '#', the end of the header")
-    words = [line.decode("latin-1").split() for line in lines]
+    tokens = [line.decode("latin-1").split() for line in lines]
 
     def number(line: int, position: int, name: str) -> float:
         try:
-            return float(words[line - 1][position - 1])
+            return float(tokens[line - 1][position - 1])
         except (IndexError, ValueError):
             raise MapFileError(f"{name}: no number at position {position} of header line {line}") from None
 

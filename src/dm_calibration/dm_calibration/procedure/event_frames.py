@@ -39,10 +39,7 @@ _EVENTS: dict[str, Any] = {
     kind.__name__: kind for kind in (Setup, Segment, MapTaken, Unseen, Dropped, Solved, Doubted, Storing)
 }
 #: What a frame keeps of a map; the points stand in Setup, and what all maps share too.
-_RECORD = (
-    "label", "kind", "step", "signals", "applied", "stamp_ns", "coefficients", "sigma", "sag", "residual_rms",
-    "valid_fraction", "file", "sha256", "nominal", "moved_ns", "segment",
-)  # fmt: skip
+_RECORD = MapSet.columns()
 
 #: The seal that the first frame of a run follows.
 FIRST = b"\0" * _SEAL

@@ -19,7 +19,7 @@ from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
 
-#: A place that nobody told.
+#: A place that is not known.
 NOWHERE = (float("nan"), float("nan"))
 
 

@@ -109,10 +109,10 @@ def open_run(
     Raises:
         StoreError: the journal cannot be written, or there is no room for all maps.
     """
-    notes = [f"unfinished run {words}: it waits for its own goal" for words in runs.others(identity)]
+    notes = [f"unfinished run {text}: it waits for its own goal" for text in runs.others(identity)]
     chosen: Found | None = None
     for found in runs.find(identity, plan.remarks):
-        reason = "a newer one goes on" if chosen else _why_not(found, plan, options)
+        reason = "a newer one goes on" if chosen else _reason_against(found, plan, options)
         if not reason:
             chosen = found
             continue
@@ -132,13 +132,13 @@ def open_run(
     kept = chosen.kept
     if kept.torn:
         notes.append(f"unfinished run {chosen.id}: the last {kept.torn} bytes are not whole and do not count")
-    words = f"resumed run {chosen.id} with {len(kept.outcome.records)} maps"
+    text = f"resumed run {chosen.id} with {len(kept.outcome.records)} maps"
     journal = RunJournal.reopen(chosen.folder)
     journal.check_room(missing)
-    return OpenRun(journal, kept.outcome, kept.storing, words, tuple(notes))
+    return OpenRun(journal, kept.outcome, kept.storing, text, tuple(notes))
 
 
-def _why_not(found: Found, plan: Plan, options: ResumeOptions) -> str:
+def _reason_against(found: Found, plan: Plan, options: ResumeOptions) -> str:
     """Why an unfinished run is not to go on; "" = it is."""
     age = 1e-9 * (time.time_ns() - found.kept.last_ns)
     if options.fresh:

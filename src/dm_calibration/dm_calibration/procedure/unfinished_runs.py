@@ -68,8 +68,8 @@ class UnfinishedRuns:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
-            words = f"another node is calibrating into {self.folder.parent}: wait for it or stop it"
-            raise Refusal(ErrorCode.BUSY, words) from None
+            text = f"another node is calibrating into {self.folder.parent}: wait for it or stop it"
+            raise Refusal(ErrorCode.BUSY, text) from None
         return self
 
     def __exit__(self, *_exception: object) -> None:
@@ -110,17 +110,17 @@ class UnfinishedRuns:
 
     def others(self, identity: Mapping[str, Any]) -> list[str]:
         """Each unfinished run that a goal with `identity` does not go on with, and why."""
-        words = []
+        sentences = []
         for folder in self._runs():
             try:
                 theirs = read_manifest(folder)["identity"]
             except (JournalError, KeyError) as error:
-                words.append(f"{folder.name}: {error}")
+                sentences.append(f"{folder.name}: {error}")
                 continue
             if theirs != identity:
                 differing = sorted(name for name in {*theirs, *identity} if theirs.get(name) != identity.get(name))
-                words.append(f"{folder.name}: other {', '.join(differing)}")
-        return words
+                sentences.append(f"{folder.name}: other {', '.join(differing)}")
+        return sentences
 
     def set_aside(self, folder: Path) -> Path:
         """Keep the run in `folder`, but do not go on with it.
