@@ -12,7 +12,9 @@ import pytest
 from typer import Typer
 from typer.testing import CliRunner
 
-from dm_calibration.report.document import Section, Table, write_html, write_pdf
+from dm_calibration.report.document import Section, Table
+from dm_calibration.report.html_page import write_html
+from dm_calibration.report.pdf_pages import write_pdf
 from studies.comparison.simulated_bench import SimulationConfig
 from studies.paper import control, reported
 from studies.paper.f_statistic import adjusted_r2_of_f, p_of_f

@@ -79,7 +79,10 @@ def test_the_twin_shares_no_code_with_what_it_judges() -> None:
 
 #: rosdep's names of modules; ROS packages go by their own.
 KEYS = {
-    **{name: f"python3-{name}" for name in ("h5py", "matplotlib", "numpy", "rich", "scipy", "serial", "typer", "yaml")},
+    **{
+        name: f"python3-{name}"
+        for name in ("h5py", "matplotlib", "numpy", "reportlab", "rich", "scipy", "serial", "typer", "yaml")
+    },
     "mcap": "mcap-ros2-support",
 }
 #: Modules that rosdep does not know; the package's README says how to install them. Starlette comes with NiceGUI.

@@ -17,8 +17,8 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
 from dm_calibration.report import content, content_hysteresis
-from dm_calibration.report.document import one_html
 from dm_calibration.report.figures import on_disc
+from dm_calibration.report.html_page import one_html
 from dm_calibration.report.hysteresis_figures import loop_opening, step_response
 from dm_calibration.report.page import figures_of, write_report
 from dm_calibration.report.residuals import residuals

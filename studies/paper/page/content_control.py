@@ -123,7 +123,7 @@ def readings(results: Results) -> Section:
     return Section(
         "What the paper leaves open, and what was taken",
         [],
-        [Table("Readings", ("what", "possible readings", "taken"), rows)],
+        [Table("Readings", ("what", "possible readings", "taken"), rows, textual=True)],
     )
 
 

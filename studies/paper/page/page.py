@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from dm_calibration.report.document import Section, write_html, write_pdf
+from dm_calibration.report.document import Section
+from dm_calibration.report.html_page import write_html
+from dm_calibration.report.pdf_pages import write_pdf
 from studies.paper.page import content, content_coefficients, content_control, content_regressions, content_sampling
 from studies.paper.results import Results
 

@@ -121,7 +121,7 @@ def provenance(calibration: Calibration, file: str, sha256: str) -> Section:
         rows += [("file", file), ("SHA-256 of the file", sha256)]
     shapes = [(name, target.strip()) for name, _, target in (text.partition(":") for text in calibration.targets)]
     solved = (
-        [Table("Shapes that were solved on an influence function", ("surface", "aim"), shapes, words=True)]
+        [Table("Shapes that were solved on an influence function", ("surface", "aim"), shapes, textual=True)]
         if shapes
         else []
     )
@@ -131,7 +131,7 @@ def provenance(calibration: Calibration, file: str, sha256: str) -> Section:
             "The calibration file holds everything this page is made of: signals, coefficients and sag of every map, "
             "names and full SHA-256 of the map files, and the result."
         ],
-        [Table("Provenance", ("item", "value"), rows, words=True), *solved],
+        [Table("Provenance", ("item", "value"), rows, textual=True), *solved],
     )
 
 
@@ -148,7 +148,7 @@ def cautions(calibration: Calibration) -> Section:
     rejected = [(maps.label[i], fit.reasons[i]) for i in np.flatnonzero(~fit.used)]
     never = [(label, reason.strip()) for label, _, reason in (entry.partition(":") for entry in calibration.dropped)]
     rows = [*rejected, *never]
-    table = [Table("Maps that are not in the fit", ("map", "reason"), rows, words=True)] if rows else []
+    table = [Table("Maps that are not in the fit", ("map", "reason"), rows, textual=True)] if rows else []
     return Section("Warnings and known limitations", [*checked, *others], table)
 
 

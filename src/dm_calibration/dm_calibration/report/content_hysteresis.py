@@ -61,7 +61,7 @@ def hysteresis(calibration: Calibration) -> Section:
             "the turning points before it. A degauss wipes the loops, not the creep.",
             *hysteresis.remarks,
         ],
-        [Table("The law", ("item", "value"), rows, words=True)],
+        [Table("The law", ("item", "value"), rows, textual=True)],
         pictures,
     )
 

@@ -11,8 +11,10 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.report import content, content_fit, content_hysteresis
-from dm_calibration.report.document import Section, one_html, pdf_pages
+from dm_calibration.report.document import Section
+from dm_calibration.report.html_page import one_html
 from dm_calibration.report.hysteresis_figures import loop_opening
+from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
 from dm_calibration.store.atomic_write import write_whole
 

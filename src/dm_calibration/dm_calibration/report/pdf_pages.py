@@ -1,0 +1,186 @@
+"""A document as PDF on A4 pages, set by ReportLab."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from reportlab.lib.colors import HexColor
+from reportlab.lib.enums import TA_LEFT, TA_RIGHT
+from reportlab.lib.pagesizes import A4
+from reportlab.lib.styles import ParagraphStyle
+from reportlab.pdfbase import pdfmetrics
+from reportlab.pdfbase.ttfonts import TTFont
+from reportlab.pdfgen.canvas import Canvas
+from reportlab.platypus import (
+    CondPageBreak,
+    Flowable,
+    Image,
+    KeepTogether,
+    LongTable,
+    Paragraph,
+    SimpleDocTemplate,
+    Spacer,
+    TableStyle,
+)
+
+from dm_calibration.report.document import Picture, Section, Table
+
+#: Of pictures on paper, dots per inch.
+DPI = 200
+#: Lengths in points, 1/72 inch.
+MARGIN = 48.0
+WIDTH = A4[0] - 2 * MARGIN
+#: Tallest picture: the page less margins and room for a caption.
+HEIGHT = A4[1] - 2 * MARGIN - 60.0
+#: Around the text of a cell.
+PADDING = 4.0
+#: Widest column of numbers whose text is not broken over lines, as a share of the page.
+COLUMN_MAX = 0.38
+TABLE_SIZE = 8.0
+FOOT = HexColor("#444444")
+RULE = HexColor("#dddddd")
+#: The fonts of the figures: they have the Greek letters and signs of the text, which the PDF standard fonts lack.
+REGULAR, BOLD = "DejaVuSans", "DejaVuSans-Bold"
+
+TITLE = ParagraphStyle("title", fontName=BOLD, fontSize=15, leading=19, spaceAfter=10)
+HEADING = ParagraphStyle(
+    "heading", fontName=BOLD, fontSize=12, leading=15, spaceBefore=12, spaceAfter=6, keepWithNext=1
+)
+BODY = ParagraphStyle("body", fontName=REGULAR, fontSize=9, leading=12.5, spaceAfter=6)
+CAPTION = ParagraphStyle("caption", fontName=REGULAR, fontSize=8, leading=10.5, spaceAfter=8, textColor=FOOT)
+TABLE_TITLE = ParagraphStyle("table", fontName=BOLD, fontSize=8.5, leading=11, spaceBefore=6, spaceAfter=3)
+
+
+def write_pdf(path: Path, title: str, sections: Sequence[Section]) -> Path:
+    """Write all sections to a PDF, as :func:`pdf_pages`; returns its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(pdf_pages(title, sections))
+    return path
+
+
+def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
+    """All sections as a PDF: text, tables and pictures one below the other, title and page number at the foot."""
+    _register_fonts()
+    stream = io.BytesIO()
+    # Invariant: without a date, the same run gives the same file.
+    document = SimpleDocTemplate(
+        stream, pagesize=A4, title=title, invariant=1,
+        leftMargin=MARGIN, rightMargin=MARGIN, topMargin=MARGIN, bottomMargin=MARGIN,
+    )  # fmt: skip
+    story: list[Flowable] = [_paragraph(title, TITLE)]
+    for section in sections:
+        story.append(_paragraph(section.title, HEADING))
+        story += [_paragraph(text, BODY) for text in section.paragraphs]
+        for table in section.tables:
+            story += _table(table)
+        story += [_picture(picture) for picture in section.pictures]
+    document.build(story, canvasmaker=_numbered(title))
+    return stream.getvalue()
+
+
+@cache
+def _register_fonts() -> None:
+    for name in (REGULAR, BOLD):
+        pdfmetrics.registerFont(TTFont(name, str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / f"{name}.ttf")))
+
+
+def _paragraph(text: str, style: ParagraphStyle) -> Paragraph:
+    return Paragraph(escape(text), style)
+
+
+def _picture(picture: Picture) -> Flowable:
+    """A picture as wide as the text, or as high as a page, with its caption below it on the same page."""
+    width, height = (72.0 * length for length in picture.figure.get_size_inches())
+    scale = min(WIDTH / width, HEIGHT / height)
+    image = Image(io.BytesIO(picture.png(DPI * scale)), width * scale, height * scale)
+    return KeepTogether([image, _paragraph(picture.caption, CAPTION)])
+
+
+def _table(table: Table) -> list[Flowable]:
+    """A table whose columns are as wide as their longest cell, in a smaller type where they need more than the page."""
+    widths = _column_widths(table)
+    scale = min(1.0, WIDTH / sum(widths))
+    size, padding = scale * TABLE_SIZE, scale * PADDING
+
+    def cells(row: Sequence[str], font: str) -> list[Any]:
+        made: list[Any] = []
+        for column, (cell, width) in enumerate(zip(row, widths, strict=True)):
+            side = TA_LEFT if table.textual or column == 0 else TA_RIGHT
+            style = ParagraphStyle("cell", fontName=font, fontSize=size, leading=1.25 * size, alignment=side)
+            broken = _cell_width(cell, font) > width + 0.1
+            made.append(_paragraph(cell, style) if broken else cell)
+        return made
+
+    rows = [cells(table.header, BOLD), *(cells(row, REGULAR) for row in table.rows)]
+    style = TableStyle(
+        [
+            ("FONT", (0, 0), (-1, 0), BOLD, size),
+            ("FONT", (0, 1), (-1, -1), REGULAR, size),
+            ("ALIGN", (0 if table.textual else 1, 0), (-1, -1), "LEFT" if table.textual else "RIGHT"),
+            ("VALIGN", (0, 0), (-1, 0), "BOTTOM"),
+            ("VALIGN", (0, 1), (-1, -1), "TOP"),
+            ("LEFTPADDING", (0, 0), (-1, -1), padding),
+            ("RIGHTPADDING", (0, 0), (-1, -1), padding),
+            ("TOPPADDING", (0, 0), (-1, -1), 1.5),
+            ("BOTTOMPADDING", (0, 0), (-1, -1), 2.5),
+            ("LINEBELOW", (0, 0), (-1, 0), 0.8, FOOT),
+            ("LINEBELOW", (0, 1), (-1, -1), 0.3, RULE),
+        ]
+    )
+    made = LongTable(rows, colWidths=[scale * width for width in widths], repeatRows=1, style=style, hAlign="LEFT")
+    # A table that fits on a page is not torn, another begins with a dozen rows at least; its caption stays above it.
+    height = made.wrap(WIDTH, HEIGHT)[1] + 20.0
+    whole = height < A4[1] - 2 * MARGIN
+    room = CondPageBreak(height if whole else min(height, 12 * 2.0 * TABLE_SIZE))
+    return [room, _paragraph(table.caption, TABLE_TITLE), made, Spacer(0, 10)]
+
+
+def _column_widths(table: Table) -> list[float]:
+    """Widths of the columns at full type size, points: room for the longest cell, as long as all fit on the page.
+
+    Else headings take several lines, then long texts as well; numbers never do.
+    """
+    longest = [max(_cell_width(row[k], REGULAR) for row in table.rows) for k in range(len(table.header))]
+    headings = [_cell_width(heading, BOLD) for heading in table.header]
+    widths = [max(pair) for pair in zip(longest, headings, strict=True)]
+    if sum(widths) > WIDTH:
+        words = [max(_cell_width(word, BOLD) for word in heading.split(" ")) for heading in table.header]
+        widths = [max(pair) for pair in zip(longest, words, strict=True)]
+    if sum(widths) > WIDTH:
+        widths = [min(width, COLUMN_MAX * WIDTH) for width in widths]
+    return widths
+
+
+def _cell_width(text: str, font: str) -> float:
+    return float(pdfmetrics.stringWidth(text, font, TABLE_SIZE)) + 2 * PADDING
+
+
+def _numbered(title: str) -> type[Canvas]:
+    """A canvas that writes the title and "page 2 of 7" at the foot of each page: once all of them are there."""
+
+    class NumberedCanvas(Canvas):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self._finished: list[dict[str, Any]] = []
+
+        def showPage(self) -> None:
+            self._finished.append(dict(self.__dict__))
+            self._startPage()
+
+        def save(self) -> None:
+            for number, page in enumerate(self._finished, start=1):
+                self.__dict__.update(page)
+                self.setFont(REGULAR, 7.0)
+                self.setFillColor(FOOT)
+                self.drawString(MARGIN, 0.5 * MARGIN, title)
+                self.drawRightString(A4[0] - MARGIN, 0.5 * MARGIN, f"page {number} of {len(self._finished)}")
+                super().showPage()
+            super().save()
+
+    return NumberedCanvas
