@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.procedure.applied_history import AppliedHistory, Report
+from dm_calibration.procedure.applied_history import AppliedHistory
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_common.measurement import Measurement
@@ -45,7 +46,7 @@ class AgeingTwin:
         self.bench.apply(np.clip(rng.uniform(-0.6, 0.6) + 0.25 * rng.standard_normal(37), -1.0, 1.0))
         self.bench.settle()
         for applied in self.bench.reports[self._heard :]:
-            self.history.observe(Report(applied, moving=False, active=True), applied.time)
+            self.history.observe(replace(applied, moving=False), applied.time)
         self._heard = len(self.bench.reports)
 
     def measurement(self, sag: np.ndarray) -> Measurement:

@@ -21,6 +21,7 @@ from dm_autofocus.gate import SettledGate
 from dm_autofocus.images import ImageError, grey
 from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.messages import seconds
 from dm_common.ros import qos
 
 #: As cameras publish; depth 1: an image that was not fetched in time is dropped for the next.
@@ -33,11 +34,6 @@ class SharpnessSample:
 
     sharpness: float
     header: Any
-
-
-def seconds(stamp: Any) -> float:
-    """A time stamp in s."""
-    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
 class FocusProbe:

@@ -7,17 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorHysteresis, MirrorInfo, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.procedure.applied_history import Report
 from dm_calibration.store.update_storage import Updates
-from dm_common.hysteresis.observer import Applied
-from dm_common.messages import doubles, recipe_book_message, stamp_ns, time_message
+from dm_common.messages import doubles, recipe_book_message, time_message
 
 Floats = NDArray[np.float64]
 
@@ -105,21 +103,6 @@ def put_updates(
     message.known_limitations = [*message.known_limitations, *doubts]
     if mirror_changed:
         message.quality = CalibrationMsg.APPROXIMATE
-
-
-def report_from(message: ActuatorState) -> Report:
-    """What the driver reports as applied, which must not be empty."""
-    turned_at = np.array(message.turned_at, dtype=np.float64)
-    applied = Applied(
-        time=1e-9 * stamp_ns(message.header.stamp),
-        signals=np.array(message.applied, dtype=np.float64),
-        turns=message.turns,
-        turned_at=turned_at if turned_at.size else None,
-        degausses=message.degausses,
-        history_known=message.history_known,
-        moving=message.moving,
-    )
-    return Report(applied, message.moving, message.driver_state == ActuatorState.STATE_ACTIVE)
 
 
 def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError, Report
+from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import Applied
 
@@ -23,8 +23,11 @@ class Driver:
         self.report(0.0)
 
     def report(self, time: float, moving: bool = False, active: bool = True) -> None:
-        applied = Applied(time, self.signals, self.turns, self.turned_at, self.degausses, self.degausses > 0)
-        self.history.observe(Report(applied, moving, active), time)
+        known = self.degausses > 0
+        applied = Applied(
+            time, self.signals, self.turns, self.turned_at, self.degausses, known, moving=moving, active=active
+        )
+        self.history.observe(applied, time)
 
     def go(self, time: float, value: float) -> None:
         self.turns, self.turned_at = self.turns + 1, self.signals

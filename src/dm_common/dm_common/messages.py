@@ -40,6 +40,11 @@ def stamp_ns(message: Time) -> int:
     return int(message.sec * 10**9 + message.nanosec)
 
 
+def seconds(message: Time) -> float:
+    """A time message in s."""
+    return 1e-9 * stamp_ns(message)
+
+
 def limits_from(message: MirrorInfo) -> Limits:
     """The limits of the mirror that the driver describes.
 
@@ -110,7 +115,7 @@ def applied_from(message: ActuatorState) -> Applied:
     signals = np.array(message.applied, dtype=np.float64)
     turned_at = np.array(message.turned_at, dtype=np.float64)
     return Applied(
-        time=1e-9 * stamp_ns(message.header.stamp),
+        time=seconds(message.header.stamp),
         signals=signals,
         turns=message.turns,
         turned_at=turned_at if turned_at.shape == signals.shape else None,

@@ -11,12 +11,9 @@ from dm_msgs.msg import ActuatorState, MirrorInfo
 from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.messages import doubles, time_message
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Kind, WriterState
-
-
-def _floats(values: NDArray[np.float64]) -> array.array[float]:
-    return array.array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
 
 
 def _indices(values: NDArray[np.intp]) -> array.array[int]:
@@ -51,7 +48,7 @@ def state_message(
     """The state of a configured driver; `refusal` of the last command, None when it was carried out."""
     message = ActuatorState(driver_state=driver_state(state))
     message.header.frame_id = frame_id
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(state.stamp_ns, 1_000_000_000)
+    message.header.stamp = time_message(state.stamp_ns)
     message.sequence = state.sequence
     message.moving = state.moving is not None
     message.history_known = state.history_known
@@ -65,11 +62,11 @@ def state_message(
     if refusal is not None and refusal.actuators is not None:
         flags[refusal.actuators] |= ActuatorState.FLAG_REFUSED
     if state.requested is not None and state.applied is not None and state.volts is not None:
-        message.requested = _floats(state.requested)
-        message.applied = _floats(state.applied)
-        message.volts = _floats(state.volts)
+        message.requested = doubles(state.requested)
+        message.applied = doubles(state.applied)
+        message.volts = doubles(state.volts)
         if state.turned_at is not None:
-            message.turned_at = _floats(state.turned_at)
+            message.turned_at = doubles(state.turned_at)
         limits = configuration.limiter.limits
         # Quantisation may leave a signal up to one code short of its limit.
         code = configuration.output.scale.resolution
@@ -90,8 +87,8 @@ def mirror_info_message(
         name=values["mirror.name"],
         serial=values["mirror.serial"],
         actuators=limits.actuators,
-        actuator_x=_floats(configuration.x),
-        actuator_y=_floats(configuration.y),
+        actuator_x=doubles(configuration.x),
+        actuator_y=doubles(configuration.y),
         neighbour_a=_indices(limits.pairs[:, 0]),
         neighbour_b=_indices(limits.pairs[:, 1]),
         full_aperture_diameter=values["mirror.full_aperture_diameter"],
@@ -102,7 +99,7 @@ def mirror_info_message(
         slew_rate_max=limits.slew_rate,
         volts_min=configuration.output.scale.volts_min,
         volts_max=configuration.output.scale.volts_max,
-        safe_signals=_floats(configuration.safe_shape),
+        safe_signals=doubles(configuration.safe_shape),
         wiring=values["mirror.wiring"],
         electronics=configuration.kind,
     )

@@ -7,7 +7,6 @@ import numpy as np
 from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
-    check_pitch,
     check_size,
     sag_from_counts,
     sag_per_count,
@@ -42,15 +41,5 @@ def parse_asc(content: bytes) -> SurfaceMap:
         header.scale_factor, header.wavelength, header.obliquity, header.phase_resolution, header.data_sign
     )
     counts = numbers(_phase_section(header, body), "phase data", pixels, np.int64)
-    return SurfaceMap(
-        sag=sag_from_counts(counts.reshape(header.height, header.width), metres_per_count),
-        wavelength=header.wavelength,
-        pitch=check_pitch(header.lateral_resolution),
-        format="asc",
-        origin=header.origin,
-        instrument=f"system type {header.system_type}",
-        serial=str(header.system_serial) if header.system_serial else "",
-        part_name=header.part_name,
-        time_stamp=header.time_stamp,
-        system_error_subtracted=header.system_error_subtracted,
-    )
+    sag = sag_from_counts(counts.reshape(header.height, header.width), metres_per_count)
+    return header.surface_map(sag, header.wavelength, "asc")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.map_files.surface_map import MapFileError
+from dm_calibration.map_files.surface_map import MapFileError, SurfaceMap, check_pitch
 
 ASC_TITLE = b"Zygo ASCII Data File"
 XYZ_TITLE = b"Zygo XYZ Data File"
@@ -38,6 +38,21 @@ class TextHeader:
     phase_resolution: int
     data_sign: int
     system_error_subtracted: bool | None
+
+    def surface_map(self, sag: NDArray[np.float64], wavelength: float, name: str) -> SurfaceMap:
+        """The map with this header, of the format `name`, with `sag` in m."""
+        return SurfaceMap(
+            sag=sag,
+            wavelength=wavelength,
+            pitch=check_pitch(self.lateral_resolution),
+            format=name,
+            origin=self.origin,
+            instrument=f"system type {self.system_type}",
+            serial=str(self.system_serial) if self.system_serial else "",
+            part_name=self.part_name,
+            time_stamp=self.time_stamp,
+            system_error_subtracted=self.system_error_subtracted,
+        )
 
 
 def is_text(start: bytes) -> bool:

@@ -9,7 +9,6 @@ from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
     check_heights,
-    check_pitch,
     check_size,
     check_wavelength,
     no_valid_pixels,
@@ -55,18 +54,7 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
     metres = UNITS[unit]
     sag *= wavelength if metres is None else metres
     check_heights(sag)
-    return SurfaceMap(
-        sag=sag,
-        wavelength=wavelength,
-        pitch=check_pitch(header.lateral_resolution),
-        format="xyz",
-        origin=header.origin,
-        instrument=f"system type {header.system_type}",
-        serial=str(header.system_serial) if header.system_serial else "",
-        part_name=header.part_name,
-        time_stamp=header.time_stamp,
-        system_error_subtracted=header.system_error_subtracted,
-    )
+    return header.surface_map(sag, wavelength, "xyz")
 
 
 def _grid_indices(position: NDArray[np.float64], origin: int, size: int, name: str) -> NDArray[np.intp]:

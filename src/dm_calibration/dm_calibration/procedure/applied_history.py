@@ -29,21 +29,6 @@ class MapNotUsableError(ValueError):
     error_code = ErrorCode.MAP_REJECTED
 
 
-@dataclass(frozen=True)
-class Report:
-    """One report of the driver.
-
-    Attributes:
-        applied: the state.
-        moving: on the way to another shape.
-        active: the electronics follow.
-    """
-
-    applied: Applied
-    moving: bool
-    active: bool
-
-
 @dataclass(frozen=True, eq=False)
 class SettledState:
     """The mirror at the time of a map.
@@ -59,7 +44,7 @@ class SettledState:
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
-    report: Report
+    report: Applied
     state: HysteresisState | None
     unknown: str
 
@@ -69,7 +54,7 @@ class AppliedHistory:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._log: deque[Report] = deque(maxlen=LOG_LENGTH)
+        self._log: deque[Applied] = deque(maxlen=LOG_LENGTH)
         self._entries: deque[_Entry] = deque(maxlen=STATES_KEPT)
         self._tracker: HysteresisTracker | None = None
         self._heard = float("-inf")
@@ -82,7 +67,7 @@ class AppliedHistory:
             for report in self._log:
                 self._enter(report)
 
-    def observe(self, report: Report, heard: float) -> None:
+    def observe(self, report: Applied, heard: float) -> None:
         """Take the driver's next report, heard at `heard` (s).
 
         Raises:
@@ -103,11 +88,11 @@ class AppliedHistory:
                     self._tracker = HysteresisTracker(self._tracker.law)
                 raise
 
-    def _enter(self, report: Report) -> None:
+    def _enter(self, report: Applied) -> None:
         if self._tracker is None:
             self._entries.append(_Entry(report, None, ""))
             return
-        self._tracker.observe(report.applied)
+        self._tracker.observe(report)
         self._entries.append(_Entry(report, self._tracker.state, self._tracker.unknown))
 
     def heard_since(self, time: float) -> bool:
@@ -124,12 +109,12 @@ class AppliedHistory:
         with self._lock:
             entries = list(self._entries)
             law = self._tracker.law if self._tracker is not None else None
-        times = [entry.report.applied.time for entry in entries]
+        times = [entry.report.time for entry in entries]
         at = next((k for k in reversed(range(len(entries))) if times[k] <= time), None)
         if at is None:
             raise MapNotUsableError("what stood at the mirror when the map was taken is not known: no report so old")
         entry = entries[at]
-        signals = entry.report.applied.signals
+        signals = entry.report.signals
         if not entry.report.active:
             raise MapNotUsableError("pdm_driver was not active when the map was taken")
         if entry.report.moving:
@@ -160,14 +145,12 @@ class AppliedHistory:
 def _moved(entry: _Entry, signals: Floats) -> bool:
     """Whether the state of `entry` is another shape than `signals`, or on the way to one."""
     report = entry.report
-    return report.moving or bool(np.abs(report.applied.signals - signals).max() > SMALL_MOVE)
+    return report.moving or bool(np.abs(report.signals - signals).max() > SMALL_MOVE)
 
 
-def _same(report: Report, last: Report) -> bool:
-    now, before = report.applied, last.applied
+def _same(now: Applied, before: Applied) -> bool:
     return (
-        (report.moving, report.active) == (last.moving, last.active)
+        (now.moving, now.active, now.history_known) == (before.moving, before.active, before.history_known)
         and (now.time, now.turns, now.degausses) == (before.time, before.turns, before.degausses)
-        and now.history_known == before.history_known
         and np.array_equal(now.signals, before.signals)
     )

@@ -17,14 +17,14 @@ from rclpy.node import Node
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_manager import CalibrationManager
-from dm_calibration.calibration_messages import put_updates, report_from
+from dm_calibration.calibration_messages import put_updates
 from dm_calibration.calibration_parameters import update_options
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
-from dm_common.messages import measurement_from, stamp_ns
+from dm_common.messages import applied_from, measurement_from, stamp_ns
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerService
@@ -148,7 +148,7 @@ class MapListener:
         if not len(message.applied):
             return
         try:
-            self._history.observe(report_from(message), 1e-9 * self._node.get_clock().now().nanoseconds)
+            self._history.observe(applied_from(message), 1e-9 * self._node.get_clock().now().nanoseconds)
         except ValueError as error:
             self._node.get_logger().error(f"actuator_state refused: {error}", throttle_duration_sec=10.0)
 

@@ -32,7 +32,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Image
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.messages import stamp_ns
+from dm_common.messages import seconds
 from dm_common.ros import qos
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.executor import BackgroundExecutor
@@ -140,7 +140,7 @@ class ConsoleNode:
                 self.following.use(calibration, 0.5 * (mirror.signal_min + mirror.signal_max))
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
-        time_s = 1e-9 * stamp_ns(message.header.stamp)
+        time_s = seconds(message.header.stamp)
         restarted = time_s < self._bench_time - TIME_JUMP_S
         self._bench_time = time_s if restarted else max(self._bench_time, time_s)
         for status in message.status:
