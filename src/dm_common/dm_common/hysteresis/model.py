@@ -145,9 +145,13 @@ class HysteresisModel:
         """The state after a degauss that ended at `middle`, long rested there."""
         play = np.full((actuators, len(self.play_radius)), middle)
         state = HysteresisState(
-            time, np.full(actuators, middle), play, np.zeros(actuators), np.zeros(actuators),
+            time,
+            np.full(actuators, middle),
+            play,
+            np.zeros(actuators),
+            np.zeros(actuators),
             np.zeros((actuators, len(self.creep_time))),
-        )  # fmt: skip
+        )
         position = self._position(play, state.fading)
         return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
 

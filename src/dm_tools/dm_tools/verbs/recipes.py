@@ -45,9 +45,7 @@ def _build(client: Any, curvatures: list[float], conic: float, tolerance: float,
                 f"{nanometres(feedback.max_zernike):.2f} nm",
             )
 
-        result = client.build_recipes(
-            curvatures, conic, tolerance=tolerance, max_maps=max_maps, on_feedback=show
-        )  # fmt: skip
+        result = client.build_recipes(curvatures, conic, tolerance=tolerance, max_maps=max_maps, on_feedback=show)
         progress.update(task, completed=len(order), description="recipes: done")
     return result
 
