@@ -1,7 +1,7 @@
 """Laws of hysteresis and creep of each actuator by itself, drawn towards common ones as far as the maps say.
 
 Hysteresis is a Preisach operator of a general density over centre and half-width of its relays: for each half-width r
-any smooth function of the value of the play operator p_r [10]. Functions are Legendre series in p_r; a Gaussian prior
+any smooth function of the value of the play operator p_r [16]. Functions are Legendre series in p_r; a Gaussian prior
 makes them alike for neighbouring r and small for high orders, and only its strongest patterns are kept, so that forty
 numbers an actuator describe a law. The patterns of all actuators are drawn towards each other: those that one
 actuator shows badly are the mean of the others. Creep is a spectrum over the elements of the model, smooth over the
