@@ -1,4 +1,4 @@
-"""The ablation on a small twin: every part of the memory earns its place, and the figures are what they say."""
+"""The ablation on a small simulation: every part of the model earns its place, and the figures are what they say."""
 
 from __future__ import annotations
 
@@ -8,24 +8,14 @@ import typer
 from typer.testing import CliRunner
 
 from dm_controller.planning.target import FocusTarget
-from studies.comparison.ablation import (
-    CONDITIONED,
-    DWELLS,
-    HISTORIES,
-    Ablation,
-    AblationOptions,
-    Requests,
-    RowFigures,
-    ablate,
-    figures_of,
-    total_steps,
-)
+from studies.comparison.ablation import CONDITIONED, DWELLS, HISTORIES, AblationOptions, ablate, total_steps
+from studies.comparison.ablation_figures import Ablation, Requests, RowFigures, figures_of
 from studies.comparison.ablation_models import CREEP, HYSTERESIS, LINEAR, MODELS, PLAYS, RECIPES
 from studies.comparison.compare import fitting_limits, true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.comparison.true_surface import TrueSurface
 from studies.verbs.compare import compare as command
-from studies.verbs.compare_history import rows_of
+from studies.verbs.compare_hysteresis import rows_of
 
 pytestmark = pytest.mark.slow
 
@@ -104,9 +94,9 @@ def test_options_that_make_no_sense_are_refused() -> None:
         AblationOptions(histories=("magic",))
 
 
-def test_the_command_refuses_all_plants_without_history() -> None:
+def test_the_command_refuses_all_plants_without_hysteresis() -> None:
     app = typer.Typer()
     app.command()(command)
     result = CliRunner().invoke(app, ["--plant", "all"])
     assert result.exit_code == 2
-    assert "--history" in result.output
+    assert "--hysteresis" in result.output

@@ -1,4 +1,4 @@
-"""The comparison of all methods: small runs on twins, and the command's figures."""
+"""The comparison of all methods: small runs on simulations, and the command's figures."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def test_nobody_beats_the_fitting_limit(comparison: Comparison) -> None:
 
 def test_the_fitting_limit_is_reached_by_an_ideal_mirror() -> None:
     """No hysteresis, no creep: the open-loop bounded programme comes within noise of the limit."""
-    twin = SimulationConfig(law="none", creep=0.0, pixels=120, degauss_steps=2)
-    figures = compare(CompareOptions(twin, seeds=(4,), methods=("bounded",), curvatures=(-0.02, 0.03)))
+    simulation = SimulationConfig(law="none", creep=0.0, pixels=120, degauss_steps=2)
+    figures = compare(CompareOptions(simulation, seeds=(4,), methods=("bounded",), curvatures=(-0.02, 0.03)))
     open_loop = [trial for trial in figures.trials if not trial.closed]
     limits = fitting_limits(SimulatedBench(SimulationConfig(pixels=120, seed=4)), [t.curvature for t in open_loop])
     for trial, limit in zip(open_loop, limits, strict=True):

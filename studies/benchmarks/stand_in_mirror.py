@@ -1,7 +1,7 @@
-"""A mirror to measure with: an analytic plate under a hexagon of actuators that remember, and what is known of it.
+"""A mirror to measure with: an analytic plate under a hexagon of actuators with hysteresis, and what is known of it.
 
-The memory laws are identified as in a calibration, but from the displacements of the twin's actuators seen through a
-random matrix, so that no maps have to be made.
+The hysteresis models are identified as in a calibration, but from the displacements of the simulation's actuators
+seen through a random matrix, so that no maps have to be made.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from studies.solvers.plate_model import PlateProperties, plate_influence
 
 Floats = NDArray[np.float64]
 
-#: By the class of the law that is fitted: what the twin's actuators follow.
-TWIN_LAWS = {
+#: By the class of the law that is fitted: what the simulation's actuators follow.
+SIMULATED_LAWS = {
     "Prandtl-Ishlinskii": "prandtl_ishlinskii",
     "Preisach": "preisach",
     "Preisach and Duhem": "bouc_wen",
@@ -50,11 +50,11 @@ SERIAL = "bench"
 
 @cache
 def identified_law(name: str) -> HysteresisModel:
-    """The law of class `name` (of TWIN_LAWS), fitted to actuators of the twin that follow a like one."""
+    """The law of class `name` (of SIMULATED_LAWS), fitted to actuators of the simulation that follow a like one."""
     x, y = hexagonal_positions(ACTUATORS, PITCH)
     mirror = Mirror("hexagon", "", x, y, WORKING_RADIUS, Limits(pairs=neighbour_pairs(x, y)))
     generator = np.random.default_rng(ACTUATORS)
-    piezo = PiezoActuators(PiezoConfig(law=TWIN_LAWS[name]), generator, np.zeros(ACTUATORS))
+    piezo = PiezoActuators(PiezoConfig(law=SIMULATED_LAWS[name]), generator, np.zeros(ACTUATORS))
     commands = excitation(mirror, MAPS)
     mixing = generator.standard_normal((ACTUATORS, NUMBERS)) / 4.0
     time = np.cumsum(1.0 + commands.dwell)
@@ -123,7 +123,7 @@ def mirror_info() -> MirrorInfo:
 
 
 def calibration(name: str, serial: str = SERIAL) -> Calibration:
-    """A calibration of that mirror whose memory is of the class `name` (of TWIN_LAWS)."""
+    """A calibration of that mirror whose hysteresis is of the class `name` (of SIMULATED_LAWS)."""
     model, law = influence_model(), identified_law(name)
     known = figures(law)
     hysteresis = HysteresisFit(

@@ -1,13 +1,13 @@
-"""What each part of the memory brings: open loop in random order on twins of several laws, part by part.
+"""What each part of the hysteresis model brings: open loop in random order on simulations of several laws.
 
-Each seed is a twin of its own, calibrated once by the memory plan; every model is made of the same maps. Requests are
-spheres of random curvature, each held for a dwell time of its own; the true surface is judged when the dwell ends.
-Models learn of the twin only what the driver reports.
+Each seed is a simulation of its own, calibrated once by the plan HYSTERESIS; every model is made of the same maps.
+Requests are spheres of random curvature, each held for a dwell time of its own; the true surface is judged when the
+dwell ends. Models learn of the simulation only what the driver reports.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,8 +19,8 @@ from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move
 from dm_controller.planning.recipes import find
 from dm_controller.planning.target import FocusTarget
+from studies.comparison.ablation_figures import Ablation, Identified, Requests, Series
 from studies.comparison.ablation_models import MODELS, Variant, make_variants
-from studies.comparison.compare import peak_to_valley
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, plan_steps
 from studies.comparison.true_surface import TrueSurface
 
@@ -29,7 +29,7 @@ from studies.comparison.true_surface import TrueSurface
 #: Conditioned: a degauss before each request, as recipes need it.
 TRACKED, DEGAUSSED, POWER_CYCLE, CONDITIONED = "tracked", "degaussed", "power cycle", "conditioned"
 HISTORIES = (TRACKED, DEGAUSSED, POWER_CYCLE)
-#: Hysteresis laws of the twins; `mixed` is one that no candidate of the identification holds.
+#: Hysteresis laws of the simulations; `mixed` is one that no candidate of the identification holds.
 PLANTS = ("prandtl_ishlinskii", "preisach", "bouc_wen", "mixed")
 #: Times that shapes are held, s.
 DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
@@ -47,13 +47,13 @@ class AblationOptions:
     """What to run.
 
     Attributes:
-        twin: its law and seed are replaced by each of `plants` and `seeds`.
+        simulation: its law and seed are replaced by each of `plants` and `seeds`.
         requests: per seed and history.
         maps: of the calibration.
         power_off: length of a power cycle, s.
     """
 
-    twin: SimulationConfig = field(default_factory=SimulationConfig)
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
     plants: Sequence[str] = PLANTS
     seeds: Sequence[int] = (1, 2, 3, 4, 5)
     histories: Sequence[str] = HISTORIES
@@ -71,106 +71,8 @@ class AblationOptions:
                 raise ValueError(f"history = {name!r}: must be one of {', '.join(HISTORIES)}")
 
 
-@dataclass(frozen=True, eq=False)
-class Requests:
-    """Outcomes of one sequence, or of several: R requests.
-
-    Attributes:
-        dwell: (R,) s.
-        curvature: (R,) 1/m.
-        max_zernike, upper: (R,) m, largest coefficient error of the true surface, and the bound told beforehand.
-        rms, limit: (R,) m, sag error, and the best that this mirror could do.
-    """
-
-    dwell: Floats
-    curvature: Floats
-    max_zernike: Floats
-    upper: Floats
-    rms: Floats
-    limit: Floats
-
-    @classmethod
-    def pooled(cls, parts: Iterable[Requests]) -> Requests:
-        parts = list(parts)
-        return cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in cls.__dataclass_fields__))
-
-    def held(self, dwell: float) -> Requests:
-        keep = self.dwell == dwell
-        return Requests(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
-
-
-@dataclass(frozen=True, eq=False)
-class Series:
-    """One model on one plant after one history, all seeds together.
-
-    Attributes:
-        hold_1h: (S,) m, drift of a shape held for an hour; of the seeds.
-    """
-
-    plant: str
-    model: str
-    history: str
-    requests: Requests
-    hold_1h: Floats
-
-
-@dataclass(frozen=True)
-class Identified:
-    """What the calibration of one twin found."""
-
-    plant: str
-    seed: int
-    law: str
-    held_out_max_zernike: float
-
-
-@dataclass(frozen=True, eq=False)
-class Ablation:
-    """All series."""
-
-    series: tuple[Series, ...]
-    identified: tuple[Identified, ...]
-    radius: float
-
-
-@dataclass(frozen=True)
-class RowFigures:
-    """Figures of some requests.
-
-    Attributes:
-        p50, p90: m, of the largest coefficient error.
-        rms_share: median of rms sag error over PV.
-        excess_share: the same of what exceeds the fitting limit (root of the difference of squares).
-        bound_coverage: share of requests inside the bound told beforehand.
-    """
-
-    requests: int
-    p50: float
-    p90: float
-    rms_share: float
-    excess_share: float
-    bound_coverage: float
-
-
-def figures_of(requests: Requests, radius: float) -> RowFigures:
-    """Figures of `requests` on an aperture of `radius` (m)."""
-    depth = np.array([peak_to_valley(c, radius) for c in requests.curvature])
-    excess = np.sqrt(np.maximum(np.square(requests.rms) - np.square(requests.limit), 0.0))
-    return RowFigures(
-        requests=len(depth),
-        p50=float(np.quantile(requests.max_zernike, 0.5)),
-        p90=float(np.quantile(requests.max_zernike, 0.9)),
-        rms_share=float(np.median(requests.rms / depth)),
-        excess_share=float(np.median(excess / depth)),
-        bound_coverage=float(np.mean(requests.max_zernike <= requests.upper)),
-    )
-
-
-# --- sequences ---
-
-
 class _Mirror:
-    """A twin under one model: moves, holds, follows the memory."""
+    """A simulation under one model: moves, holds, follows hysteresis and creep."""
 
     def __init__(self, bench: SimulatedBench, variant: Variant) -> None:
         self.bench, self._variant = bench, variant
@@ -266,7 +168,7 @@ def ablate(options: AblationOptions, progress: Callable[[str], None] = lambda st
         progress: called with a description before each of `total_steps` steps.
 
     Raises:
-        TooFewMapsError, Refusal: a twin could not be calibrated.
+        TooFewMapsError, Refusal: a simulation could not be calibrated.
     """
     parts: dict[tuple[str, str, str], list[tuple[Requests, float]]] = {}
     identified = []
@@ -274,7 +176,7 @@ def ablate(options: AblationOptions, progress: Callable[[str], None] = lambda st
     for plant in options.plants:
         for seed in options.seeds:
             where = f"{plant}, seed {seed}"
-            bench = SimulatedBench(replace(options.twin, law=plant, seed=seed))
+            bench = SimulatedBench(replace(options.simulation, law=plant, seed=seed))
             radius = bench.mirror.working_radius
 
             def calibrating(now: Progress, where: str = where) -> None:

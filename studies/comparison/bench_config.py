@@ -1,4 +1,4 @@
-"""Which twin, and how it is operated."""
+"""Which simulation, and how it is operated."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """Which twin, and how it is operated.
+    """Which simulation, and how it is operated.
 
     Attributes:
         law: hysteresis law: none, prandtl_ishlinskii, preisach, bouc_wen or mixed.

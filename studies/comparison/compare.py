@@ -1,11 +1,13 @@
-"""All methods side by side on the same twins: how near they bring a sweep of spheres, and what that costs.
+"""All methods side by side on the same simulations: how near they bring a sweep of spheres, and what that costs.
 
-Each seed is a twin of its own, calibrated once by the full plan. Every method then starts from the same state of that
-twin, noise to come included, rested by a degauss, and goes through the same spheres in the same random order. Open-loop
-rows take the solver's command as it is; closed-loop rows let the same solver correct it on the interferometer.
+Each seed is a simulation of its own, calibrated once by the full plan. Every method then starts from the same state
+of that simulation, noise to come included, rested by a degauss, and goes through the same spheres in the same random
+order. Open-loop rows take the solver's command as it is; closed-loop rows let the same solver correct it on the
+interferometer.
 
-Errors are those of the true surface, which only a twin knows: a loop that stops on its own measurement would otherwise
-be judged by the noise it stopped on. Curvature 0 has no peak to valley and does not count in the relative figures.
+Errors are those of the true surface, which only a simulation knows: a loop that stops on its own measurement would
+otherwise be judged by the noise it stopped on. Curvature 0 has no peak to valley and does not count in the relative
+figures.
 """
 
 from __future__ import annotations
@@ -48,15 +50,15 @@ class CompareOptions:
     """What to compare on.
 
     Attributes:
-        twin: the twin; its seed is replaced by each of `seeds`.
-        seeds: of the twins; the order of the sweep follows from them too.
+        simulation: the simulation; its seed is replaced by each of `seeds`.
+        seeds: of the simulations; the order of the sweep follows from them too.
         methods: names of solvers; empty = all.
         curvatures: of the spheres, 1/m.
         loop: of the closed-loop rows; by default wavelength / 1000, and three iterations of measuring and correcting.
         creep: share per decade that the loops foresee, see `closed_loop.Creep`; 0 = they do not.
     """
 
-    twin: SimulationConfig = field(default_factory=SimulationConfig)
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
     seeds: Sequence[int] = (1,)
     methods: Sequence[str] = ()
     curvatures: Sequence[float] = CURVATURES
@@ -67,7 +69,7 @@ class CompareOptions:
         if not self.seeds:
             raise ValueError("seeds: at least one is needed")
         if len(set(self.seeds)) < len(self.seeds):
-            raise ValueError(f"seeds = {list(self.seeds)}: the same twin twice says nothing new; name each seed once")
+            raise ValueError(f"seeds = {list(self.seeds)}: name each seed once; twice says nothing new")
         if min(self.seeds) < 0:
             raise ValueError(f"seeds = {list(self.seeds)}: must not be negative")
         if not any(self.curvatures):
@@ -161,7 +163,7 @@ class _MapInfo:
 
 
 def true_error(bench: SimulatedBench, target: FocusTarget) -> SurfaceError:
-    """The true surface of the twin against `target`."""
+    """The true surface of the simulation against `target`."""
     aperture = bench.aperture
     info = _MapInfo(aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px, aperture.radius_px * bench.pitch)
     return surface_error(bench.true_map(), info, target)
@@ -257,7 +259,7 @@ def compare(options: CompareOptions, progress: Callable[[str], None] = lambda st
 
     Raises:
         UnknownNameError: an unknown method, listing all.
-        TooFewMapsError, Refusal: the twin could not be calibrated.
+        TooFewMapsError, Refusal: the simulation could not be calibrated.
     """
     methods = tuple(dict.fromkeys(options.methods)) or tuple(SOLVERS)
     trials: list[Trial] = []
@@ -265,7 +267,7 @@ def compare(options: CompareOptions, progress: Callable[[str], None] = lambda st
     shares: list[float] = []
     radius = 0.0
     for seed in options.seeds:
-        bench = SimulatedBench(replace(options.twin, seed=seed))
+        bench = SimulatedBench(replace(options.simulation, seed=seed))
         radius = bench.mirror.working_radius
 
         def calibrating(now: Progress, seed: int = seed) -> None:

@@ -45,7 +45,7 @@ REPORT_INTERVAL_S = 0.02
 
 
 class SimulatedBench:
-    """One twin with its time, which only waits and maps advance.
+    """One simulation with its time, which only waits and maps advance.
 
     Raises:
         ValueError: a configuration that makes no sense, naming the parameter.
@@ -96,7 +96,7 @@ class SimulatedBench:
         self._report()
         self.limits = Limits(-1.0, 1.0, pairs, config.neighbour_difference)
         self.mirror = Mirror(
-            "PDM30-37", f"twin-{config.seed}", self.plate.x, self.plate.y, camera.field_diameter / 2, self.limits
+            "PDM30-37", f"simulation-{config.seed}", self.plate.x, self.plate.y, camera.field_diameter / 2, self.limits
         )
 
     def fork(self) -> SimulatedBench:
@@ -112,7 +112,7 @@ class SimulatedBench:
     # --- dm_common.measurement.Bench ---
 
     def degauss(self) -> None:
-        """Wipe the hysteresis memory as the driver does, and end at mid range."""
+        """Demagnetise as the driver does, and end at mid range."""
         rest = self.mirror.rest
         points = degauss_waypoints(len(rest), float(rest[0]), 1.0, self.config.degauss_steps, rest)
         self._follow(list(self._limiter.path(self._written, points)), known=False)
@@ -266,7 +266,7 @@ class SimulatedBench:
 
 
 def plan_steps(kind: PlanKind = PlanKind.FULL, options: PlanOptions | None = None) -> int:
-    """Steps of a plan on the twin's mirror, for progress bars."""
+    """Steps of a plan on the simulation's mirror, for progress bars."""
     plate = Plate(PlateConfig())
     limits = Limits(pairs=neighbour_pairs(plate.x, plate.y))
     mirror = Mirror("PDM30-37", "", plate.x, plate.y, InterferometerConfig().field_diameter / 2, limits)

@@ -1,4 +1,4 @@
-"""The true surface of a twin against targets, many at once: what `compare.true_error` says, as matrix products."""
+"""The true surface of a simulation against targets, many at once: `compare.true_error` as matrix products."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 class TrueSurface:
-    """Judges displacements of one twin; for judging only."""
+    """Judges displacements of one simulation; for judging only."""
 
     def __init__(self, bench: SimulatedBench) -> None:
         self._influence, self._figure = bench.true_influence()

@@ -87,7 +87,7 @@ class Shot:
         sag: (h, w) m, the last map, piston and tilt removed, thinned out to DRAWN_PIXELS for drawing.
         residual: (h, w) m, the map less the target, likewise.
         zernike: (21,) m, coefficient errors on that map.
-        true_zernike: (21,) m, those of the noise-free surface, which only a twin knows.
+        true_zernike: (21,) m, those of the noise-free surface, which only a simulation knows.
         rms: m, of the residual over all pixels.
         overflow: how far the signals asked for lay outside the limits, normalised.
         maps: taken during control, the judging one not counted.
@@ -191,7 +191,7 @@ def run_series(
     targets: Sequence[FocusTarget],
     on_shot: Callable[[], None] = lambda: None,
 ) -> Series:
-    """Control `targets` one after another on a copy of the samples' twin.
+    """Control `targets` one after another on a copy of the samples' simulation.
 
     Raises:
         ValueError: an unknown reading.

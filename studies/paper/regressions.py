@@ -26,7 +26,7 @@ LEVEL = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Regressions:
-    """All regressions on one calibrated twin.
+    """All regressions on one calibrated simulation.
 
     Attributes:
         by_reading: the regression of each model in each reading.
@@ -90,7 +90,7 @@ def relative_errors(regression: ErrorRegression) -> Floats:
 
 
 def relative_errors_on(config: SimulationConfig) -> dict[str, Floats]:
-    """(S,) RelErr of the test surfaces on a new twin, by model, in the reading taken."""
+    """(S,) RelErr of the test surfaces on a new simulation, by model, in the reading taken."""
     bench = SimulatedBench(config)
     calibration = bench.calibrate()
     return {

@@ -1,4 +1,4 @@
-"""Everything that the page shows, measured: the standard bench, ideal actuators beside it, and further twins."""
+"""Everything that the page shows, measured: the standard bench, ideal actuators beside it, and further simulations."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STANDARD, IDEAL = "standard bench", "ideal actuators"
 FOREIGN_LAWS = ("preisach", "bouc_wen")
 #: Methods that the aspheres are controlled by.
 ASPHERE_METHODS = ("AZreg", "AZWreg")
-#: Method that the spheres are controlled by on twins of foreign laws.
+#: Method that the spheres are controlled by on simulations of foreign laws.
 LAW_METHOD = "AZreg"
 #: Readings on each bench: ideal actuators have no hysteresis.
 READINGS_ON = MappingProxyType({STANDARD: READINGS, IDEAL: LINEAR_READINGS})
@@ -48,7 +48,7 @@ class PaperOptions:
     Attributes:
         bench: the standard bench, its seed included.
         spheres: number of spheres over the range of curvature.
-        seeds: number of further twins for Table 3, with the seeds that follow the bench's; with small cameras.
+        seeds: number of further simulations for Table 3, with the seeds that follow the bench's; with small cameras.
         shuffles: of the responses of the regression.
         foreign_laws: whether Table 3 and the spheres are tried on other hysteresis laws too.
     """
@@ -88,7 +88,7 @@ class PaperOptions:
 
 @dataclass(frozen=True, eq=False)
 class BenchResults:
-    """One twin.
+    """One simulation.
 
     Attributes:
         spheres: by method and reading.
@@ -111,10 +111,10 @@ class Results:
 
     Attributes:
         benches: STANDARD and IDEAL.
-        seeds: of the further twins.
+        seeds: of the further simulations.
         over_seeds: (B, S) RelErr of the test surfaces on them, by model.
-        over_laws: (S,) the same on one twin of each foreign law, by law and model.
-        law_spheres: the spheres by LAW_METHOD on such twins, by law and reading.
+        over_laws: (S,) the same on one simulation of each foreign law, by law and model.
+        law_spheres: the spheres by LAW_METHOD on such simulations, by law and reading.
         sampling: errors of ways to sample a map, on the standard bench.
     """
 
@@ -142,7 +142,7 @@ def measure(options: PaperOptions, step: Callable[[str], None] = lambda what: No
         step: called with a description before each of `options.steps` steps.
 
     Raises:
-        TooFewMapsError, Refusal, ValueError: a twin could not be calibrated, or its maps judged.
+        TooFewMapsError, Refusal, ValueError: a simulation could not be calibrated, or its maps judged.
     """
     configs = {
         STANDARD: options.bench,
@@ -153,14 +153,14 @@ def measure(options: PaperOptions, step: Callable[[str], None] = lambda what: No
     seeds = tuple(options.bench.seed + k for k in range(1, options.seeds + 1))
     rows = []
     for seed in seeds:
-        step(f"Table 3 on another twin, seed {seed}")
+        step(f"Table 3 on another simulation, seed {seed}")
         rows.append(relative_errors_on(replace(small, seed=seed)))
     over_seeds = {model: np.stack([row[model] for row in rows]) for model in rows[0]}
     over_laws, law_spheres = {}, {}
     for law in FOREIGN_LAWS if options.foreign_laws else ():
-        step(f"Table 3 on a {law} twin")
+        step(f"Table 3 on a {law} simulation")
         over_laws[law] = relative_errors_on(replace(small, law=law))
-        step(f"spheres on a {law} twin")
+        step(f"spheres on a {law} simulation")
         samples = measure_samples(replace(small, law=law))
         law_spheres[law] = {
             reading: run_series(samples, LAW_METHOD, reading, spheres(options.spheres)) for reading in READINGS

@@ -1,4 +1,4 @@
-"""The sample surfaces of Table 1 measured on a twin, and what sections 2.2 and 3.1 of the paper need of them."""
+"""The sample surfaces of Table 1 measured on a simulation, and what sections 2.2 and 3.1 of the paper need of them."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ LONG_REST = 1e4
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """One calibrated twin with its regional errors.
+    """One calibrated simulation with its regional errors.
 
     Attributes:
-        bench: the twin right after its calibration, at rest.
+        bench: the simulation right after its calibration, at rest.
         calibration: all maps, with the fit by AZreg.
         labels: (M,) names of the sample surfaces.
         regional: (M, 10) m, rms surface control error inside the regions.
@@ -123,7 +123,7 @@ class _MapKeepingBench(SimulatedBench):
 def measure_samples(
     config: SimulationConfig, progress: Callable[[Progress], None] = lambda progress: None, *, every_pixel: bool = False
 ) -> Samples:
-    """Measure Table 1 on a new twin, with the pokes and reference frames of a full calibration, and judge the maps.
+    """Measure Table 1 on a new simulation, with the pokes and reference frames of a full calibration, and judge them.
 
     Args:
         every_pixel: judge the regions of Fig. 5 on all pixels too; all maps are in memory meanwhile.

@@ -1,4 +1,4 @@
-"""The sampling study of section 2.2 on surfaces of a twin: edge-clustered and uniform points against every pixel."""
+"""The sampling study of section 2.2 on simulated surfaces: edge-clustered and uniform points against every pixel."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ DRAWS = 10
 
 
 def study_samples(samples: Samples) -> SamplingStudy:
-    """Set surfaces of Table 1 on a copy of the twin and sample the noise-free maps of them in all ways.
+    """Set surfaces of Table 1 on a copy of the simulation and sample the noise-free maps of them in all ways.
 
-    The pixel noise is the instrument's; the noise draws follow from the twin's seed.
+    The pixel noise is the instrument's; the noise draws follow from the simulation's seed.
     """
     bench = samples.bench.fork()
     surfaces = []

@@ -1,4 +1,4 @@
-"""`dm compare`: every method on the same twins, open loop and closed loop."""
+"""`dm compare`: every method on the same simulations, open loop and closed loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, pro
 
 
 class Plant(StrEnum):
-    """Hysteresis laws of the twin; `all` = all that remember, for the ablation."""
+    """Hysteresis laws of the simulation; `all` = all with hysteresis, for the ablation."""
 
     none = "none"
     prandtl_ishlinskii = "prandtl_ishlinskii"
@@ -83,43 +83,44 @@ def show(comparison: Any) -> None:
 
 
 def compare(
-    plant: Annotated[Plant, typer.Option(help="Hysteresis law of the twin.")] = Plant.prandtl_ishlinskii,
+    plant: Annotated[Plant, typer.Option(help="Hysteresis law of the simulation.")] = Plant.prandtl_ishlinskii,
     seed: Annotated[
-        list[int] | None, typer.Option(min=0, help="Seed of a twin; repeat it for several. Default: 1.")
+        list[int] | None, typer.Option(min=0, help="Seed of a simulation; repeat it for several. Default: 1.")
     ] = None,
     method: Annotated[list[str] | None, typer.Option(help="Only these methods; repeat it for several.")] = None,
-    creep: Annotated[float, typer.Option(min=0.0, max=0.2, help="Creep of the twin per decade of time.")] = 0.01,
+    creep: Annotated[float, typer.Option(min=0.0, max=0.2, help="Creep of the simulation per decade of time.")] = 0.01,
     foreseen: Annotated[
         float, typer.Option(min=0.0, max=0.2, help="Creep that closed loops expect per decade; 0 = none.")
     ] = 0.01,
     max_maps: Annotated[
         int, typer.Option(min=1, help="Maps that a closed loop may take, each followed by a correction.")
     ] = 3,
-    pixels: Annotated[int, typer.Option(min=64, max=2048, help="Camera of the twin, pixels x pixels.")] = 236,
-    history: Annotated[
-        bool, typer.Option("--history", help="What each part of the memory brings: hysteresis, creep, recipes.")
+    pixels: Annotated[int, typer.Option(min=64, max=2048, help="Camera of the simulation, pixels x pixels.")] = 236,
+    hysteresis: Annotated[
+        bool,
+        typer.Option("--hysteresis", help="What each part of the model brings: hysteresis, creep, recipes."),
     ] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="With --history: fewer maps and requests.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="With --hysteresis: fewer maps and requests.")] = False,
     json: JsonOption = None,
 ) -> None:
     """Compare all methods on the virtual bench: spheres from -0.05 to +0.05 1/m in random order.
 
-    Runs in process, without nodes. Errors are those of the true surface, which only a twin knows.
-    With --history it is models that are compared, in open loop: any order, dwell times from 0.1 s to 10 min, tracked
+    Runs in process, without nodes. Errors are those of the true surface, which only a simulation knows.
+    With --hysteresis it is models that are compared, in open loop: any order, dwell times from 0.1 s to 10 min, tracked
     from the calibration on, after a degauss and after a power cycle.
     """
-    if history:
-        _compare_history(plant, tuple(seed or (1,)), creep, pixels, quick, json)
+    if hysteresis:
+        _compare_hysteresis(plant, tuple(seed or (1,)), creep, pixels, quick, json)
         return
     if plant is Plant.all:
-        raise typer.BadParameter("all: only with --history", param_hint="--plant")
+        raise typer.BadParameter("all: only with --hysteresis", param_hint="--plant")
     from studies.comparison.compare import CompareOptions, total_steps
     from studies.comparison.compare import compare as run
     from studies.comparison.simulated_bench import SimulationConfig
 
     started = time.monotonic()
     options = CompareOptions(
-        twin=SimulationConfig(law=plant.value, creep=creep, pixels=pixels),
+        simulation=SimulationConfig(law=plant.value, creep=creep, pixels=pixels),
         seeds=tuple(seed or (1,)),
         methods=tuple(method or ()),
         loop=replace(CompareOptions().loop, max_maps=max_maps),
@@ -146,25 +147,25 @@ def compare(
     console.print(f"done in {time.monotonic() - started:.0f} s")
 
 
-def _compare_history(
+def _compare_hysteresis(
     plant: Plant, seeds: tuple[int, ...], creep: float, pixels: int, quick: bool, json: Path | None
 ) -> None:
     from studies.comparison.ablation import PLANTS
     from studies.comparison.simulated_bench import SimulationConfig
-    from studies.verbs import compare_history
+    from studies.verbs import compare_hysteresis
 
     if plant is Plant.none:
-        raise typer.BadParameter("none: a twin without memory has no history", param_hint="--plant")
+        raise typer.BadParameter("none: a simulation without hysteresis has nothing to compare", param_hint="--plant")
     started = time.monotonic()
     plants = PLANTS if plant is Plant.all else (plant.value,)
-    result = compare_history.run(plants, seeds, SimulationConfig(creep=creep, pixels=pixels), quick)
-    compare_history.show(result)
+    result = compare_hysteresis.run(plants, seeds, SimulationConfig(creep=creep, pixels=pixels), quick)
+    compare_hysteresis.show(result)
     figures = {
         "plant": plant.value,
         "seeds": list(seeds),
         "creep_per_decade": creep,
-        "ablation": compare_history.rows_of(result),
-        "identified": compare_history.identified_of(result),
+        "ablation": compare_hysteresis.rows_of(result),
+        "identified": compare_hysteresis.identified_of(result),
     }
     write_json(json, figures | {"seconds": time.monotonic() - started})
     console.print(f"done in {time.monotonic() - started:.0f} s")

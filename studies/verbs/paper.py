@@ -77,9 +77,9 @@ def _show_sampling(results: Any) -> None:
 
 def paper(
     out: Annotated[Path, typer.Option(help="Folder for the page, its pictures and the PDF.")] = Path("runs/paper"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the twin.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulation.")] = 1,
     quick: Annotated[
-        bool, typer.Option(help="A small camera, few spheres and one further twin: under half a minute.")
+        bool, typer.Option(help="A small camera, few spheres and one further simulation: under half a minute.")
     ] = False,
     json: JsonOption = None,
 ) -> None:

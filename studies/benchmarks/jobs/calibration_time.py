@@ -14,7 +14,7 @@ from studies.comparison.simulated_bench import Floats, SimulatedBench, Simulatio
 
 
 class TimedBench(SimulatedBench):
-    """A twin that tells its own work, which a real bench has no part in, from that of calibrating.
+    """A simulation whose own work, which a real bench has no part in, is timed apart from that of calibrating.
 
     Attributes:
         own_s: CPU time spent on simulating, s.

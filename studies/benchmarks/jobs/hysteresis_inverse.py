@@ -1,4 +1,4 @@
-"""The inverse of identified memory laws, beside the linear solve with clipping, and its growth with the actuators."""
+"""The inverse of identified hysteresis models, beside the linear solve with clipping, and its growth with actuators."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SWING, AIM = 0.7, 0.6
 def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     """Figures `inverse` (ms: the slowest class of law, 37 actuators) and `inverse_growth`."""
     generator = np.random.default_rng(3)
-    laws = {name: stand_in_mirror.identified_law(name) for name in stand_in_mirror.TWIN_LAWS}
+    laws = {name: stand_in_mirror.identified_law(name) for name in stand_in_mirror.SIMULATED_LAWS}
     mirror = CalibratedMirror(stand_in_mirror.influence_model(), Limits(-1.0, 1.0, np.zeros((0, 2), np.intp), 2.0))
     by_law = {name: _law(law, mirror, effort, generator) for name, law in laws.items()}
     growth = [_growth(count, laws, effort, generator) for count in (ACTUATORS[:3] if effort.quick else ACTUATORS)]

@@ -46,7 +46,7 @@ def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
 
 
 def _run(rounds: int, driver_host: str, controller_host: str) -> dict[str, float]:
-    """Twin and driver on one host; controller and client on the other."""
+    """Simulation and driver on one host; controller and client on the other."""
     environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory(prefix="dm-hosts-") as temporary:
         folder = Path(temporary)

@@ -21,7 +21,7 @@ START_S, MEASURED_S = 6.0, 20.0
 def measure(effort: Effort, _rivals: dict[str, ModuleType]) -> dict[str, Any]:
     """Figure `idle`: per cent of one core, of the nodes that run on a real bench together, and each.
 
-    The mirror stands in its safe shape and no file arrives; the twin's process is not part of the sum.
+    The mirror stands in its safe shape and no file arrives; the simulation's process is not part of the sum.
 
     Raises:
         RuntimeError: a node has ended.

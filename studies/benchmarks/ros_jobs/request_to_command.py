@@ -2,7 +2,7 @@
 
 Every request waits for its answer before the next one, in turns, so that a busy moment of the machine meets relay and
 controller alike; figures are medians over blocks of such turns. The controller runs as on a bench: a calibration whose
-memory is identified, and a driver that reports every move.
+hysteresis is identified, and a driver that reports every move.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from studies.benchmarks.timing import Effort
 
 Floats = NDArray[np.float64]
 
-#: Class of the memory law in the calibration.
+#: Class of the hysteresis model in the calibration.
 LAW = "Preisach"
 #: Largest curvature asked for, 1/m: reachable, some actuators at their limits.
 REACH = 0.03

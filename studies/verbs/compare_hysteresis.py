@@ -1,4 +1,4 @@
-"""The ablation of `dm compare --history`: its table and its figures."""
+"""The ablation of `dm compare --hysteresis`: its table and its figures."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 from dm_tools.output import as_wavelengths, console, nanometres, progress_bar
 
 
-def run(plants: Sequence[str], seeds: Sequence[int], twin: Any, quick: bool) -> Any:
+def run(plants: Sequence[str], seeds: Sequence[int], simulation: Any, quick: bool) -> Any:
     """Run the ablation with a progress bar."""
     from studies.comparison.ablation import AblationOptions, ablate, total_steps
 
     defaults = AblationOptions()
     options = AblationOptions(
-        twin, plants, seeds, requests=10 if quick else defaults.requests, maps=150 if quick else defaults.maps
+        simulation, plants, seeds, requests=10 if quick else defaults.requests, maps=150 if quick else defaults.maps
     )
     with progress_bar() as bar:
         task = bar.add_task("ablation", total=total_steps(options))
@@ -25,7 +25,8 @@ def run(plants: Sequence[str], seeds: Sequence[int], twin: Any, quick: bool) -> 
 
 def rows_of(ablation: Any) -> list[dict[str, Any]]:
     """A row for each series and dwell time, and one over all dwell times (`dwell_s` null, with the hold of an hour)."""
-    from studies.comparison.ablation import DWELLS, figures_of
+    from studies.comparison.ablation import DWELLS
+    from studies.comparison.ablation_figures import figures_of
 
     rows = []
     for series in ablation.series:
@@ -51,7 +52,7 @@ def rows_of(ablation: Any) -> list[dict[str, Any]]:
 
 
 def identified_of(ablation: Any) -> list[dict[str, Any]]:
-    """What the calibration of each twin found."""
+    """What the calibration of each simulation found."""
     return [
         {
             "plant": found.plant,
