@@ -1,0 +1,136 @@
+"""The floor plan: which way imports go between packages and folders, and how large folders and modules may be."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = sorted(path.name for path in (ROOT / "src").iterdir() if (path / path.name / "__init__.py").is_file())
+#: Folders beside the installed packages, by the name under which they are imported.
+CHECKOUT = {"studies": ROOT / "studies", "fault_injection": ROOT / "tests" / "fault_injection"}
+HOMES = {package: ROOT / "src" / package / package for package in PACKAGES} | CHECKOUT
+
+FOLDER_MODULES_MAX = 12
+MODULE_LINES_MAX = 300
+#: A module shorter than this has more than one importer, or is one that something outside of Python starts.
+SMALL_MODULE_LINES = 40
+#: Modules that the focus controller's node may load of this project, __init__ counted too.
+NODE_MODULES_MAX = 64
+
+
+#: What does not keep a rule yet; nothing may be added.
+CIRCLES = {
+    "dm_calibration": {
+        ("dm_calibration.hysteresis", "dm_calibration.procedure"),
+        ("dm_calibration.map_files", "dm_calibration.store"),
+        ("dm_calibration.recalibration", "dm_calibration.store"),
+    }
+}
+FULL = {"dm_tools.console", "studies.paper"}
+LONG = {"dm_client.client", "dm_common.hysteresis.model", "studies.comparison.ablation"}
+SMALL = {"dm_tools.documentation.parameters", "dm_controller.solvers.iterative_learning", "studies.paper.sampling"}
+
+
+def name_of(path: Path, home: str) -> str:
+    """Name under which a module is imported."""
+    parts = [home, *path.relative_to(HOMES[home]).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(path, home): path for home in HOMES for path in sorted(HOMES[home].rglob("*.py"))}
+
+
+def imports(module: str) -> set[str]:
+    """Modules of this project that a module imports, anywhere in its text."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return (found & MODULES.keys()) - {module}
+
+
+IMPORTS = {module: imports(module) for module in MODULES}
+
+
+def is_package(module: str) -> bool:
+    return MODULES[module].name == "__init__.py"
+
+
+def folder(module: str) -> str:
+    """The folder of a module, as a dotted name."""
+    return module if is_package(module) else module.rpartition(".")[0]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_what_is_installed_needs_nothing_of_the_checkout(package: str) -> None:
+    for module in (name for name in MODULES if name.split(".")[0] == package):
+        others = {name for name in IMPORTS[module] if name.split(".")[0] in CHECKOUT}
+        assert not others, f"{module} imports {others}"
+
+
+def test_studies_do_not_need_the_fault_injection() -> None:
+    for module in (name for name in MODULES if name.startswith("studies")):
+        assert not {name for name in IMPORTS[module] if name.startswith("fault_injection")}, module
+
+
+def loaded(module: str) -> set[str]:
+    """All modules of this project that an import of `module` loads."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name in found or name not in MODULES:
+            continue
+        found.add(name)
+        waiting += [*IMPORTS[name], name.rpartition(".")[0]]
+    return found
+
+
+def test_the_focus_controller_is_on_its_own() -> None:
+    modules = loaded("dm_controller.focus_controller_node")
+    assert {name.split(".")[0] for name in modules} == {"dm_common", "dm_controller"}
+    assert len(modules) <= NODE_MODULES_MAX, sorted(modules)
+
+
+@pytest.mark.parametrize("home", HOMES)
+def test_folders_side_by_side_do_not_need_each_other(home: str) -> None:
+    """Of two folders of one package, at most one imports the other."""
+    edges = {
+        (folder(module), folder(other))
+        for module in MODULES
+        if module.split(".")[0] == home
+        for other in IMPORTS[module]
+        if other.split(".")[0] == home
+    }
+    apart = {(a, b) for a, b in edges if not a.startswith(b) and not b.startswith(a)}
+    both_ways = {tuple(sorted(pair)) for pair in apart if pair[::-1] in apart}
+    assert both_ways == CIRCLES.get(home, set())
+
+
+@pytest.mark.parametrize("home", HOMES)
+def test_folders_hold_a_dozen_modules(home: str) -> None:
+    counts = Counter(folder(name) for name in MODULES if name.split(".")[0] == home and not is_package(name))
+    assert {name for name, count in counts.items() if count > FOLDER_MODULES_MAX} <= FULL
+
+
+@pytest.mark.parametrize("home", HOMES)
+def test_modules_can_be_read_at_one_sitting(home: str) -> None:
+    lines = {name: len(MODULES[name].read_text().splitlines()) for name in MODULES if name.split(".")[0] == home}
+    assert {name for name, count in lines.items() if count > MODULE_LINES_MAX} <= LONG
+
+
+def test_small_modules_serve_more_than_one() -> None:
+    importers = Counter(other for module in MODULES for other in IMPORTS[module])
+    small = {
+        name
+        for name, path in MODULES.items()
+        if len(path.read_text().splitlines()) < SMALL_MODULE_LINES and importers[name] == 1
+        if not (is_package(name) or name.endswith("_node") or 'if __name__ == "__main__":' in path.read_text())
+    }
+    assert small <= SMALL
