@@ -8,7 +8,7 @@ from dm_calibration.influence.surfaces import TABLE_1 as NAMES
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from studies.paper import reported
-from studies.paper.figures import regional_errors_figure, regions_figure, weights_figure
+from studies.paper.page.figures import regional_errors_figure, regions_figure, weights_figure
 from studies.paper.regions import OUTSIDE_MEAN, RegionStatistics
 from studies.paper.results import STANDARD, Results
 from studies.paper.samples import PIXELS, POINTS, Samples

@@ -15,7 +15,7 @@ from studies.paper.control import (
     Series,
     share_within,
 )
-from studies.paper.control_figures import coefficients_figure, sweep_figure
+from studies.paper.page.control_figures import coefficients_figure, sweep_figure
 from studies.paper.results import IDEAL, LAW_METHOD, STANDARD, BenchResults, Results
 
 NM = 1e9

@@ -10,8 +10,8 @@ from dm_calibration.report.document import Picture, Section, Table
 from dm_common.optics.conic import conic_sag
 from studies.paper import reported
 from studies.paper.control import LOOP_HYSTERESIS, LOOP_MAPS, METHODS, OPEN_HYSTERESIS
-from studies.paper.control_figures import surfaces_figure
 from studies.paper.page.content_coefficients import FIGURES, SHOWN, WITH, best, parts
+from studies.paper.page.control_figures import surfaces_figure
 from studies.paper.regressions import LEVEL
 from studies.paper.results import STANDARD, BenchResults, Results
 

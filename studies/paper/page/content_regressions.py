@@ -7,7 +7,7 @@ import numpy as np
 from dm_calibration.regression.surface_error import ErrorRegression, Reading
 from dm_calibration.report.document import Picture, Section, Table
 from studies.paper import reported
-from studies.paper.figures import predictions_figure
+from studies.paper.page.figures import predictions_figure
 from studies.paper.regressions import LEVEL, TAKEN, relative_errors
 from studies.paper.results import STANDARD, BenchResults, Results
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS
-from studies.paper.figures import sampling_figure
+from studies.paper.page.figures import sampling_figure
 from studies.paper.results import Results
 from studies.paper.sampling_study import SamplingResult
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from dm_calibration.report.colours import BLUE, GREEN, ORANGE, PURPLE, VERMILION
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from studies.paper.control import LOOP_HYSTERESIS, OPEN_HYSTERESIS, Series
-from studies.paper.figures import NM
+from studies.paper.page.figures import NM
 from studies.paper.reported import CLAIM_PARTS, WAVELENGTH
 
 #: Errors below this are drawn here, m: far below the noise of any interferometer.
