@@ -57,4 +57,4 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     commands = {found[1]: None for reason in reasons if (found := _COMMAND.search(reason))}
     if reports:
         cure = f"; to run them: {' && '.join(commands)}" if commands else "; the reasons stand above"
-        terminalreporter.write_line(f"{len(reports)} tests were skipped{cure}")
+        terminalreporter.write_line(f"tests skipped: {len(reports)}{cure}")

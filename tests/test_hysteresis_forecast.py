@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_calibration.hysteresis.forecast import Forecast, forecast, map_noise
+from dm_calibration.procedure.forecast import Forecast, forecast, map_noise
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 

@@ -15,9 +15,9 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_maps
-from dm_calibration.hysteresis.forecast import forecast
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.procedure.event_frames import Storing
+from dm_calibration.procedure.forecast import forecast
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.store.update_storage import Updates
+from dm_calibration.recalibration.update_storage import Updates
 from dm_common.messages import doubles, recipe_book_message, time_message
 
 Floats = NDArray[np.float64]

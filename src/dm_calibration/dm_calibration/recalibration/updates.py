@@ -18,8 +18,14 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
 from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter, DriftRates
+from dm_calibration.recalibration.update_storage import (
+    Updates,
+    UpdatesFileError,
+    basis_hash,
+    read_updates,
+    write_updates,
+)
 from dm_calibration.store.calibration_store import StoreError
-from dm_calibration.store.update_storage import Updates, UpdatesFileError, basis_hash, read_updates, write_updates
 from dm_common.measurement import Measurement
 from dm_common.mirror import APERTURE_TOLERANCE
 

@@ -106,7 +106,7 @@ class Hdf5Sandbox:
         atexit.register(self.close)
 
     def read(self, task: str, content: bytes) -> Answer:
-        """Have `content` read by the reader `task` of :mod:`dm_calibration.store.hdf5_process`.
+        """Have `content` read by the reader `task` of :mod:`dm_calibration.map_files.hdf5_process`.
 
         Raises:
             SandboxError: the helper died of it, took too long, or could not be started.
@@ -147,7 +147,7 @@ class Hdf5Sandbox:
                 self._shared = os.memfd_create("hdf5")
                 # A session of its own: Ctrl-C on the terminal is for the node, which ends the helper with itself.
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "dm_calibration.store.hdf5_process", str(self._shared)],
+                    [sys.executable, "-m", "dm_calibration.map_files.hdf5_process", str(self._shared)],
                     pass_fds=[self._shared],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
