@@ -15,7 +15,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.names import UnknownNameError
-from dm_common.optics.piston_tilt import remove_piston_tilt, rms, weighted_fit
+from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from linear_mirror import LinearMirror, make_mirror
 
 NM = 1e-9
@@ -262,14 +262,3 @@ def test_unknown_method_and_label(mirror: Mirror) -> None:
         fit_influence(maps, FitOptions(method="AZreq"))
     with pytest.raises(UnknownNameError, match=r"map label 'poke\+1' is unknown; did you mean poke\+"):
         fit_influence(maps, exclude=["poke+1"])
-
-
-def test_weighted_fit_with_and_without_gaps() -> None:
-    random = np.random.default_rng(6)
-    modes = random.standard_normal((50, 4))
-    weight = random.uniform(0.5, 1.5, 50)
-    truth = random.standard_normal((3, 4))
-    sag = truth @ modes.T
-    assert weighted_fit(sag, modes, weight) == pytest.approx(truth)
-    sag[1, 5:20] = np.nan
-    assert weighted_fit(sag, modes, weight) == pytest.approx(truth)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
-from dm_common.optics.piston_tilt import fit_plane, remove_plane
 from dm_common.optics.zernike import basis
 
 
@@ -135,24 +134,6 @@ def test_residual_map() -> None:
     residual = fitter.residual(sag, fitter.fit(sag).coefficients)
     _coefficients, expected, _inverse = plain_fit(sag, 40.2, 39.1, 35.0)
     np.testing.assert_allclose(residual[np.isfinite(residual)], expected, atol=1e-15)
-
-
-def test_piston_and_tilt_are_removed_and_nothing_else() -> None:
-    rows, columns = np.mgrid[:40, :50]
-    bump = np.where(np.random.default_rng(0).random((40, 50)) < 0.1, np.nan, np.sin(columns / 3.0) * np.cos(rows / 5.0))
-    flat = remove_plane(bump)
-    tilted = remove_plane(bump + 5 + 0.3 * columns - 0.2 * rows)
-    np.testing.assert_allclose(tilted, flat, atol=1e-12)
-    np.testing.assert_allclose(fit_plane(flat), 0, atol=1e-13)
-    np.testing.assert_allclose(fit_plane(5 + 0.3 * (columns - 24.5) - 0.2 * (rows - 19.5)), [5, 0.3, -0.2])
-
-
-def test_plane_of_a_single_row_does_not_fail() -> None:
-    sag = np.full((5, 6), np.nan)
-    sag[2] = np.arange(6)
-    np.testing.assert_allclose(remove_plane(sag)[2], 0, atol=1e-12)
-    with pytest.raises(ValueError, match="no valid pixel"):
-        fit_plane(np.full((2, 2), np.nan))
 
 
 LETTER_F = np.array([[1, 1, 1], [1, 0, 0], [1, 1, 0], [1, 0, 0]], dtype=float)

@@ -1,0 +1,125 @@
+"""Messages of dm_msgs and the types that several nodes share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo
+from dm_msgs.srv import Measure
+
+from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_common.messages import (
+    applied_from,
+    hysteresis_model_from,
+    measurement_from,
+    mirror_from,
+    recipe_book_from,
+    recipe_book_message,
+    seconds,
+    stamp_ns,
+    time_message,
+)
+from dm_common.recipes import Recipe, RecipeBook, RecipeError
+
+X, Y = hexagonal_positions(7)
+PAIRS = neighbour_pairs(X, Y)
+
+
+def mirror_info(**fields: Any) -> MirrorInfo:
+    described: dict[str, Any] = {
+        "name": "PDM",
+        "serial": "7",
+        "actuators": 7,
+        "actuator_x": X.tolist(),
+        "actuator_y": Y.tolist(),
+        "neighbour_a": PAIRS[:, 0].tolist(),
+        "neighbour_b": PAIRS[:, 1].tolist(),
+        "working_aperture_diameter": 22e-3,
+        "signal_min": -0.5,
+        "signal_max": 1.0,
+        "neighbour_difference_max": 0.8,
+    }
+    return MirrorInfo(**described | fields)
+
+
+def test_times_go_there_and_back() -> None:
+    stamp = 1_700_000_000_123_456_789
+    assert stamp_ns(time_message(stamp)) == stamp
+    assert seconds(time_message(stamp)) == pytest.approx(1e-9 * stamp)
+
+
+def test_a_mirror_is_what_the_driver_describes() -> None:
+    mirror = mirror_from(mirror_info())
+    assert (mirror.name, mirror.serial, mirror.actuators, mirror.working_radius) == ("PDM", "7", 7, 11e-3)
+    limits = mirror.limits
+    assert (limits.low, limits.high, limits.neighbour_difference) == (-0.5, 1.0, 0.8)
+    assert (limits.pairs == PAIRS).all()
+    assert mirror.rest == pytest.approx(np.full(7, 0.25))
+    assert len(mirror_from(mirror_info(neighbour_a=[], neighbour_b=[])).limits.pairs) == 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"actuator_x": [0.0]}, "actuator_x has 1 values, not 7"),
+        ({"neighbour_a": [0]}, "1 neighbour_a, 12 neighbour_b"),
+        ({"neighbour_a": [0] * 12, "neighbour_b": [7] * 12}, r"indices must lie in 0\.\.6"),
+        ({"working_aperture_diameter": 0.0}, "working_radius = 0.0: must be positive"),
+        ({"signal_min": 1.0}, "the lower limit must be below the upper"),
+        ({"neighbour_difference_max": 0.0}, "neighbour_difference = 0: must be positive"),
+    ],
+)
+def test_a_mirror_that_makes_no_sense_is_refused(fields: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        mirror_from(mirror_info(**fields))
+
+
+def test_reports_of_the_driver() -> None:
+    message = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE, turns=3, degausses=1, history_known=True)
+    message.header.stamp = time_message(2_500_000_000)
+    message.applied, message.turned_at = [0.1, 0.2], [0.3, 0.4]
+    report = applied_from(message)
+    assert (report.time, report.turns, report.degausses, report.history_known) == (2.5, 3, 1, True)
+    assert report.active and not report.moving
+    assert report.turned_at is not None and report.turned_at.tolist() == [0.3, 0.4]
+    message.turned_at = []
+    assert applied_from(message).turned_at is None
+
+
+def test_a_map_of_another_convention_or_without_samples_is_refused() -> None:
+    answer = Measure.Response()
+    with pytest.raises(ValueError, match="0 sag values at 0 points"):
+        measurement_from(answer)
+    answer.zernike.convention = 99
+    with pytest.raises(ValueError, match=r"zernike\.convention = 99"):
+        measurement_from(answer)
+
+
+def test_hysteresis_that_was_not_identified_and_one_that_makes_no_sense() -> None:
+    assert hysteresis_model_from(ActuatorHysteresis()) is None
+    with pytest.raises(ValueError, match="play_weight has 3 values, must be 2 x 1"):
+        hysteresis_model_from(ActuatorHysteresis(play_radius=[0.0, 0.5], play_weight=[1.0, 2.0, 3.0], powers=1))
+
+
+def recipe(curvature: float, actuators: int = 2) -> Recipe:
+    signals = np.full(actuators, curvature)
+    return Recipe(curvature, 0.0, signals, signals + 0.1, 1e-10, 2e-10, 5)
+
+
+def test_recipes_go_there_and_back() -> None:
+    book = RecipeBook((recipe(-0.01), recipe(0.02)), 100, 3e-10, 1_700_000_000_000_000_000)
+    back = recipe_book_from(recipe_book_message(book))
+    assert (back.degauss_steps, back.interpolation_error, back.stamp_ns) == (100, 3e-10, book.stamp_ns)
+    for one, other in zip(book.recipes, back.recipes, strict=True):
+        figures = [(each.curvature, each.max_zernike, each.rms, each.maps) for each in (one, other)]
+        assert figures[0] == figures[1]
+        assert (one.effective == other.effective).all() and (one.signals == other.signals).all()
+
+
+def test_recipes_that_do_not_fit_together_are_refused() -> None:
+    with pytest.raises(RecipeError, match="must rise"):
+        RecipeBook((recipe(0.02), recipe(-0.01)), 100, 0.0, 0)
+    with pytest.raises(RecipeError, match="different numbers of actuators"):
+        RecipeBook((recipe(-0.01), recipe(0.02, actuators=3)), 100, 0.0, 0)
