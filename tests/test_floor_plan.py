@@ -24,7 +24,7 @@ NODE_MODULES_MAX = 64
 
 #: What does not keep a rule yet; nothing may be added.
 FULL = {"dm_tools.console", "studies.paper"}
-LONG = {"dm_client.client", "dm_common.hysteresis.model", "studies.comparison.ablation"}
+LONG = {"dm_client.client", "dm_common.hysteresis.model"}
 SMALL = {"dm_tools.documentation.parameters", "dm_controller.solvers.iterative_learning", "studies.paper.sampling"}
 
 
