@@ -25,7 +25,7 @@ NODE_MODULES_MAX = 64
 #: What does not keep a rule yet; nothing may be added.
 FULL = {"dm_tools.console", "studies.paper"}
 LONG = {"dm_client.client", "dm_common.hysteresis.model"}
-SMALL = {"dm_tools.documentation.parameters", "dm_controller.solvers.iterative_learning", "studies.paper.sampling"}
+SMALL = {"dm_controller.solvers.iterative_learning"}  # one solver a module
 
 
 def name_of(path: Path, home: str) -> str:

@@ -25,8 +25,7 @@ from studies.paper.control import (
 from studies.paper.regressions import Regressions, regress_samples, relative_errors_on
 from studies.paper.reported import CURVATURE_RANGE
 from studies.paper.samples import Samples, measure_samples
-from studies.paper.sampling import study_samples
-from studies.paper.sampling_study import SamplingStudy
+from studies.paper.sampling_study import SamplingStudy, study_samples
 
 Floats = NDArray[np.float64]
 

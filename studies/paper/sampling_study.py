@@ -27,9 +27,15 @@ from dm_calibration.optics.aperture import Aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points, sample_map, uniform_points
 from dm_common.optics.zernike import TERMS, basis, rms_of
+from dm_simulation.interferometer.interferometer import InterferometerConfig
+from studies.paper.samples import Samples
 
 Floats = NDArray[np.float64]
 
+#: Of the surfaces of Table 1 every so many are studied: pokes, spheres and Zernike surfaces among them.
+STRIDE = 6
+#: Noise maps of the study on simulated surfaces.
+DRAWS = 10
 #: The rim is the outermost share of the aperture's area.
 RIM_SHARE = 0.1
 
@@ -191,3 +197,24 @@ def _check(surfaces: Floats, pixel_noise: float, truth: Floats | None, dropout: 
         raise ValueError(f"draws = {draws}: a standard deviation needs at least 2")
     if count < len(TERMS):
         raise ValueError(f"count = {count} sampling points for {len(TERMS)} terms: at least {len(TERMS)} are needed")
+
+
+def study_samples(samples: Samples) -> SamplingStudy:
+    """Set surfaces of Table 1 on a copy of the simulation and sample the noise-free maps of them in all ways.
+
+    The pixel noise is the instrument's; the noise draws follow from the simulation's seed.
+    """
+    bench = samples.bench.fork()
+    surfaces = []
+    for label in samples.labels[::STRIDE]:
+        bench.apply(samples.calibration.maps.applied[samples.row(label)])
+        bench.settle()
+        surfaces.append(bench.true_map())
+    return study_sampling(
+        np.stack(surfaces),
+        bench.aperture,
+        InterferometerConfig().pixel_noise,
+        np.random.default_rng(bench.config.seed),
+        draws=DRAWS,
+        count=bench.config.samples,
+    )
