@@ -47,7 +47,7 @@ class FileEvent(NamedTuple):
 class FolderWatch:
     """Finds files that are new in a folder (not below it), each state of a file once.
 
-    Files that exist at the first look that succeeds are not new, until they are written again.
+    Files that exist at the first listing that succeeds are not new, until they are written again.
     """
 
     def __init__(self, folder: Path, patterns: Sequence[str], stable_time: float) -> None:
@@ -68,9 +68,9 @@ class FolderWatch:
         self._ignored.add(path.name)
 
     def poll(self, now: float) -> list[FileEvent]:
-        """Look once; `now` is a monotonic time in s.
+        """List the folder; `now` is a monotonic time in s.
 
-        Returns what became ready since the last look, oldest first.
+        Returns what became ready since the last listing, oldest first.
 
         Raises:
             OSError: the folder cannot be read now; what is known is kept.
@@ -91,7 +91,7 @@ class FolderWatch:
         return [event for _time, event in sorted(ready)]
 
     def closed(self, names: Iterable[str], now: float) -> list[FileEvent]:
-        """Look at files whose writer has just closed them, as far as they are known to be whole, which need not wait.
+        """Check files whose writer has just closed them, as far as they are known to be whole, which need not wait.
 
         Others are left to :meth:`poll`, so are those that it would refuse.
         """

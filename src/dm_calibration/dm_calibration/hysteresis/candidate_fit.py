@@ -154,9 +154,15 @@ class CandidateProblem:
         high = np.concatenate((np.full(slopes, 30.0), [0.2]))
         scale = np.concatenate((np.ones(slopes), [0.01]))
         found = least_squares(
-            residual, guess, bounds=(low, high), x_scale=scale, diff_step=1e-3, max_nfev=evaluations, xtol=1e-5,
+            residual,
+            guess,
+            bounds=(low, high),
+            x_scale=scale,
+            diff_step=1e-3,
+            max_nfev=evaluations,
+            xtol=1e-5,
             ftol=1e-6,
-        )  # fmt: skip
+        )
         features = self._features(found.x)
         solved, left = self._solve(features, keep, weights[0])
         return LawFit(self.candidate, self._law(solved, found.x), left * self._scatter)

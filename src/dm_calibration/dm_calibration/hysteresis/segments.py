@@ -46,9 +46,7 @@ def figure_columns(time: Floats, parts: list[slice], starts: list[float]) -> Flo
         time: (M,) s.
         starts: s, of all parts.
     """
-    running = np.concatenate(
-        [[0.0], np.cumsum(np.diff(time) * (~_begins(parts, len(time)))[1:])]
-    )  # fmt: skip
+    running = np.concatenate([[0.0], np.cumsum(np.diff(time) * (~_begins(parts, len(time)))[1:])])
     first = np.zeros(len(time))
     first[parts[0]] = relaxation(time[parts[0]], starts[0])
     columns = [np.ones(len(time)), first, (running + time[0] - starts[0]) / max(float(np.ptp(running)), 1e-9)]

@@ -97,8 +97,11 @@ def check_pokes(
     quiet = size <= 1e-12 * size.max(initial=0.0) if silent is None else silent | (size == 0.0)
     active = np.flatnonzero(~(quiet | untried))
     quiet &= ~untried
-    findings = [_numbered("shows no response above the noise", "show no response above the noise",
-                          np.flatnonzero(quiet))] if quiet.any() else []  # fmt: skip
+    findings = (
+        [_numbered("shows no response above the noise", "show no response above the noise", np.flatnonzero(quiet))]
+        if quiet.any()
+        else []
+    )
     if active.size < 3:
         findings.append(f"only {active.size} actuators answer: wiring and orientation cannot be checked")
         zero = np.zeros(count, dtype=np.int64)

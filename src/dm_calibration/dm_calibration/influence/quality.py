@@ -52,8 +52,9 @@ def grade(
     options = options or GradeOptions()
     rings = np.zeros(response.size, dtype=np.int64) if rings is None else rings
     overall = float(np.median(response[excited])) if excited.any() else 0.0
-    ring_median = np.array([np.median(response[excited & (rings == ring)]) if e else 0.0
-                            for ring, e in zip(rings, excited, strict=True)])  # fmt: skip
+    ring_median = np.array(
+        [np.median(response[excited & (rings == ring)]) if e else 0.0 for ring, e in zip(rings, excited, strict=True)]
+    )
     dead = (response < options.dead_sigmas * standard_error) | (response < options.dead_share * overall)
     weak = (response < options.weak_sigmas * standard_error) | (response < options.weak_share * ring_median)
     grades = np.where(dead, GRADE_DEAD, np.where(weak, GRADE_WEAK, GRADE_GOOD))

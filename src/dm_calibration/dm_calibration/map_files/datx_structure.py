@@ -99,12 +99,12 @@ def _other_values(surface: h5py.Dataset, first: int, last: int) -> bool:
     """Whether values of another dataset may stand among the bytes `first` to `last`."""
     found = []
 
-    def look(_name: str, item: object) -> None:
+    def visit(_name: str, item: object) -> None:
         if isinstance(item, h5py.Dataset) and item != surface:
             start = item.id.get_offset()
             found.append(start is None or (start < last and start + item.id.get_storage_size() > first))
 
-    surface.file.visititems(look)
+    surface.file.visititems(visit)
     return any(found)
 
 

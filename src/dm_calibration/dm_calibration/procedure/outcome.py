@@ -38,9 +38,13 @@ class Setup:
     def of(cls, measured: Measurement) -> Setup:
         """The setup that `measured` was taken with."""
         return cls(
-            measured.points, measured.wavelength, measured.system_error_subtracted, measured.instrument,
-            measured.pitch, measured.camera,
-        )  # fmt: skip
+            measured.points,
+            measured.wavelength,
+            measured.system_error_subtracted,
+            measured.instrument,
+            measured.pitch,
+            measured.camera,
+        )
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class MapTaken:
 
 @dataclass(frozen=True)
 class Unseen:
-    """A command without a map, kept because the actuators remember it."""
+    """A command without a map, kept because it belongs to the history of the actuators."""
 
     record: Measurement
 

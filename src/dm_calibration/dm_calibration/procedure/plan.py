@@ -136,9 +136,7 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     commands = excitation(mirror, options.hysteresis_maps)
     steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
     steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]
-    for k, (signals, dwell, check) in enumerate(
-        zip(commands.signals, commands.dwell, commands.check, strict=True)
-    ):  # fmt: skip
+    for k, (signals, dwell, check) in enumerate(zip(commands.signals, commands.dwell, commands.check, strict=True)):
         kind = StepKind.CHECK if check else StepKind.EXCITATION
         steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell)))
         if (k + 1) % HYSTERESIS_REFERENCE_EVERY == 0:

@@ -28,7 +28,7 @@ __all__ = ["Outcome", "Procedure", "ProcedureOptions", "Progress"]
 
 Floats = NDArray[np.float64]
 
-#: Maps of the mirror at rest with which a memory run goes on: they tell where the figure stands now.
+#: Maps of the mirror at rest with which a hysteresis run goes on: they show where the figure stands now.
 RESUME_MAPS = 3
 
 
@@ -117,7 +117,7 @@ class Procedure:
             self._measure_state(step, number, self._options.maps_per_state)
 
     def _go_on(self) -> None:
-        """Begin a new segment after an interruption: wipe the memory, look at the mirror at rest."""
+        """Begin a new segment after an interruption: degauss, and a map of the mirror at rest."""
         last = self.outcome.records[-1].label
         done = next(number for number, step in enumerate(self._plan.steps) if not self._is_done(number, step))
         self._checkpoint()
@@ -136,9 +136,7 @@ class Procedure:
 
     def _report(self, label: str, kind: StepKind, done: int) -> None:
         residual_rms = self.outcome.records[-1].residual_rms if self.outcome.records else 0.0
-        self._progress(
-            Progress(label, kind, done, len(self._plan.steps), len(self.outcome.dropped), residual_rms)
-        )  # fmt: skip
+        self._progress(Progress(label, kind, done, len(self._plan.steps), len(self.outcome.dropped), residual_rms))
 
     def _checkpoint(self) -> None:
         if self._cancelled():
@@ -193,7 +191,7 @@ class Procedure:
             raise Refusal(failure.error_code, f"{self._failures} states in a row gave no map; the last: {failure}")
 
     def _note_unseen(self, step: Step, number: int, applied: Floats) -> None:
-        """Keep a command without a map where the actuators' memory is to be identified: they remember it all the same.
+        """Keep a command without a map where hysteresis is to be identified: the actuators had it all the same.
 
         Its time is not known; it counts as right after the map before.
         """
@@ -203,8 +201,20 @@ class Procedure:
         nothing = np.full_like(records[-1].coefficients, np.nan)
         assert step.signals is not None
         unseen = replace(
-            records[-1], label=step.label, kind=step.kind.value, step=number, signals=step.signals,
-            applied=applied, coefficients=nothing, sigma=nothing, sag=np.full_like(records[-1].sag, np.nan),
-            residual_rms=np.nan, valid_fraction=0.0, file="", sha256="", nominal=None, moved_ns=0,
-        )  # fmt: skip
+            records[-1],
+            label=step.label,
+            kind=step.kind.value,
+            step=number,
+            signals=step.signals,
+            applied=applied,
+            coefficients=nothing,
+            sigma=nothing,
+            sag=np.full_like(records[-1].sag, np.nan),
+            residual_rms=np.nan,
+            valid_fraction=0.0,
+            file="",
+            sha256="",
+            nominal=None,
+            moved_ns=0,
+        )
         self._note(Unseen(unseen))

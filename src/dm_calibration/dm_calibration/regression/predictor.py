@@ -1,7 +1,7 @@
 """The surface control error of a command that is still to come, with an interval.
 
 The regression of the reading HISTORY says how the error follows from a command and those before it. Whoever asks about
-a command gives no history, and the actuators remember: so the answer is taken over many histories, as the mirror may
+a command gives no history, and the error depends on it: so the answer is taken over many histories, as the mirror may
 have in use: smooth shapes (the spheres and Zernike surfaces of the calibration) of any size the range allows, in random
 order from a rested mirror. The interval holds 95 % of them, widened by the uncertainty of the regression.
 """

@@ -15,7 +15,7 @@ readings are kept (:class:`Reading`):
 - MEASURED: signals, measured coefficients, and `model` with the part inside the 21 terms from those, c - G s, and the
   rest as COMMAND. It uses what [1] uses, but the surface must have been measured.
 - HISTORY: as COMMAND, but `model` follows the commands before this one too
-  (:mod:`~dm_calibration.regression.sag_history`), so it knows what the actuators remember, and the figure drifts with
+  (:mod:`~dm_calibration.regression.sag_history`), so it knows hysteresis and creep, and the figure drifts with
   the reference frames. Nothing measured on the surface itself enters, but the frames before and after it do. This is
   the one that works, and the default.
 
