@@ -27,18 +27,18 @@ def calibration() -> Calibration:
 
 
 def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration, tmp_path: Path) -> None:
-    told: list[tuple[str, bool]] = []
-    writer = ReportWriter(lambda words, warning: told.append((words, warning)))
+    published: list[tuple[str, bool]] = []
+    writer = ReportWriter(lambda text, warning: published.append((text, warning)))
     store = ReportingStore(tmp_path, writer, lambda: True)
     store.save(calibration)
     assert writer.wait(PATIENCE_S)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c1.h5", "c1.html", "c1.pdf"]
-    assert told == [("report written: c1.html and .pdf beside the calibration", False)]
+    assert published == [("report written: c1.html and .pdf beside the calibration", False)]
     assert [entry.id for entry in store.entries()] == ["c1"]
 
 
 def test_a_changed_calibration_gets_a_new_report(calibration: Calibration, tmp_path: Path) -> None:
-    writer = ReportWriter(lambda _words, _warning: None)
+    writer = ReportWriter(lambda _text, _warning: None)
     store = ReportingStore(tmp_path, writer, lambda: True)
     store.save(calibration)
     store.replace(replace(calibration, limitations=("Somebody leaned on the table.",)))
@@ -47,26 +47,26 @@ def test_a_changed_calibration_gets_a_new_report(calibration: Calibration, tmp_p
 
 
 def test_a_report_that_fails_leaves_the_calibration_and_a_sentence(calibration: Calibration, tmp_path: Path) -> None:
-    told: list[tuple[str, bool]] = []
-    writer = ReportWriter(lambda words, warning: told.append((words, warning)))
+    published: list[tuple[str, bool]] = []
+    writer = ReportWriter(lambda text, warning: published.append((text, warning)))
     (tmp_path / "c1.html").mkdir()  # something else has the name
     store = ReportingStore(tmp_path, writer, lambda: True)
     store.save(calibration)
     assert writer.wait(PATIENCE_S)
-    ((words, warning),) = told
-    assert warning and words.startswith("no report of c1.h5: ") and "./dm report" in words
+    ((text, warning),) = published
+    assert warning and text.startswith("no report of c1.h5: ") and "./dm report" in text
     assert store.load("c1").id == "c1"
 
 
 def test_nothing_is_written_when_none_is_wanted(calibration: Calibration, tmp_path: Path) -> None:
-    writer = ReportWriter(lambda _words, _warning: None)
+    writer = ReportWriter(lambda _text, _warning: None)
     ReportingStore(tmp_path, writer, lambda: False).save(calibration)
     assert writer.wait(PATIENCE_S)
     assert [path.name for path in tmp_path.iterdir()] == ["c1.h5"]
 
 
 def test_the_end_of_the_node_leaves_no_halves(calibration: Calibration, tmp_path: Path) -> None:
-    writer = ReportWriter(lambda _words, _warning: None)
+    writer = ReportWriter(lambda _text, _warning: None)
     ReportingStore(tmp_path, writer, lambda: True).save(calibration)
     writer.end()
     assert writer.wait(0.0)

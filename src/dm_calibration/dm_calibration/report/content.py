@@ -1,4 +1,4 @@
-"""The report in words, part one: what it comes to, what was measured with what, what to beware of, every map."""
+"""Text of the report, part one: what it comes to, what was measured with what, what to beware of, every map."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHA_SHOWN = 12
 
 
 def utc(time_ns: int) -> str:
-    """A time in words."""
+    """A time as text."""
     return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(time_ns * 1e-9))
 
 
@@ -38,7 +38,7 @@ def _counted(number: int, one: str, many: str) -> str:
 
 
 def remeasured(calibration: Calibration) -> str:
-    """The largest re-measured error of the recipes, in words."""
+    """The largest re-measured error of the recipes, as text."""
     recipes = calibration.recipes.recipes
     if not recipes:
         return "not measured"
@@ -69,16 +69,16 @@ def summary(calibration: Calibration) -> Section:
     )
     if hysteresis is None:
         kind = (
-            "This calibration is linear and without memory: after any move, hysteresis and creep leave an error that "
+            "This calibration is linear, without hysteresis: after any move, hysteresis and creep leave an error that "
             "depends on the moves before. The held-out residual holds it."
         )
     else:
         kind = (
-            f"This calibration knows how the mirror remembers ({hysteresis.name}). Its influence function acts on "
+            f"This calibration holds a hysteresis model ({hysteresis.name}). Its influence function acts on "
             "effective signals, which follow from the history of all moves since the last degauss."
         )
     dropped, warnings = calibration.maps_dropped, len(calibration.limitations)
-    told = (
+    counted = (
         f"{_counted(dropped, 'map was', 'maps were')} dropped; "
         f"{_counted(warnings, 'sentence', 'sentences')} of caution below."
     )
@@ -89,7 +89,7 @@ def summary(calibration: Calibration) -> Section:
             "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that "
             "had no part in it: the honest one. Re-measured is what a map showed after a command of this calibration "
             "was applied. All lengths are surface sag, piston and tilt removed.",
-            told,
+            counted,
         ],
         [Table("Key figures", ("figure", "value"), rows)],
     )
@@ -99,7 +99,7 @@ def provenance(calibration: Calibration, file: str, sha256: str) -> Section:
     """What was measured, when, with what."""
     maps, fit = calibration.maps, calibration.fit
     first, last = int(maps.stamp_ns.min()), int(maps.stamp_ns.max())
-    wavelength = f"{calibration.wavelength * NM:.2f} nm" if calibration.wavelength > 0.0 else "not told by the maps"
+    wavelength = f"{calibration.wavelength * NM:.2f} nm" if calibration.wavelength > 0.0 else "not stated by the maps"
     kinds = Counter(maps.kind)
     rows = [
         ("calibration", calibration.id),

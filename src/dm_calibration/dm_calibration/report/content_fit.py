@@ -1,4 +1,4 @@
-"""The report in words, part two: influence functions, actuators, residuals, regions, coefficients."""
+"""Text of the report, part two: influence functions, actuators, residuals, regions, coefficients."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def regions(calibration: Calibration, left: Residuals) -> Section:
     try:
         regional = regional_rms(left.sag, left.maps.points, labels=left.maps.label)
     except EmptyRegionError as error:
-        return Section(title, [f"Not told: {error}."])
+        return Section(title, [f"Not evaluated: {error}."])
     moved = ~left.maps.reference
     shown, kinds = regional[moved], [kind for kind, each in zip(left.maps.kind, moved, strict=True) if each]
     weights = calibration.region_weights

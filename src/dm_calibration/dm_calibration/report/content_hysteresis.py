@@ -1,4 +1,4 @@
-"""The report in words, part three: hysteresis, creep and recipes."""
+"""Text of the report, part three: hysteresis, creep and recipes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def hysteresis(calibration: Calibration) -> Section:
         return Section(
             title,
             [
-                "Not identified: the maps of this plan do not show the memory apart from the influence function. "
-                "A calibration with the plan “memory” does (./dm calibrate --plan hysteresis)."
+                "Not identified: the maps of this plan do not show hysteresis apart from the influence function. "
+                "A calibration with the plan “hysteresis” does (./dm calibrate --plan hysteresis)."
             ],
         )
     law, wavelength = hysteresis.law, calibration.wavelength
@@ -73,7 +73,9 @@ def recipes(calibration: Calibration) -> Section:
     if not book.recipes:
         return Section(
             title,
-            ["None are stored with this calibration, so no error was re-measured. The action “converge” builds them."],
+            [
+                "None are stored with this calibration, so none was re-measured. The action “build_recipes” builds them."
+            ],
         )
     rows = [
         (

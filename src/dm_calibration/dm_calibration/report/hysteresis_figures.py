@@ -1,4 +1,4 @@
-"""Figures of the memory: hysteresis loops and creep of the identified law, and the recipes."""
+"""Figures of the hysteresis model: hysteresis loops and creep of the identified law, and the recipes."""
 
 from __future__ import annotations
 

@@ -150,8 +150,8 @@ def _column_widths(table: Table) -> list[float]:
     headings = [_cell_width(heading, BOLD) for heading in table.header]
     widths = [max(pair) for pair in zip(longest, headings, strict=True)]
     if sum(widths) > WIDTH:
-        words = [max(_cell_width(word, BOLD) for word in heading.split(" ")) for heading in table.header]
-        widths = [max(pair) for pair in zip(longest, words, strict=True)]
+        narrow = [max(_cell_width(word, BOLD) for word in heading.split(" ")) for heading in table.header]
+        widths = [max(pair) for pair in zip(longest, narrow, strict=True)]
     if sum(widths) > WIDTH:
         widths = [min(width, COLUMN_MAX * WIDTH) for width in widths]
     return widths

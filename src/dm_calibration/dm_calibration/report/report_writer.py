@@ -27,11 +27,11 @@ class ReportWriter:
     """Writes one report after the other; of one calibration that changes meanwhile, only the last state.
 
     Args:
-        tell: called with a sentence and whether it is a warning, from a thread of its own.
+        publish: called with a sentence and whether it is a warning, from a thread of its own.
     """
 
-    def __init__(self, tell: Callable[[str, bool], None]) -> None:
-        self._tell = tell
+    def __init__(self, publish: Callable[[str, bool], None]) -> None:
+        self._publish = publish
         self._lock = threading.Lock()
         self._waiting: list[Path] = []
         self._process: subprocess.Popen[bytes] | None = None
@@ -82,17 +82,17 @@ class ReportWriter:
                         start_new_session=True,
                     )  # fmt: skip
                 except OSError as error:
-                    self._tell(f"no report of {file.name}: {error}", True)
+                    self._publish(f"no report of {file.name}: {error}", True)
                     continue
             self._finish(file, self._process)
 
     def _finish(self, file: Path, process: subprocess.Popen[bytes]) -> None:
         try:
-            words = process.communicate(timeout=TIMEOUT_S)[1].decode(errors="replace").strip()
+            errors = process.communicate(timeout=TIMEOUT_S)[1].decode(errors="replace").strip()
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
-            words = f"it took longer than {TIMEOUT_S:g} s"
+            errors = f"it took longer than {TIMEOUT_S:g} s"
         for leftover in file.parent.glob(f".{file.stem}.*.{process.pid}.tmp"):
             leftover.unlink(missing_ok=True)
         with self._lock:
@@ -100,10 +100,10 @@ class ReportWriter:
             if self._ended:
                 return
         if process.returncode == 0:
-            self._tell(f"report written: {file.with_suffix('.html').name} and .pdf beside the calibration", False)
+            self._publish(f"report written: {file.with_suffix('.html').name} and .pdf beside the calibration", False)
         else:
-            reason = words.splitlines()[-1] if words else f"its process ended with status {process.returncode}"
-            self._tell(f"no report of {file.name}: {reason}; `./dm report` tries again", True)
+            reason = errors.splitlines()[-1] if errors else f"its process ended with status {process.returncode}"
+            self._publish(f"no report of {file.name}: {reason}; `./dm report` tries again", True)
 
 
 class ReportingStore(CalibrationStore):

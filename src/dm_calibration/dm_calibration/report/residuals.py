@@ -21,7 +21,7 @@ class Residuals:
     """U maps that entered the fit.
 
     Attributes:
-        maps: those maps; `applied` are effective signals where the calibration holds a memory.
+        maps: those maps; `applied` are effective signals where the calibration holds a hysteresis model.
         sag: (U, P) m, piston and tilt removed; 0 where a map has no data.
         coefficients: (U, K) m.
     """
