@@ -24,10 +24,8 @@ class Driver:
 
     def report(self, time: float, moving: bool = False, active: bool = True) -> None:
         known = self.degausses > 0
-        applied = Applied(
-            time, self.signals, self.turns, self.turned_at, self.degausses, known, moving=moving, active=active
-        )
-        self.history.observe(applied, time)
+        report = Applied(time, self.signals, self.turns, self.turned_at, self.degausses, known, moving, active=active)
+        self.history.observe(report, time)
 
     def go(self, time: float, value: float) -> None:
         self.turns, self.turned_at = self.turns + 1, self.signals

@@ -214,6 +214,8 @@ class HysteresisObserver:
             self.latest = report
             if not report.signals.size:
                 return
+            if self._log and _same(self._log[-1], report):
+                return
             # What a later law must know: where the way bent, and how a move under way began.
             if len(self._log) >= 2 and _between(self._log[-2], self._log[-1], report):
                 self._log.pop()
@@ -283,5 +285,10 @@ def _between(before: Applied, between: Applied, after: Applied) -> bool:
     return before.time <= between.time <= after.time and (between.moving or between.time == after.time)
 
 
-def _phase(report: Applied) -> tuple[int, int, bool, bool]:
-    return report.turns, report.degausses, report.history_known, report.moving
+def _same(last: Applied, report: Applied) -> bool:
+    """Whether a report repeats the last one, as those of a mirror at rest do."""
+    return _phase(last) == _phase(report) and last.time == report.time and np.array_equal(last.signals, report.signals)
+
+
+def _phase(report: Applied) -> tuple[int, int, bool, bool, bool]:
+    return report.turns, report.degausses, report.history_known, report.moving, report.active

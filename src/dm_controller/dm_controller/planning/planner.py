@@ -101,8 +101,8 @@ class Planner:
 
     def prepare(self, state: HysteresisState) -> None:
         """Work out now what plans from exactly this `state`, of a mirror at rest, will need."""
-        limits = self.mirror.limits
-        if self.hysteresis is not None and self.law.remembers:
+        limits, ready = self.mirror.limits, self._prepared
+        if self.hysteresis is not None and self.law.remembers and (ready is None or ready.state is not state):
             self._prepared = PreparedInverse(self.law, state, limits.low, limits.high)
 
     def plan(
