@@ -15,9 +15,7 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import doubles
 from dm_common.ros import qos
 from dm_common.ros.parameters import declare
-from dm_controller.converge.converge_action import CONVERGE_PARAMETERS, ConvergeAction
-from dm_controller.converge.loop_bench import BENCH_PARAMETERS, LoopBench
-from dm_controller.converge.recipe_action import RECIPE_PARAMETERS, BuildRecipesAction
+from dm_controller.focus_actions import LOOP_PARAMETERS, serve_loops
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
@@ -109,11 +107,9 @@ class Host(Node):
         super().__init__("converge_host")
         self.refuse = False
         self.calibration: Calibration | None = calibration()
-        self.values = declare(self, (*CONVERGE_PARAMETERS, *RECIPE_PARAMETERS, *BENCH_PARAMETERS))
+        self.values = declare(self, LOOP_PARAMETERS)
         self.reserved: list[str] = []
-        bench = LoopBench(self, self.values, self)
-        ConvergeAction(self, self.values, bench)
-        BuildRecipesAction(self, self.values, bench)
+        self.actions = serve_loops(self, self.values, self)
 
     def target(self, wanted: FocusRequest) -> FocusTarget:
         if self.refuse:

@@ -16,12 +16,9 @@ from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import never_silent
-from dm_controller.converge.converge_action import ConvergeAction
-from dm_controller.converge.loop_bench import LoopBench
-from dm_controller.converge.recipe_action import BuildRecipesAction
+from dm_controller.focus_actions import MoveFocusAction, serve_loops
 from dm_controller.focus_host import FocusHost
 from dm_controller.focus_parameters import PARAMETERS
-from dm_controller.move_focus_action import MoveFocusAction
 
 
 class FocusControllerNode(Node):
@@ -34,12 +31,7 @@ class FocusControllerNode(Node):
         self._mirror: MirrorInfo | None = None
         self._calibration: Calibration | None = None
         self._diagnostics = diagnostics.Diagnostics(self, "", host.health)
-        bench = LoopBench(self, values, host)
-        self._actions = (
-            MoveFocusAction(self, host, values["settle_time"]),
-            ConvergeAction(self, values, bench),
-            BuildRecipesAction(self, values, bench),
-        )
+        self._actions = MoveFocusAction(self, host, values["settle_time"]), *serve_loops(self, values, host)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", host.driver_report, qos.STATE)

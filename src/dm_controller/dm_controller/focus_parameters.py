@@ -6,10 +6,8 @@ from typing import Final
 
 from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.parameters import Parameter
-from dm_controller.converge.converge_action import CONVERGE_PARAMETERS
-from dm_controller.converge.loop_bench import BENCH_PARAMETERS
-from dm_controller.converge.recipe_action import RECIPE_PARAMETERS
 from dm_controller.creep_hold import PERIOD_S
+from dm_controller.focus_actions import LOOP_PARAMETERS
 from dm_controller.planning.planner import SETTLE_S
 
 PARAMETERS: Final = (
@@ -110,7 +108,5 @@ PARAMETERS: Final = (
         0.0,
         0.5,
     ),
-    *CONVERGE_PARAMETERS,
-    *RECIPE_PARAMETERS,
-    *BENCH_PARAMETERS,
+    *LOOP_PARAMETERS,
 )

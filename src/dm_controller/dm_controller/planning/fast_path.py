@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dm_common.hysteresis.inverse import Pieces, horner, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.optics.conic_series import ORDERS, series, series_coefficients, series_sag
+from dm_common.optics.conic import ORDERS, series, series_coefficients, series_sag
 from dm_common.optics.zernike import TERMS, basis
 from dm_controller.planning.target import FocusTarget
 

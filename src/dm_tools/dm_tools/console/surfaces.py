@@ -12,7 +12,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.zernike import basis
-from dm_controller.planning.conversions import model_of
+from dm_controller.planning.active_calibration import model_of
 
 Floats = NDArray[np.float64]
 

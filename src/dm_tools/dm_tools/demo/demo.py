@@ -61,7 +61,7 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
 def best_possible(calibration: Any, mirror: Any) -> float:
     """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, as the model says."""
     from dm_common.messages import limits_from
-    from dm_controller.planning.conversions import model_of
+    from dm_controller.planning.active_calibration import model_of
     from dm_controller.planning.mirror_model import CalibratedMirror
     from dm_controller.planning.target import FocusTarget
 

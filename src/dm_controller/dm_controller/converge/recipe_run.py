@@ -1,4 +1,4 @@
-"""The action `build_recipes`: from a list of curvatures to recipes, built on the bench, stored with the calibration.
+"""A goal of the action `build_recipes`: a list of curvatures becomes recipes, stored with the calibration.
 
 Recipes that are whole are stored however the goal ends: on a failure of the bench or a cancel, those built before it.
 The mirror goes back to mid range.
@@ -14,6 +14,7 @@ import numpy as np
 from dm_msgs.action import BuildRecipes
 from dm_msgs.srv import StoreRecipes
 from rclpy.action.server import ServerGoalHandle
+from rclpy.client import Client
 from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
@@ -21,29 +22,13 @@ from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.observer import Applied, HysteresisTracker
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeError
-from dm_common.ros.parameters import Parameter
-from dm_common.ros.worker import ServiceCallError, WorkerActionServer, call, wait_for_clock
-from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
+from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
+from dm_controller.converge.goals import check_figures, ending
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
+from dm_controller.focus_actions import LoopBench
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget, TargetError
-
-#: Parameters that the hosting node declares beside BENCH_PARAMETERS.
-RECIPE_PARAMETERS = (
-    Parameter(
-        "recipes.tolerance",
-        float,
-        6.3e-10,
-        "largest re-measured coefficient error of a recipe",
-        "m",
-        1e-11,
-        1e-5,
-        live=True,
-    ),
-    Parameter("recipes.max_maps", int, 32, "maps that one recipe may take", "", 4, 100, live=True),
-    Parameter("recipes.average", int, 8, "maps averaged after each degauss of a recipe", "", 2, 50, live=True),
-)
 
 #: A model that leaves a larger coefficient error of a curvature, m, cannot reach it.
 UNREACHABLE_ERROR = 2e-8
@@ -53,21 +38,21 @@ BUSY = "recipes are being built (action build_recipes)"
 STORE_TIMEOUT_S = 30.0
 
 
-class BuildRecipesAction:
-    """Serves `build_recipes`, one goal at a time; a newer goal is refused while one runs.
+class RecipeRun:
+    """Carries out one goal; blocks, in the worker thread of the action.
 
     Args:
         node: the hosting node.
-        values: its parameters, RECIPE_PARAMETERS and BENCH_PARAMETERS among them.
-        bench: shared with `converge`; its host knows the calibration in use and the actuators' hysteresis.
+        values: its parameters, LOOP_PARAMETERS among them.
+        bench: its host knows the calibration in use and the actuators' hysteresis.
+        store: client of the service `store_recipes`.
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench) -> None:
-        self._node, self._values, self._bench = node, values, bench
-        self._store = node.create_client(StoreRecipes, "store_recipes")
-        WorkerActionServer(node, BuildRecipes, "build_recipes", self._run)
+    def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench, store: Client) -> None:
+        self._node, self._values, self._bench, self._store = node, values, bench, store
 
-    def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+    def run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+        """Outcome and result of the goal."""
         try:
             with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested)):
                 outcome, result = self._build_and_store(handle)

@@ -1,8 +1,7 @@
-"""The action `converge`: bring the surface to a request in closed loop on the interferometer.
+"""A goal of the action `converge`: bring the surface to a request in closed loop on the interferometer.
 
-Hosted by the focus controller, which judges the request as for an open-loop move and knows calibration and mirror. The
-loop itself is `dm_controller.converge.closed_loop`; driver and interferometer are reached through the services that a
-calibration uses.
+The host judges the request as for an open-loop move and knows calibration and mirror. The loop itself is
+`dm_controller.converge.closed_loop`; driver and interferometer are reached through services.
 """
 
 from __future__ import annotations
@@ -18,56 +17,31 @@ from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.messages import doubles
-from dm_common.ros.parameters import Parameter
-from dm_common.ros.worker import WorkerActionServer, wait_for_clock
+from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
-from dm_controller.converge.loop_bench import LoopBench, check_figures, ending
+from dm_controller.converge.goals import check_figures, ending
+from dm_controller.focus_actions import LoopBench
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import MirrorFacts, make_solver
-
-#: Parameters that the hosting node declares beside BENCH_PARAMETERS.
-CONVERGE_PARAMETERS = (
-    Parameter(
-        "converge.tolerance",
-        float,
-        2e-9,
-        "largest coefficient error at which a closed loop ends",
-        "m",
-        1e-11,
-        1e-5,
-        live=True,
-    ),
-    Parameter("converge.max_maps", int, 5, "maps that a closed loop may take", "", 1, 100, live=True),
-    Parameter(
-        "converge.creep",
-        float,
-        0.01,
-        "growth of a move per decade of time that the loop foresees; 0 = none",
-        "",
-        0.0,
-        0.2,
-        live=True,
-    ),
-)
 
 #: What requests are told meanwhile.
 BUSY = "a closed loop (action converge) is running"
 
 
-class ConvergeAction:
-    """Serves `converge`, one goal at a time; a newer goal is refused while one runs.
+class ConvergeRun:
+    """Carries out one goal; blocks, in the worker thread of the action.
 
     Args:
         node: the hosting node.
-        values: its parameters, CONVERGE_PARAMETERS among them.
-        bench: shared with `build_recipes`; its host judges requests and knows the calibration in use.
+        values: its parameters, LOOP_PARAMETERS among them.
+        bench: its host judges requests and knows the calibration in use.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench) -> None:
         self._node, self._values, self._bench = node, values, bench
-        WorkerActionServer(node, Converge, "converge", self._run)
 
-    def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+    def run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+        """Outcome and result of the goal."""
         steps: list[LoopStep] = []
 
         def report(step: LoopStep) -> None:

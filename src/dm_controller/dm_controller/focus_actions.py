@@ -1,0 +1,258 @@
+"""The actions of the focus controller: `move_focus`, and `converge` and `build_recipes` on an interferometer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+from dm_msgs.action import BuildRecipes, Converge, MoveFocus
+from dm_msgs.msg import FocusRequest
+from dm_msgs.srv import Degauss, StoreRecipes
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+
+from dm_common.errors import ErrorCode, MeasurementError, Refusal
+from dm_common.hysteresis.model import HysteresisState
+from dm_common.measurement import Measurement
+from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.parameters import Parameter
+from dm_common.ros.worker import WorkerActionServer, sleep
+from dm_controller.focus_host import FocusHost
+from dm_controller.focus_types import Order
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.target import FocusTarget
+
+#: Parameters that the hosting node declares beside its own.
+LOOP_PARAMETERS = (
+    Parameter(
+        "converge.tolerance",
+        float,
+        2e-9,
+        "largest coefficient error at which a closed loop ends",
+        "m",
+        1e-11,
+        1e-5,
+        live=True,
+    ),
+    Parameter("converge.max_maps", int, 5, "maps that a closed loop may take", "", 1, 100, live=True),
+    Parameter(
+        "converge.creep",
+        float,
+        0.01,
+        "growth of a move per decade of time that the loop foresees; 0 = none",
+        "",
+        0.0,
+        0.2,
+        live=True,
+    ),
+    Parameter(
+        "recipes.tolerance",
+        float,
+        6.3e-10,
+        "largest re-measured coefficient error of a recipe",
+        "m",
+        1e-11,
+        1e-5,
+        live=True,
+    ),
+    Parameter("recipes.max_maps", int, 32, "maps that one recipe may take", "", 4, 100, live=True),
+    Parameter("recipes.average", int, 8, "maps averaged after each degauss of a recipe", "", 2, 50, live=True),
+    Parameter("converge.settle_time", float, 0.5, "wait between command and map, in ROS time", "s", 0.0, 600.0),
+    Parameter("converge.driver_timeout", float, 30.0, "longest wait for the driver to set a shape", "s", 0.1, 600.0),
+    Parameter("converge.measure_timeout", float, 60.0, "longest wait for one map", "s", 0.1, 3600.0),
+    Parameter("converge.measure_retries", int, 1, "further tries after a map that failed", "", 0, 20, live=True),
+    Parameter("recipes.degauss_steps", int, 100, "half-swings of the degauss that recipes begin with", "", 1, 10000),
+    Parameter("recipes.degauss_timeout", float, 120.0, "longest wait for a degauss", "s", 1.0, 3600.0),
+)
+
+
+class LoopHost(Protocol):
+    """What the hosting node offers; every method may be called from any thread."""
+
+    def target(self, request: FocusRequest) -> FocusTarget:
+        """The target of a request that could be carried out; else raises Refusal."""
+
+    def active_calibration(self) -> ActiveCalibration:
+        """The calibration in use; raises Refusal when there is none."""
+
+    def hysteresis(self) -> HysteresisState | None:
+        """What is known of the actuators; None = nothing."""
+
+    def reserve(self, text: str) -> None:
+        """Refuse requests from now on, with this sentence as the reason; "" = serve them again."""
+
+
+class LoopBench(BenchServices):
+    """Driver and interferometer, for one goal of either action at a time.
+
+    Args:
+        node: the hosting node.
+        values: its parameters, LOOP_PARAMETERS among them.
+
+    Attributes:
+        host: what the node knows and can do.
+    """
+
+    def __init__(self, node: Node, values: Mapping[str, Any], host: LoopHost) -> None:
+        own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
+        super().__init__(node, own | {"degauss_timeout": values["recipes.degauss_timeout"]})
+        self.host, self._parameters = host, values
+        self._goal = threading.Lock()
+
+    @contextmanager
+    def reserved(self, text: str, cancelled: Callable[[], bool]) -> Iterator[None]:
+        """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
+
+        Args:
+            text: what the host says to requests meanwhile.
+
+        Raises:
+            Refusal: another goal has it.
+        """
+        if not self._goal.acquire(blocking=False):
+            raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
+        try:
+            self.cancelled = cancelled
+            self.host.reserve(text)
+            yield
+        finally:
+            self.host.reserve("")
+            self._goal.release()
+
+    def degauss(self) -> None:
+        """The condition that recipes begin with: the driver's own number of steps may be another."""
+        request = Degauss.Request(steps=int(self._parameters["recipes.degauss_steps"]))
+        self._call(self._degauss, request, self._values["degauss_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
+
+    def measure(self, label: str) -> Measurement:
+        """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""
+        left = int(self._parameters["converge.measure_retries"])
+        while True:
+            try:
+                return super().measure(label)
+            except MeasurementError:
+                if left == 0 or self.cancelled():
+                    raise
+                left -= 1
+
+
+def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[WorkerActionServer, ...]:
+    """Offer both actions, one goal at a time. What they run is loaded with the first goal: most mirrors never see one.
+
+    Args:
+        node: the hosting node.
+        values: its parameters, LOOP_PARAMETERS among them.
+        host: judges requests and knows the calibration in use.
+    """
+    bench = LoopBench(node, values, host)
+    store = node.create_client(StoreRecipes, "store_recipes")
+
+    def converge(handle: ServerGoalHandle) -> tuple[str, Any]:
+        from dm_controller.converge.converge_run import ConvergeRun
+
+        return ConvergeRun(node, values, bench).run(handle)
+
+    def build_recipes(handle: ServerGoalHandle) -> tuple[str, Any]:
+        from dm_controller.converge.recipe_run import RecipeRun
+
+        return RecipeRun(node, values, bench, store).run(handle)
+
+    return (
+        WorkerActionServer(node, Converge, "converge", converge),
+        WorkerActionServer(node, BuildRecipes, "build_recipes", build_recipes),
+    )
+
+
+#: How often an order is looked after, s, and how often its feedback is published.
+POLL_S, FEEDBACK_S = 0.002, 0.1
+
+
+class MoveFocusAction:
+    """Serves `move_focus` in worker threads; the newest goal pre-empts.
+
+    Args:
+        node: hosts the action.
+        host: carries the requests out.
+        settle_time: s, for goals that name none.
+    """
+
+    def __init__(self, node: Node, host: FocusHost, settle_time: float) -> None:
+        self._clock, self._host, self._settle_time = node.get_clock(), host, settle_time
+        self._server = WorkerActionServer(node, MoveFocus, "move_focus", self._run, exclusive="preempt")
+
+    def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+        started, result = time.monotonic(), MoveFocus.Result()
+        outcome, result.error_code, result.message = self._carry_out(handle, result)
+        result.duration = time.monotonic() - started
+        return outcome, result
+
+    def _carry_out(self, handle: ServerGoalHandle, result: MoveFocus.Result) -> tuple[str, int, str]:
+        """Outcome, ErrorCode and message of a goal; fills the state of `result`."""
+        goal, host = handle.request, self._host
+        # Goals that wait for their turn may get it in another order than they came in.
+        if self._to_stop(handle):
+            return self._stopped(handle, None)
+        handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
+        if goal.tolerance > 0.0:
+            preview = host.state(host.order(goal.request, dry_run=True))
+            if preview.error_code == ErrorCode.OK and preview.predicted_max_zernike > goal.tolerance:
+                result.state = preview
+                return (
+                    "abort",
+                    ErrorCode.OUT_OF_RANGE,
+                    f"tolerance = {goal.tolerance * 1e9:.2f} nm: the predicted largest coefficient error is "
+                    f"{preview.predicted_max_zernike * 1e9:.2f} nm; nothing moved",
+                )
+        order = host.order(goal.request)
+        ended = self._follow(handle, order)
+        result.state = host.state(order)
+        if ended is not None:
+            return ended
+        handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))
+        if not sleep(self._clock, goal.settle_time or self._settle_time, lambda: self._to_stop(handle)):
+            return self._stopped(handle, order)
+        if not host.keeps(order):
+            return "abort", ErrorCode.PREEMPTED, "another command took over"
+        return "succeed", ErrorCode.OK, f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
+
+    def _follow(self, handle: ServerGoalHandle, order: Order) -> tuple[str, int, str] | None:
+        """Wait until the shape of `order` stands; None when it does."""
+        next_feedback = 0.0
+        while True:
+            progress = self._host.progress(order)
+            if progress.stands:
+                return None
+            if progress.failed is not None:
+                return "abort", progress.failed.error_code, str(progress.failed)
+            if self._to_stop(handle):
+                return self._stopped(handle, order)
+            if time.monotonic() >= next_feedback:
+                next_feedback = time.monotonic() + FEEDBACK_S
+                phase = MoveFocus.Feedback.PHASE_PLAN if progress.planning else MoveFocus.Feedback.PHASE_MOVE
+                handle.publish_feedback(
+                    MoveFocus.Feedback(phase=phase, progress=progress.share, remaining=progress.remaining)
+                )
+            time.sleep(POLL_S)
+
+    def _to_stop(self, handle: ServerGoalHandle) -> bool:
+        return handle.is_cancel_requested or self._server.preempted(handle)
+
+    def _stopped(self, handle: ServerGoalHandle, order: Order | None) -> tuple[str, int, str]:
+        """End a goal early, None = before it asked for anything.
+
+        On cancel the mirror holds the shape it has, unless it is under way to one that was asked for since; a newer
+        goal goes on from there by itself.
+        """
+        waited = order is not None and self._host.withdraw(order)
+        if not handle.is_cancel_requested:
+            return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
+        if order is None:
+            return "canceled", ErrorCode.CANCELED, "canceled before anything moved"
+        if waited:
+            return "canceled", ErrorCode.CANCELED, "canceled; the degauss under way ends at mid range"
+        if self._host.stop(order):
+            return "canceled", ErrorCode.CANCELED, "canceled; the mirror holds the shape it had reached"
+        return "canceled", ErrorCode.CANCELED, "canceled; the mirror follows a newer request"
