@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ class AgeingTwin:
         self.bench.apply(np.clip(rng.uniform(-0.6, 0.6) + 0.25 * rng.standard_normal(37), -1.0, 1.0))
         self.bench.settle()
         for applied in self.bench.reports[self._heard :]:
-            self.history.observe(applied, applied.time)
+            self.history.observe(replace(applied, moving=False), applied.time)
         self._heard = len(self.bench.reports)
 
     def measurement(self, sag: np.ndarray) -> Measurement:
