@@ -41,7 +41,6 @@ class AppliedHistory:
 
     def __init__(self) -> None:
         self._observer = HysteresisObserver()
-        self._last: Applied | None = None
         self._heard = float("-inf")
 
     def follow(self, law: HysteresisModel | None, middle: float = 0.0) -> None:
@@ -55,10 +54,7 @@ class AppliedHistory:
             ValueError: as :meth:`HysteresisObserver.observe`; what was heard before is forgotten.
         """
         self._heard = heard
-        # A mirror at rest reports the same again and again: kept once, so that older shapes are not crowded out.
-        if self._last is None or not _same(report, self._last):
-            self._observer.observe(report)
-            self._last = report
+        self._observer.observe(report)
 
     def heard_since(self, time: float) -> bool:
         """Whether the driver has reported at or after `time` (s), so that a move until then would be known."""
@@ -101,11 +97,3 @@ class AppliedHistory:
                 "that"
             )
         return SettledState(law.effective(law.advance(estimate.state, time)), times[first])
-
-
-def _same(now: Applied, before: Applied) -> bool:
-    return (
-        (now.moving, now.active, now.history_known) == (before.moving, before.active, before.history_known)
-        and (now.time, now.turns, now.degausses) == (before.time, before.turns, before.degausses)
-        and np.array_equal(now.signals, before.signals)
-    )

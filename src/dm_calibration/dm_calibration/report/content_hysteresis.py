@@ -73,9 +73,7 @@ def recipes(calibration: Calibration) -> Section:
     if not book.recipes:
         return Section(
             title,
-            [
-                "None are stored with this calibration, so none was re-measured. The action “build_recipes” builds them."
-            ],
+            ["None are stored with this calibration, so none was re-measured. The action “build_recipes” builds them."],
         )
     rows = [
         (
