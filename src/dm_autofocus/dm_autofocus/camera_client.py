@@ -23,12 +23,9 @@ class CameraFocusClient(DeformableMirrorClient):
     def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
         super().__init__(namespace, domain, timeout_s)
         # Early, so that the node has discovered them by the time the first is used.
-        self._client(SetFocusDistance, "set_focus_distance")
-        self._client(GetFocusRange, "get_focus_range")
-        self._client(Autofocus, "autofocus")
-
-    def __enter__(self) -> CameraFocusClient:
-        return self
+        self.client(SetFocusDistance, "set_focus_distance")
+        self.client(GetFocusRange, "get_focus_range")
+        self.client(Autofocus, "autofocus")
 
     def focus_range(self) -> GetFocusRange.Response:
         """Between which object distances the camera can focus."""

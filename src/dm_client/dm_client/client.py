@@ -10,14 +10,11 @@ with DeformableMirrorClient() as mirror:
 
 from __future__ import annotations
 
-import itertools
-import os
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
-import rclpy
 from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
 from dm_msgs.srv import (
@@ -31,50 +28,38 @@ from dm_msgs.srv import (
     SetSignals,
     UpdateCalibration,
 )
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_client.connection import Connection, DeformableMirrorError
+from dm_common.errors import ErrorCode
 from dm_common.ros import qos
-from dm_common.ros.action_client import ThreadedActionClient
-from dm_common.ros.executor import BackgroundExecutor
-from dm_common.ros.worker import ServiceCallError, answers_arrive, call
 
-SERVICES = {
-    SetSignals: "set_signals",
-    Degauss: "degauss",
-    SetFocus: "set_focus",
-    Flatten: "flatten",
-    IngestFile: "ingest_file",
-    Measure: "measure",
-    ListCalibrations: "list_calibrations",
-    LoadCalibration: "load_calibration",
-    UpdateCalibration: "update_calibration",
+TOPICS = {
+    "mirror_info": (MirrorInfo, qos.LATCHED),
+    "calibration": (Calibration, qos.LATCHED),
+    "capabilities": (Capabilities, qos.LATCHED),
+    "actuator_state": (ActuatorState, qos.STATE),
 }
-ACTIONS = {Calibrate: "calibrate", MoveFocus: "move_focus", Converge: "converge", BuildRecipes: "build_recipes"}
-#: Two clients of one process need two names.
-_NUMBERS = itertools.count(1)
-
-
+INTERFACES = {
+    "set_signals": SetSignals,
+    "degauss": Degauss,
+    "set_focus": SetFocus,
+    "flatten": Flatten,
+    "ingest_file": IngestFile,
+    "measure": Measure,
+    "list_calibrations": ListCalibrations,
+    "load_calibration": LoadCalibration,
+    "update_calibration": UpdateCalibration,
+    "calibrate": Calibrate,
+    "move_focus": MoveFocus,
+    "converge": Converge,
+    "build_recipes": BuildRecipes,
+}
 #: `timeout_s` for nodes that the same program has only just started, s.
 STARTING_S = 60.0
 
 
-class DeformableMirrorError(Refusal):
-    """The suite refused or could not carry out a request.
-
-    Attributes:
-        error_code: a value of ErrorCode.
-        response: the whole response or result, when there is one.
-    """
-
-    def __init__(self, error_code: int, message: str, response: Any = None) -> None:
-        super().__init__(error_code, message)
-        self.response = response
-
-
-class DeformableMirrorClient:
+class DeformableMirrorClient(Connection):
     """Talk to one mirror's nodes. Use as a context manager.
 
     Args:
@@ -84,41 +69,16 @@ class DeformableMirrorClient:
     """
 
     def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node(f"dm_client_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
-        self._timeout_s = timeout_s
-        self._latest: dict[str, Any] = {}
-        self._clients: dict[str, Any] = {}
-        for message_type, topic, profile in (
-            (MirrorInfo, "mirror_info", qos.LATCHED),
-            (Calibration, "calibration", qos.LATCHED),
-            (Capabilities, "capabilities", qos.LATCHED),
-            (ActuatorState, "actuator_state", qos.STATE),
-        ):
-            self._keep_latest(message_type, topic, profile)
-        # Early, so that the nodes have discovered them all by the time the first is used.
-        for service_type, name in SERVICES.items():
-            self._client(service_type, name)
-        for action_type, name in ACTIONS.items():
-            self._client(action_type, name)
-        self._background = BackgroundExecutor(self.node)
+        super().__init__("dm_client", namespace, domain, TOPICS, INTERFACES, timeout_s=timeout_s)
+        self.start()
 
-    def _keep_latest(self, message_type: Any, topic: str, profile: Any) -> None:
-        self.node.create_subscription(message_type, topic, lambda m: self._latest.__setitem__(topic, m), profile)
-
-    def __enter__(self) -> DeformableMirrorClient:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
         self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
     ) -> None:
         self.close()
-
-    def close(self) -> None:
-        """Leave the ROS graph; the mirror keeps its shape."""
-        self._background.destroy_node()
-        self._context.try_shutdown()
 
     # --- what is known ---
 
@@ -128,24 +88,15 @@ class DeformableMirrorClient:
         Raises:
             DeformableMirrorError: none came within the time.
         """
-        if not self.wait(lambda: topic in self._latest, timeout_s):
+        if not self.wait(lambda: topic in self.messages, timeout_s):
             raise DeformableMirrorError(ErrorCode.INTERNAL, f"no message on {topic}: are the nodes running (./dm up)?")
-        return self._latest[topic]
-
-    def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
-        """Wait until `condition()` is true; False when it was not in time."""
-        deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
-        while not condition():
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.005)
-        return True
+        return self.messages[topic]
 
     def wait_until_active(self, timeout_s: float = 20.0) -> None:
         """Wait until the driver accepts commands. Raises DeformableMirrorError with the driver's own reason."""
 
         def active() -> bool:
-            state = self._latest.get("actuator_state")
+            state = self.messages.get("actuator_state")
             return state is not None and state.driver_state == ActuatorState.STATE_ACTIVE
 
         if not self.wait(active, timeout_s):
@@ -167,26 +118,7 @@ class DeformableMirrorClient:
         """What stands at the electronics."""
         return self.latest("actuator_state")
 
-    def _client(self, interface: Any, name: str) -> Any:
-        """The service or action client of that name."""
-        if name not in self._clients:
-            is_action = hasattr(interface, "Goal")
-            make = ThreadedActionClient if is_action else Node.create_client
-            self._clients[name] = make(self.node, interface, name)
-        return self._clients[name]
-
     # --- services ---
-
-    def call(self, service_type: Any, name: str, request: Any, timeout_s: float | None = None) -> Any:
-        """Call any service of the suite; raise DeformableMirrorError when it refuses or does not answer."""
-        client = self._client(service_type, name)
-        try:
-            response = call(client, request, self._timeout_s if timeout_s is None else timeout_s)
-        except ServiceCallError as error:
-            raise DeformableMirrorError(ErrorCode.TIMEOUT, str(error)) from error
-        if response.error_code != 0:
-            raise DeformableMirrorError(response.error_code, response.message, response)
-        return response
 
     def focus(
         self,
@@ -226,21 +158,21 @@ class DeformableMirrorClient:
 
     def measure_map(self, label: str = "", timeout_s: float = 60.0) -> tuple[Measure.Response, Image]:
         """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
-        if "surface_map" not in self._latest:
-            self._keep_latest(Image, "surface_map", qos.MAP)
-            self._keep_latest(SurfaceMapInfo, "surface_map_info", qos.MAP)
-            self._latest["surface_map"] = None
+        if "surface_map" not in self.messages:
+            self.hear("surface_map", Image, qos.MAP)
+            self.hear("surface_map_info", SurfaceMapInfo, qos.MAP)
+            self.messages["surface_map"] = None
             self.wait(lambda: self.node.count_publishers("surface_map") > 0)
             time.sleep(0.3)  # the publisher must have discovered this subscription too
         response = self.measure(label, timeout_s)
 
         def arrived() -> bool:
-            image = self._latest["surface_map"]
+            image = self.messages["surface_map"]
             return image is not None and image.header.stamp == response.info.header.stamp
 
         if not self.wait(arrived):
             raise DeformableMirrorError(ErrorCode.MAP_TIMEOUT, "the map did not arrive on surface_map")
-        return response, self._latest["surface_map"]
+        return response, self.messages["surface_map"]
 
     def list_calibrations(self) -> ListCalibrations.Response:
         """Calibrations in the store, newest first."""
@@ -261,39 +193,6 @@ class DeformableMirrorClient:
         return self.call(UpdateCalibration, "update_calibration", request, timeout_s)
 
     # --- actions ---
-
-    def run_action(
-        self, action_type: Any, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float
-    ) -> Any:
-        """Run a goal to its end. Ctrl-C cancels it first, so that the mirror is left safe."""
-        client = self._client(action_type, name)
-        if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
-            raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
-        accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
-        finished = None
-        try:
-            if not self.wait(accepted.done):
-                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no answer to the goal")
-            if not accepted.result().accepted:
-                raise DeformableMirrorError(ErrorCode.BUSY, f"{name}: refused, another goal is running")
-            finished = accepted.result().get_result_async()
-            if not self.wait(finished.done, timeout_s):
-                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: not finished within {timeout_s:g} s")
-        except BaseException:
-            self._cancel(accepted, finished)
-            raise
-        result = finished.result().result
-        if result.error_code != 0:
-            raise DeformableMirrorError(result.error_code, result.message, result)
-        return result
-
-    def _cancel(self, accepted: Any, finished: Any) -> None:
-        """Cancel a goal that may not be accepted yet, and wait for its end."""
-        if not self.wait(accepted.done) or not accepted.result().accepted:
-            return
-        handle = accepted.result()
-        handle.cancel_goal_async()
-        self.wait((finished or handle.get_result_async()).done, 20.0)
 
     def move_focus(
         self,

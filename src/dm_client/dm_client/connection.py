@@ -1,0 +1,157 @@
+"""One node in a thread of its own, for code that calls and waits: the latest messages, services, actions."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.worker import ServiceCallError, answers_arrive, call
+
+#: Two connections of one process need two names.
+_NUMBERS = itertools.count(1)
+
+
+class DeformableMirrorError(Refusal):
+    """The suite refused or could not carry out a request.
+
+    Attributes:
+        error_code: a value of ErrorCode.
+        response: the whole response or result, when there is one.
+    """
+
+    def __init__(self, error_code: int, message: str, response: Any = None) -> None:
+        super().__init__(error_code, message)
+        self.response = response
+
+
+def checked(response: Any) -> Any:
+    """A response or result of the suite; raise DeformableMirrorError when it is a refusal."""
+    if response.error_code != 0:
+        raise DeformableMirrorError(response.error_code, response.message, response)
+    return response
+
+
+class Connection:
+    """A node that hears topics and calls the nodes of one mirror, once it is started.
+
+    Args:
+        name: of the node, a number follows.
+        namespace: of the mirror, "" for none.
+        domain: ROS domain; None = the environment's.
+        topics: {name: (message type, quality of service)}, heard from the beginning.
+        interfaces: {name: service or action type}, made at once, so that the nodes have discovered them all by the
+            time the first is used.
+        on_message: called with topic and message in the executor's thread, after `messages` has it.
+        timeout_s: how long to wait for an answer that should come at once.
+
+    Attributes:
+        messages: {topic: latest message}.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        namespace: str,
+        domain: int | None,
+        topics: Mapping[str, tuple[Any, Any]],
+        interfaces: Mapping[str, Any],
+        on_message: Callable[[str, Any], None] = lambda topic, message: None,
+        timeout_s: float = 10.0,
+    ) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node(f"{name}_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
+        self.messages: dict[str, Any] = {}
+        self._on_message, self._timeout_s = on_message, timeout_s
+        self._clients: dict[str, Any] = {}
+        for topic, (message_type, profile) in topics.items():
+            self.hear(topic, message_type, profile)
+        for interface_name, interface in interfaces.items():
+            self.client(interface, interface_name)
+        self._background: BackgroundExecutor | None = None
+
+    def start(self) -> None:
+        """Begin to hear; what is added to the node before misses nothing."""
+        self._background = BackgroundExecutor(self.node)
+
+    def close(self) -> None:
+        """Leave the ROS graph; the mirror keeps its shape."""
+        if self._background is not None:
+            self._background.destroy_node()
+        self._context.try_shutdown()
+
+    def hear(self, topic: str, message_type: Any, profile: Any) -> None:
+        """Keep the latest message of a topic from now on."""
+
+        def take(message: Any) -> None:
+            self.messages[topic] = message
+            self._on_message(topic, message)
+
+        self.node.create_subscription(message_type, topic, take, profile)
+
+    def client(self, interface: Any, name: str) -> Any:
+        """The service or action client of that name."""
+        if name not in self._clients:
+            make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
+            self._clients[name] = make(self.node, interface, name)
+        return self._clients[name]
+
+    def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
+        """Wait until `condition()` is true; False when it was not in time."""
+        deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
+        while not condition():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.005)
+        return True
+
+    def call(self, service_type: Any, name: str, request: Any, timeout_s: float | None = None) -> Any:
+        """Call any service of the suite; raise DeformableMirrorError when it refuses or does not answer."""
+        try:
+            timeout_s = self._timeout_s if timeout_s is None else timeout_s
+            return checked(call(self.client(service_type, name), request, timeout_s))
+        except ServiceCallError as error:
+            raise DeformableMirrorError(ErrorCode.TIMEOUT, str(error)) from error
+
+    def run_action(
+        self, action_type: Any, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float
+    ) -> Any:
+        """Run a goal to its end; raise DeformableMirrorError when it is refused or fails.
+
+        Ctrl-C cancels it first, so that the mirror is left safe.
+        """
+        client = self.client(action_type, name)
+        if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
+            raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
+        accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
+        finished = None
+        try:
+            if not self.wait(accepted.done):
+                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no answer to the goal")
+            if not accepted.result().accepted:
+                raise DeformableMirrorError(ErrorCode.BUSY, f"{name}: refused, another goal is running")
+            finished = accepted.result().get_result_async()
+            if not self.wait(finished.done, timeout_s):
+                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: not finished within {timeout_s:g} s")
+        except BaseException:
+            self._cancel(accepted, finished)
+            raise
+        return checked(finished.result().result)
+
+    def _cancel(self, accepted: Any, finished: Any) -> None:
+        """Cancel a goal that may not be accepted yet, and wait for its end."""
+        if not self.wait(accepted.done) or not accepted.result().accepted:
+            return
+        handle = accepted.result()
+        handle.cancel_goal_async()
+        self.wait((finished or handle.get_result_async()).done, 20.0)
