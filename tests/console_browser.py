@@ -21,7 +21,7 @@ from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from dm_tools.demo.demo import free_ports
+from dm_tools.demo.demo_bench import free_ports
 from support import wait_until
 
 BROWSERS = ("chromium", "google-chrome", "google-chrome-stable", "chromium-browser")
@@ -129,11 +129,16 @@ class Browser:
         return self.find(name, "div")
 
     def pictures(self, begin: str) -> list[str]:
-        """Descriptions of the drawings that begin with these words."""
-        found = self.driver.find_elements(By.CSS_SELECTOR, f'svg[aria-label^="{begin}"]')
+        """Descriptions of the drawings in sight that begin with these words."""
+        found = self.driver.find_elements(By.CSS_SELECTOR, f'[role="img"][aria-label^="{begin}"]')
         with contextlib.suppress(StaleElementReferenceException):
-            return [str(picture.get_attribute("aria-label")) for picture in found]
+            return [str(picture.get_attribute("aria-label")) for picture in found if picture.is_displayed()]
         return []
+
+    def hexagons(self) -> dict[int, Any]:
+        """{number: its text on the command map}, without those that carry a sign."""
+        found = self.driver.find_elements(By.CSS_SELECTOR, '[role="img"][aria-label^="command map"] svg text')
+        return {int(element.text): element for element in found if element.text.isdecimal()}
 
     def dismiss_all(self) -> None:
         """Take every refusal off the page."""

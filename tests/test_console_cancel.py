@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from dm_common.errors import Refusal
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import WorkerActionServer
-from dm_tools.console import console_node as ros_side
+from dm_tools.console import console_node
 from dm_tools.console.console_node import ConsoleNode
 from support import own_domain
 
@@ -54,7 +54,7 @@ def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tu
 
     async def scene() -> BackgroundExecutor:
         run = asyncio.create_task(side.run("calibrate", Calibrate.Goal(), lambda _feedback: None))
-        while not side._actions["calibrate"]._pending_goal_requests:
+        while not side._connection.client(Calibrate, "calibrate")._pending_goal_requests:
             await asyncio.sleep(0.01)
         await side.cancel("calibrate")
         served = BackgroundExecutor(node)  # only now does the node take the goal
@@ -72,15 +72,15 @@ def test_a_goal_whose_answer_was_lost_is_seen_and_can_be_cancelled(
 
     async def scene() -> BackgroundExecutor:
         # By then the node must have been found, and its answer not have come.
-        monkeypatch.setattr(ros_side, "ANSWER_S", 3.0)
+        monkeypatch.setattr(console_node, "ANSWER_S", 3.0)
         with pytest.raises(Refusal, match="no answer to the goal"):
             await side.run("calibrate", Calibrate.Goal(), lambda _feedback: None)
         monkeypatch.undo()
         served = BackgroundExecutor(node)
-        while side.busy_elsewhere != "calibrate":
+        while side.external_action != "calibrate":
             await asyncio.sleep(0.01)
         await side.cancel("calibrate")
-        while side.busy_elsewhere:
+        while side.external_action:
             await asyncio.sleep(0.01)
         return served
 

@@ -11,7 +11,7 @@ from dm_msgs.action import Calibrate
 
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from dm_bringup.suite import Suite
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from support import Observer, own_domain, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
@@ -47,7 +47,7 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_length_of_a_hysteresis_plan_is_told_before_it_runs(page: Browser) -> None:
     page.wait_for("driver: active")
-    page.enter("Length: commands of the memory plan", "80")
+    page.enter("Length: commands of the plan", "80")
     page.press("How long?")
     page.wait_for("nothing was moved", 30)
 
@@ -120,9 +120,9 @@ def test_the_loop_of_an_actuator_is_measured(page: Browser, shots: Path) -> None
     wait_until(functools.partial(page.pictures, "hysteresis loop of actuator 8"), 60, "the loop")
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
-    page.shoot(shots / "console-memory.png")
+    page.shoot(shots / "console-hysteresis.png")
     page.resize(*PHONE)
-    page.shoot(shots / "console-memory-phone.png")
+    page.shoot(shots / "console-hysteresis-phone.png")
     page.resize(*DESKTOP)
 
 

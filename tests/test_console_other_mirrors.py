@@ -99,10 +99,10 @@ def test_nineteen_actuators_stand_where_the_driver_says(
     assert words.startswith("command map of 19 actuators")
 
     def centres() -> Any:
-        return page.driver.execute_script(
-            "return [...document.querySelectorAll('[data-actuator]')].map((cell) => {"
-            "const at = cell.getBBox(); return [+cell.dataset.actuator, at.x + at.width / 2, at.y + at.height / 2]})"
-        )
+        with contextlib.suppress(StaleElementReferenceException):
+            boxes = {number: text.rect for number, text in page.hexagons().items()}
+            return [[n, at["x"] + at["width"] / 2, at["y"] + at["height"] / 2] for n, at in boxes.items()]
+        return []
 
     found = np.array(sorted(wait_until(lambda: len(centres()) == 19 and centres(), 60, "19 cells")))[:, 1:]
     # One scale and one origin take the places to the picture, y downwards.

@@ -22,7 +22,7 @@ from selenium.webdriver.common.keys import Keys
 
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from dm_bringup.suite import Suite
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from support import own_domain, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
@@ -163,8 +163,8 @@ def test_actuators_are_chosen_poked_and_released_by_keyboard(page: Browser) -> N
 
 def test_a_click_on_a_hexagon_chooses_it(page: Browser) -> None:
     def clicked() -> bool:
-        with contextlib.suppress(StaleElementReferenceException):
-            page.driver.find_element(By.CSS_SELECTOR, '[data-actuator="12"]').click()
+        with contextlib.suppress(StaleElementReferenceException, KeyError):
+            page.hexagons()[12].click()
         return page.chosen() == 12
 
     wait_until(clicked, 60, "actuator 12")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import json
 import re
 from types import SimpleNamespace
 from typing import Any
@@ -10,18 +13,17 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, MirrorInfo, SurfaceMapInfo, ZernikeCoefficients
+from matplotlib.image import imread
 
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_tools.console import status, view_models
+from dm_tools.console.charts.command_map import command_map, outlines
+from dm_tools.console.charts.heat_map import SAG_COLOURS, heat_map
+from dm_tools.console.charts.plots import loop_chart, residual_chart, zernike_chart
 from dm_tools.console.console_node import Snapshot
-from dm_tools.console.drawing.charts import loop_chart, residual_chart, zernike_chart
-from dm_tools.console.drawing.command_map import command_map
-from dm_tools.console.drawing.heat_map import SAG_COLOURS, heat_map
-from dm_tools.console.drawing.hexagons import outlines, sizes
-from dm_tools.console.drawing.svg import nice_ticks
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
@@ -81,7 +83,7 @@ def test_cells_carry_signal_limit_and_grade() -> None:
     shape = state([0.0, 1.0, -0.5, 0.0, 0.0, 0.0, 0.0])
     shape.flags = bytes([0, ActuatorState.FLAG_AT_LIMIT, ActuatorState.FLAG_REFUSED, 0, 0, 0, 0])
     first, second, third, *_ = view_models.cells(mirror_info(), shape, message)
-    assert first.words == "actuator 1, signal +0.000, graded dead"
+    assert first.text == "actuator 1, signal +0.000, graded dead"
     assert (second.mark, second.remarks) == ("▲", ("at its upper limit",))
     assert third.mark == "!"
     assert second.fill != third.fill
@@ -93,16 +95,18 @@ def test_cells_without_a_command_have_no_signal() -> None:
 
 def test_the_command_map_has_every_actuator_where_it_is() -> None:
     found = view_models.cells(mirror_info(), state([0.0] * COUNT), None)
-    svg = command_map(found, 3, 11.0)
-    assert sorted(map(int, re.findall(r'data-actuator="(\d+)"', svg))) == list(range(1, COUNT + 1))
-    places = {
-        int(n): np.mean([[float(value) for value in corner.split(",")] for corner in corners.split()], axis=0)
-        for n, corners in re.findall(r'data-actuator="(\d+)".*?points="([^"]+)"', svg)
-    }
-    # Actuator 2 lies to the right of 1, and a larger y is further up.
-    assert places[2][0] > places[1][0]
-    up = max(found, key=lambda cell: cell.y).number
-    assert places[up][1] < places[1][1]
+    drawing = command_map(found, 3, 11.0, -1.0, 1.0)
+    cells, circle = drawing.options["series"]
+    assert sorted(number for _x, _y, number in (item["value"] for item in cells["data"])) == list(range(1, COUNT + 1))
+    assert cells["data"][-1]["value"][2] == 3  # drawn last: nothing covers its outline
+    embedded = re.search(r"cell = (\[.*\])\[params", cells[":renderItem"])
+    assert embedded
+    drawn = json.loads(embedded[1])
+    assert [cell["label"] for cell in drawn] == [str(item["value"][2]) for item in cells["data"]]
+    for cell, item in zip(drawn, cells["data"], strict=True):
+        assert np.mean(cell["corners"], axis=0) == pytest.approx(item["value"][:2], abs=2e-3)
+    assert np.hypot(*np.array(circle["data"]).T) == pytest.approx(11.0, abs=2e-3)
+    assert drawing.description == f"command map of {COUNT} actuators; no flags"
 
 
 @pytest.mark.parametrize(("direction", "axis", "sign"), [(0.0, "x", 1), (np.pi, "x", -1), (np.pi / 2, "y", 1)])
@@ -164,18 +168,18 @@ def test_what_is_missing_is_told_with_its_effect() -> None:
 def test_a_button_tells_why_it_cannot_be_pressed() -> None:
     everything = frozenset(status.NODES)
     active = Snapshot(actuator_state=state([0.0] * COUNT), present=everything)
-    assert status.why_not("move", active, "") == ""
-    assert status.why_not("move", active, "Calibration") == "Calibration is under way."
-    assert "not calibrated" in status.why_not("focus", active, "")
+    assert status.reason_against("move", active, "") == ""
+    assert status.reason_against("move", active, "Calibration") == "Calibration is under way."
+    assert "not calibrated" in status.reason_against("focus", active, "")
     calibrated = Snapshot(
         actuator_state=active.actuator_state, capabilities=Capabilities(calibration_id="c1"), present=everything
     )
-    assert status.why_not("focus", calibrated, "") == ""
+    assert status.reason_against("focus", calibrated, "") == ""
     lost = ActuatorState(driver_state=ActuatorState.STATE_LINK_LOST, message="no route to 10.0.0.7")
-    assert status.why_not("move", Snapshot(actuator_state=lost, present=everything), "") == (
+    assert status.reason_against("move", Snapshot(actuator_state=lost, present=everything), "") == (
         "The driver is link lost: no route to 10.0.0.7."
     )
-    assert status.why_not("measure", Snapshot(present=frozenset({"pdm_driver"})), "") == (
+    assert status.reason_against("measure", Snapshot(present=frozenset({"pdm_driver"})), "") == (
         "The node interferometer is not heard."
     )
 
@@ -224,8 +228,8 @@ def test_the_loop_opens_as_the_law_says() -> None:
     # Half-widths 0.1 and 0.3 with weight 0.1 each lag by their half-width on both branches.
     middle = len(loop.signals) // 2
     assert loop.falling[middle] - loop.rising[middle] == pytest.approx(2 * (0.1 * 0.1 + 0.1 * 0.3))
-    assert "of the span apart" in loop.words
-    assert "hysteresis loop of actuator 4" in loop_chart(loop)
+    assert "of the span apart" in loop.text
+    assert "hysteresis loop of actuator 4" in loop_chart(loop).description
 
 
 def test_a_measured_way_comes_back_and_stays_inside() -> None:
@@ -247,47 +251,59 @@ def test_the_change_of_an_effective_signal_is_read_off_two_maps() -> None:
         effective_change(before, SimpleNamespace(x=x[1:], y=y[1:], sag=x[1:]), message, 3)
 
 
-def test_following_tells_what_stood_when_a_map_was_taken() -> None:
-    following = StateObserver()
+def test_the_observer_knows_what_stood_when_a_map_was_taken() -> None:
+    observer = StateObserver()
     for second, value in ((1, 0.0), (2, 0.5), (3, -0.5)):
         shape = state([value] * COUNT, turns=second)
         shape.header.stamp.sec = second
-        following.observe(shape)
-    assert not following.creep_before  # without a law there is no creep
-    assert following.at(2.4).effective == pytest.approx([0.5] * COUNT)
-    assert following.now(9.0).effective == pytest.approx([-0.5] * COUNT)
-    assert following.at(0.5).effective is None and following.at(0.5).doubt
+        observer.observe(shape)
+    assert not observer.creep_before  # without a law there is no creep
+    assert observer.at(2.4).effective == pytest.approx([0.5] * COUNT)
+    assert observer.now(9.0).effective == pytest.approx([-0.5] * COUNT)
+    assert observer.at(0.5).effective is None and observer.at(0.5).doubt
 
 
 def test_a_calibration_that_is_published_again_loses_nothing() -> None:
     message, _ = calibration()
     message.hysteresis.law = "play"
-    following = StateObserver()
-    following.use(message, 0.0)
+    observer = StateObserver()
+    observer.use(message, 0.0)
     shape = state([0.5] * COUNT, turns=1)
     shape.header.stamp.sec = 1
-    following.observe(shape)
-    following.use(message, 0.0)
-    assert following.at(1.5).effective == pytest.approx([0.5] * COUNT)
+    observer.observe(shape)
+    observer.use(message, 0.0)
+    assert observer.at(1.5).effective == pytest.approx([0.5] * COUNT)
 
 
-def test_pictures_are_described_and_keep_hostile_text_out() -> None:
+def test_charts_are_described_and_have_axes() -> None:
     surface = measured_surface(*map_of_terms(np.eye(21)[3] * 4e-7))
-    svg = heat_map(surface, surface.extent, SAG_COLOURS, '<script>"x"')
-    assert "<script>" not in svg and "aria-label" in svg
-    said = re.search(r"peak to valley (\d+) nm", svg)
+    drawing = heat_map(surface, surface.extent, SAG_COLOURS, "measured surface")
+    said = re.search(r"peak to valley (\d+) nm", drawing.description)
     assert said and float(said[1]) == pytest.approx(800.0 * SHOWN**2, rel=0.01)
-    assert "x, mm" in svg and "sag, nm" in svg
+    axes = [*drawing.options["xAxis"], *drawing.options["yAxis"]]
+    assert [axis["name"] for axis in axes if "name" in axis] == ["x, mm", "y, mm", "sag, nm"]
     message = ZernikeCoefficients(coefficients=(np.arange(21) * 1e-9).tolist(), sigma=[])
-    assert "largest Z5,5 sin: 20.00 nm" in zernike_chart(view_models.bars(message, None, False), "Coefficient")
-    assert "residual of 2 maps, the last 3.0 nm" in residual_chart([2.0, 3.0])
+    zernike = zernike_chart(view_models.bars(message, None, False), "Coefficient")
+    assert "largest Z5,5 sin: 20.00 nm" in zernike.description
+    assert "residual of 2 maps, the last 3.0 nm" in residual_chart([2.0, 3.0]).description
 
 
-@pytest.mark.parametrize(("low", "high"), [(-11.0, 11.0), (-3.1e-4, 2.2e-4), (0.0, 7.3)])
-def test_ticks_are_round_and_inside(low: float, high: float) -> None:
-    ticks = nice_ticks(low, high)
-    assert 3 <= len(ticks) <= 8
-    assert low - 1e-12 <= ticks[0] and ticks[-1] <= high + 1e-12
+def test_a_heat_map_is_a_picture_of_the_surface_the_right_way_up() -> None:
+    surface = measured_surface(*map_of_terms(np.eye(21)[2] * 4e-7 + np.eye(21)[4] * 4e-7))
+    image, bar = heat_map(surface, surface.extent, "gray", "measured surface").options["series"]
+    assert image["data"] == [pytest.approx([-11.0, 11.0, 11.0, -11.0])]
+    grey, opaque = pixels(image)[..., 0] / 255.0, pixels(image)[..., 3] > 0
+    np.testing.assert_array_equal(opaque, np.isfinite(surface.sag))  # row 0 is the top
+    np.testing.assert_allclose(2.0 * grey[opaque] - 1.0, surface.sag[opaque] / surface.extent, atol=0.02)
+    stops = json.loads(re.search(r"colorStops: (\[.*\])", bar[":renderItem"])[1])  # type: ignore[index]
+    assert (stops[0]["color"], stops[-1]["color"]) == ("#ffffff", "#000000")
+
+
+def pixels(series: dict[str, Any]) -> np.ndarray:
+    """RGBA of the picture that a series draws."""
+    found = re.search(r"base64,([^']+)'", series[":renderItem"])
+    assert found
+    return (imread(io.BytesIO(base64.b64decode(found[1]))) * 255).round().astype(int)
 
 
 def areas(cells: list[np.ndarray]) -> np.ndarray:
@@ -299,7 +315,7 @@ def areas(cells: list[np.ndarray]) -> np.ndarray:
 @pytest.mark.parametrize("turned", [0.0, 0.3, np.pi / 6])
 def test_cells_of_a_hexagonal_grid_fill_it_however_it_is_turned(turned: float) -> None:
     x, y = hexagonal_positions(19, pitch=4.0, start_angle=turned)
-    cells = outlines(tuple(zip(x.tolist(), y.tolist(), strict=True)))
+    cells = [corners for corners, _size in outlines(tuple(zip(x.tolist(), y.tolist(), strict=True)))]
     assert [len(cell) for cell in cells] == [6] * 19
     assert areas(cells) == pytest.approx(np.sqrt(3) / 2 * 4.0**2)
 
@@ -307,16 +323,17 @@ def test_cells_of_a_hexagonal_grid_fill_it_however_it_is_turned(turned: float) -
 def test_cells_of_scattered_actuators_do_not_cover_each_other() -> None:
     places = np.random.default_rng(3).uniform(-10.0, 10.0, size=(40, 2))
     cells = outlines(tuple(map(tuple, places.tolist())))
-    for number, cell in enumerate(cells):
+    for number, (cell, size) in enumerate(cells):
+        assert size > 0.0
         middle = cell.mean(axis=0)
         inside = middle + 0.99 * (cell - middle)
         distance = np.hypot(*(inside[:, None, :] - places).transpose(2, 0, 1))
         assert (distance.argmin(axis=1) == number).all()
-    assert min(sizes(cells, places.tolist())) > 0.0
 
 
 def test_a_lone_actuator_has_a_cell() -> None:
-    assert len(outlines(((1.0, 2.0),))[0]) == 6
+    ((corners, _size),) = outlines(((1.0, 2.0),))
+    assert len(corners) == 6
 
 
 @pytest.mark.parametrize("grey", range(0, 256, 15))

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
-import os
 import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import rclpy
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
@@ -26,18 +23,15 @@ from dm_msgs.msg import (
     ZernikeCoefficients,
 )
 from dm_msgs.srv import Degauss, Flatten, ListCalibrations, LoadCalibration, Measure, SetFocus, SetSignals
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import Image
 
+from dm_client.connection import Connection, DeformableMirrorError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
-from dm_common.ros.action_client import ThreadedActionClient
-from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.rosout import LogTail
-from dm_common.ros.worker import ServiceCallError, answers_arrive, call
+from dm_common.ros.worker import answers_arrive
 from dm_tools.console.external_goals import ExternalGoals
 from dm_tools.console.state_observer import StateObserver
 
@@ -71,7 +65,6 @@ SILENCE_S = 5.0
 ANSWER_S = 10.0
 #: Time that runs back by more than this is another time: a simulator that was started again, s.
 TIME_JUMP_S = 60.0
-_NUMBERS = itertools.count(1)
 
 
 @dataclass(frozen=True)
@@ -106,38 +99,28 @@ class ConsoleNode:
     """
 
     def __init__(self, namespace: str = "", domain: int | None = None) -> None:
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node(f"dm_console_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
         self._prefix = f"{namespace.strip('/')}/" if namespace.strip("/") else ""
-        self._latest: dict[str, Any] = {}
         self._heard: dict[str, float] = {}
         self._diagnostics: dict[str, DiagnosticStatus] = {}
         self._bench_time = 0.0
         self._goals: dict[str, Any] = {}
         self._beginning: dict[str, bool] = {}  # goals that are not accepted yet; True = to be cancelled
-        self.following = StateObserver()
+        self.observer = StateObserver()
+        self._connection = Connection("dm_console", namespace, domain, TOPICS, SERVICES | ACTIONS, self._take)
+        self.node = self._connection.node
         self.log = LogTail(self.node)
-        for topic, (message_type, profile) in TOPICS.items():
-            self._subscribe(message_type, topic, profile)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
-        # Early, so that the nodes have discovered them all by the time the first is used.
-        self._services = {name: self.node.create_client(kind, name) for name, kind in SERVICES.items()}
-        self._actions = {name: ThreadedActionClient(self.node, kind, name) for name, kind in ACTIONS.items()}
         self.watched = {name: ExternalGoals(self.node, ACTIONS[name], name) for name in WATCHED}
-        self._background = BackgroundExecutor(self.node)
-
-    def _subscribe(self, message_type: Any, topic: str, profile: Any) -> None:
-        self.node.create_subscription(message_type, topic, lambda message: self._take(topic, message), profile)
+        self._connection.start()
 
     def _take(self, topic: str, message: Any) -> None:
-        self._latest[topic] = message
         if topic == "actuator_state":
-            self.following.observe(message)
+            self.observer.observe(message)
         elif topic in ("calibration", "mirror_info"):
-            calibration, mirror = self._latest.get("calibration"), self._latest.get("mirror_info")
+            messages = self._connection.messages
+            calibration, mirror = messages.get("calibration"), messages.get("mirror_info")
             if calibration is not None and mirror is not None:
-                self.following.use(calibration, 0.5 * (mirror.signal_min + mirror.signal_max))
+                self.observer.use(calibration, 0.5 * (mirror.signal_min + mirror.signal_max))
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         time_s = seconds(message.header.stamp)
@@ -149,8 +132,7 @@ class ConsoleNode:
 
     def close(self) -> None:
         """Leave the ROS graph; the mirror keeps its shape."""
-        self._background.destroy_node()
-        self._context.try_shutdown()
+        self._connection.close()
 
     def snapshot(self) -> Snapshot:
         """What is known now."""
@@ -161,7 +143,7 @@ class ConsoleNode:
             if when >= recent and name.startswith(self._prefix)
         )
         return Snapshot(
-            **dict(self._latest),
+            **dict(self._connection.messages),
             diagnostics=dict(self._diagnostics),
             present=present,
             bench_time=self._bench_time,
@@ -174,12 +156,9 @@ class ConsoleNode:
             Refusal: it refused, with its sentence, or did not answer.
         """
         try:
-            response = await asyncio.to_thread(call, self._services[name], request, timeout_s)
-        except ServiceCallError as error:
-            raise Refusal(ErrorCode.TIMEOUT, str(error)) from error
-        if response.error_code != 0:
-            raise Refusal(response.error_code, f"{response.message} (error {response.error_code})")
-        return response
+            return await asyncio.to_thread(self._connection.call, SERVICES[name], name, request, timeout_s)
+        except DeformableMirrorError as error:
+            raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
 
     async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = 7200.0) -> Any:
         """Run an action to its end and return its result.
@@ -187,7 +166,7 @@ class ConsoleNode:
         Raises:
             Refusal: the goal was refused, ended with an error or was cancelled, with the node's sentence.
         """
-        client = self._actions[name]
+        client = self._connection.client(ACTIONS[name], name)
         identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
         identity.uuid = list(uuid.uuid4().bytes)
         if name in self.watched:
@@ -198,7 +177,7 @@ class ConsoleNode:
             finished = handle.get_result_async()
             if self._beginning.pop(name):
                 await self.cancel(name)
-            if not await _until(finished.done, timeout_s, lambda: self._server_is_gone(client)):
+            if not await _until(finished.done, timeout_s, lambda: not client.server_is_ready()):
                 with contextlib.suppress(Refusal):
                     await self.cancel(name)
                 raise Refusal(
@@ -218,7 +197,7 @@ class ConsoleNode:
 
     async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None], identity: Any) -> Any:
         """The handle of a goal that was accepted."""
-        client = self._actions[name]
+        client = self._connection.client(ACTIONS[name], name)
         if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
             raise Refusal(ErrorCode.TIMEOUT, f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
         if self._beginning[name]:
@@ -231,14 +210,10 @@ class ConsoleNode:
             raise Refusal(ErrorCode.BUSY, f"{name}: refused, another goal is running")
         return handle
 
-    @staticmethod
-    def _server_is_gone(client: ThreadedActionClient) -> bool:
-        return not client.server_is_ready()
-
     @property
-    def busy_elsewhere(self) -> str:
+    def external_action(self) -> str:
         """Name of an action that runs and was not started here; "" = none."""
-        return next((name for name, watch in self.watched.items() if watch.elsewhere), "")
+        return next((name for name, watch in self.watched.items() if watch.running), "")
 
     async def cancel(self, name: str) -> None:
         """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs.

@@ -59,7 +59,7 @@ class ExternalGoals:
             self._own.discard(bytes(identity.uuid))
 
     @property
-    def elsewhere(self) -> bool:
+    def running(self) -> bool:
         """Whether a goal runs that this console did not send."""
         with self._lock:
             running, heard = self._running, self._heard

@@ -43,7 +43,7 @@ class Loop:
         return gap / (self.rising[-1] - self.rising[0])
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """The loop in a sentence."""
         return f"the branches are up to {self.opening:.1%} of the span apart"
 

@@ -11,14 +11,14 @@ from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import Degauss, Flatten, LoadCalibration, Measure, SetFocus, SetSignals
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_tools.console.feedback import calibration_step, converge_step, recipe_step
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
-from dm_tools.console.view_models import NM, poke_signals, prediction_words
+from dm_tools.console.status import calibration_step, converge_step, recipe_step
+from dm_tools.console.view_models import NM, poke_signals, prediction_text
 
 #: What the plans of a calibration are called.
 PLANS = {
-    Calibrate.Goal.PLAN_HYSTERESIS: "Memory: influence function, hysteresis and creep",
+    Calibrate.Goal.PLAN_HYSTERESIS: "Hysteresis: influence function, hysteresis and creep",
     Calibrate.Goal.PLAN_FULL: "Full: pokes and the surfaces of Table 1",
     Calibrate.Goal.PLAN_POKES: "Pokes only",
     Calibrate.Goal.PLAN_SURFACES: "Surfaces of Table 1 only",
@@ -31,7 +31,7 @@ DEGAUSS_S, MEASURE_S, MOVE_S = 300.0, 120.0, 60.0
 async def predict(session: Session, request: FocusRequest) -> str:
     """The prediction for a request, in words; nothing moves. Raises Refusal."""
     answer = await session.ros.call("set_focus", SetFocus.Request(request=request, dry_run=True))
-    return prediction_words(answer.state)
+    return prediction_text(answer.state)
 
 
 async def move(session: Session, request: FocusRequest) -> str:
@@ -39,12 +39,12 @@ async def move(session: Session, request: FocusRequest) -> str:
 
     def show(feedback: Any) -> None:
         session.progress.step, session.progress.steps = round(100 * feedback.progress), 100
-        session.progress.words = ("planning", "moving", "settling")[min(feedback.phase, 2)]
+        session.progress.text = ("planning", "moving", "settling")[min(feedback.phase, 2)]
 
     timeout = MOVE_S + (DEGAUSS_S if request.mode != FocusRequest.MODE_DIRECT else 0.0)
     result = await session.ros.run("move_focus", MoveFocus.Goal(request=request), show, timeout)
     session.base = None
-    return f"{request.curvature:+.4f} 1/m stands after {result.duration:.2f} s. {prediction_words(result.state)}"
+    return f"{request.curvature:+.4f} 1/m stands after {result.duration:.2f} s. {prediction_text(result.state)}"
 
 
 async def converge(session: Session, request: FocusRequest) -> str:
@@ -52,7 +52,7 @@ async def converge(session: Session, request: FocusRequest) -> str:
 
     def show(feedback: Any) -> None:
         session.progress.step = feedback.step
-        session.progress.words = converge_step(feedback)
+        session.progress.text = converge_step(feedback)
 
     result = await session.ros.run("converge", Converge.Goal(request=request), show)
     session.base = None
@@ -64,12 +64,12 @@ async def flatten(session: Session) -> str:
     """Make the surface flat."""
     answer = await session.ros.call("flatten", Flatten.Request(), MOVE_S)
     session.base = None
-    return prediction_words(answer.state)
+    return prediction_text(answer.state)
 
 
 async def degauss(session: Session) -> str:
-    """Wipe the hysteresis memory."""
-    session.progress.words = "alternating with falling amplitude about mid range"
+    """Wipe the history of the actuators."""
+    session.progress.text = "alternating with falling amplitude about mid range"
     answer = await session.ros.call("degauss", Degauss.Request(), DEGAUSS_S)
     session.base = None
     return f"done in {answer.duration:.1f} s; the mirror is at mid range"
@@ -86,7 +86,7 @@ async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
 
     def show(feedback: Any) -> None:
         session.progress.step, session.progress.steps = feedback.step, feedback.steps
-        session.progress.words = calibration_step(feedback)
+        session.progress.text = calibration_step(feedback)
 
     result = await session.ros.run("calibrate", goal, show)
     findings = "".join(f" Poke check: {sentence}." for sentence in result.poke_findings)
@@ -109,7 +109,7 @@ async def build_recipes(session: Session, curvatures: list[float]) -> str:
     def show(feedback: Any) -> None:
         done = sum(curvature < feedback.curvature - 1e-9 for curvature in order)
         session.progress.step, session.progress.steps = done, len(order)
-        session.progress.words = recipe_step(feedback)
+        session.progress.text = recipe_step(feedback)
 
     result = await session.ros.run("build_recipes", BuildRecipes.Goal(curvatures=curvatures), show)
     session.base = None
@@ -146,8 +146,8 @@ async def poke(session: Session, actuator: int, amplitude: float, then_measure: 
     signals = poke_signals(base, actuator, amplitude, mirror.signal_min, mirror.signal_max)
     await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), MOVE_S)
     session.base, session.poked = base, signals
-    words = f"actuator {actuator} at {signals[actuator - 1]:+.3f}; release it with Escape"
-    return f"{words}. Map: {await measure(session, f'poke {actuator}')}" if then_measure else words
+    text = f"actuator {actuator} at {signals[actuator - 1]:+.3f}; release it with Escape"
+    return f"{text}. Map: {await measure(session, f'poke {actuator}')}" if then_measure else text
 
 
 async def release(session: Session) -> str:
@@ -167,19 +167,19 @@ async def release(session: Session) -> str:
 async def measure_loop(session: Session, actuator: int, amplitude: float) -> str:
     """Take one actuator up and down with a map at every step; it ends where it began."""
     snapshot, (mirror, start) = session.snapshot(), _standing(session)
-    calibration, following = snapshot.calibration, session.ros.following
+    calibration, observer = snapshot.calibration, session.ros.observer
     if calibration is None or not calibration.id:
         raise Refusal(
             ErrorCode.NOT_CALIBRATED,
             "a measured loop needs a calibration: it holds what the actuator does to the surface",
         )
-    standing = following.now(snapshot.bench_time)
-    state = following.state()
+    standing = observer.now(snapshot.bench_time)
+    state = observer.state()
     if standing.effective is None or state is None:
         raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"where the actuators stand is not known: {standing.doubt}")
     signals = way(start[actuator - 1], amplitude, mirror.signal_min, mirror.signal_max)
     first = float(standing.effective[actuator - 1])
-    model = modelled_way(following.law, state, actuator, signals)
+    model = modelled_way(observer.law, state, actuator, signals)
     before = (await session.ros.call("measure", Measure.Request(label="loop start"), MEASURE_S)).samples
     values: list[float] = []
     session.progress.steps = len(signals)
@@ -187,7 +187,7 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
         for step, signal in enumerate(signals, start=1):
             if session.cancelled:
                 raise Refusal(ErrorCode.CANCELED, "cancelled; the actuator is back where it began")
-            session.progress.step, session.progress.words = step, f"actuator {actuator} at {signal:+.2f}"
+            session.progress.step, session.progress.text = step, f"actuator {actuator} at {signal:+.2f}"
             shape = [*start[: actuator - 1], signal, *start[actuator:]]
             await session.ros.call("set_signals", SetSignals.Request(signals=shape, wait=True), MOVE_S)
             after = (await session.ros.call("measure", Measure.Request(label=f"loop {step}"), MEASURE_S)).samples
@@ -195,7 +195,7 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
     except (Refusal, ValueError):
         await session.ros.call("set_signals", SetSignals.Request(signals=start, wait=True), MOVE_S)
         raise
-    loop = modelled_loop(following.law, actuator, mirror.signal_min, mirror.signal_max)
+    loop = modelled_loop(observer.law, actuator, mirror.signal_min, mirror.signal_max)
     session.loops[actuator] = dataclasses.replace(
         loop, path=tuple(signals), modelled_path=tuple(model), measured=tuple(values)
     )

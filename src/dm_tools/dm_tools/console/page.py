@@ -33,7 +33,7 @@ def serve(ros: ConsoleNode, port: int) -> None:
         port: 1 to 65535.
     """
     session = Session(ros)
-    view = SurfaceView(ros.following)
+    view = SurfaceView(ros.observer)
 
     @ui.page("/")
     def console() -> None:
@@ -57,7 +57,7 @@ def build(session: Session, view: SurfaceView) -> None:
     """Put the cards on a new page."""
     ui.add_css(style.CSS)
     ui.colors(primary=style.PRIMARY, negative=style.ERROR, warning=style.WARNING)
-    top = Header(session)
+    header = Header(session)
     with ui.element("main").classes("grid"):
         with ui.element("div").classes("column side"):
             left = (FocusCard(session), CalibrationCard(session), RecipesCard(session))
@@ -66,7 +66,7 @@ def build(session: Session, view: SurfaceView) -> None:
             with ui.element("div").classes("pair"):
                 below = (ZernikeCard(view), LogCard(session))
             health = DiagnosticsCard()
-    cards = (top, *left, *right, *below, health)
+    cards = (header, *left, *right, *below, health)
 
     def refresh() -> None:
         snapshot = session.snapshot()

@@ -11,13 +11,13 @@ from typing import Any
 
 from dm_common.errors import Refusal
 from dm_tools.console.console_node import ConsoleNode, Snapshot
-from dm_tools.console.feedback import calibration_step, converge_step, recipe_step
 from dm_tools.console.loops import Loop
+from dm_tools.console.status import calibration_step, converge_step, recipe_step
 
 #: Failures that are kept until somebody dismisses them.
 FAILURES_KEPT = 50
 #: What an action that was not started here is called.
-ELSEWHERE = {
+EXTERNAL = {
     "build_recipes": "A run of recipes that was started elsewhere",
     "calibrate": "A calibration that was started elsewhere",
     "converge": "A closed loop that was started elsewhere",
@@ -41,14 +41,14 @@ class Progress:
     Attributes:
         title: of the operation, "" = none is under way.
         step, steps: i of n; steps 0 = not known.
-        words: what it does now.
+        text: what it does now.
         can_cancel: whether it can be cancelled.
     """
 
     title: str = ""
     step: int = 0
     steps: int = 0
-    words: str = ""
+    text: str = ""
     can_cancel: bool = False
 
 
@@ -84,27 +84,27 @@ class Session:
     @property
     def running(self) -> str:
         """Title of the operation under way, here or elsewhere; "" = none."""
-        return self.progress.title or ELSEWHERE.get(self.ros.busy_elsewhere, "")
+        return self.progress.title or EXTERNAL.get(self.ros.external_action, "")
 
     @property
     def calibrating(self) -> bool:
         """Whether a calibration is under way, here or elsewhere."""
-        return self.progress.title == "Calibration" or self.ros.busy_elsewhere == "calibrate"
+        return self.progress.title == "Calibration" or self.ros.external_action == "calibrate"
 
     @property
     def shown_progress(self) -> Progress:
         """The operation under way here, else the one elsewhere."""
-        name = self.ros.busy_elsewhere
+        name = self.ros.external_action
         if self.progress.title or not name:
             return self.progress
         feedback = self.ros.watched[name].feedback
-        shown = Progress(ELSEWHERE[name], can_cancel=True)
+        shown = Progress(EXTERNAL[name], can_cancel=True)
         if feedback is None:
-            shown.words = "no word of it yet"
+            shown.text = "no word of it yet"
         elif name == "calibrate":
-            shown.step, shown.steps, shown.words = feedback.step, feedback.steps, calibration_step(feedback)
+            shown.step, shown.steps, shown.text = feedback.step, feedback.steps, calibration_step(feedback)
         else:
-            shown.words = recipe_step(feedback) if name == "build_recipes" else converge_step(feedback)
+            shown.text = recipe_step(feedback) if name == "build_recipes" else converge_step(feedback)
         return shown
 
     def fail(self, title: str, sentence: str) -> None:
@@ -149,11 +149,11 @@ class Session:
     async def cancel(self) -> None:
         """Ask the operation under way to stop, here or elsewhere."""
         try:
-            if not self.progress.title and (name := self.ros.busy_elsewhere):
+            if not self.progress.title and (name := self.ros.external_action):
                 await self.ros.cancel(name)
             elif self._cancel is not None and self.progress.title:
                 self.cancelled = True
-                self.progress.words = "cancelling"
+                self.progress.text = "cancelling"
                 await self._cancel()
         except Refusal as error:
             self.fail("Cancel", str(error))

@@ -37,16 +37,16 @@ LEVELS = {
 _PATH = re.compile(r"(?<![\w/.])/(?:home|root|tmp|var|opt|mnt|media|srv|data|work|Users)(?:/[^\s/,;:'\"()]+)+")
 
 
-def shortened(words: str) -> str:
-    """`words` with only the last part of every path in them: who looks at the page knows the folders."""
-    return _PATH.sub(lambda match: f"…/{match[0].rsplit('/', 1)[-1]}", words)
+def shortened(text: str) -> str:
+    """`text` with only the last part of every path in them: who looks at the page knows the folders."""
+    return _PATH.sub(lambda match: f"…/{match[0].rsplit('/', 1)[-1]}", text)
 
 
 @dataclass(frozen=True)
 class Badge:
     """A few words on the state; `kind` is "", "doubt" or "bad"."""
 
-    words: str
+    text: str
     kind: str = ""
 
 
@@ -62,8 +62,8 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
         shown.append(Badge("driver: not heard", "bad"))
     else:
         active = state.driver_state == ActuatorState.STATE_ACTIVE
-        words = DRIVER_STATES.get(state.driver_state, "?") + (", moving" if state.moving else "")
-        shown.append(Badge(f"driver: {words}", "" if active else "bad"))
+        text = DRIVER_STATES.get(state.driver_state, "?") + (", moving" if state.moving else "")
+        shown.append(Badge(f"driver: {text}", "" if active else "bad"))
     if calibration is None or not calibration.id:
         shown.append(Badge("no calibration", "doubt"))
     else:
@@ -75,8 +75,8 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
             shown.append(Badge("history: not known" if doubt else "history: known", "doubt" if doubt else ""))
     worst = max((ord(bytes(status.level)) for status in snapshot.diagnostics.values()), default=0)
     if worst and worst != ord(DiagnosticStatus.STALE):
-        words = LEVELS.get(bytes([worst]), "?")
-        shown.append(Badge(f"diagnostics: {words}", "bad" if worst >= ord(DiagnosticStatus.ERROR) else "doubt"))
+        text = LEVELS.get(bytes([worst]), "?")
+        shown.append(Badge(f"diagnostics: {text}", "bad" if worst >= ord(DiagnosticStatus.ERROR) else "doubt"))
     return shown
 
 
@@ -90,7 +90,7 @@ def missing(present: frozenset[str], mirror_known: bool) -> list[str]:
     return lines
 
 
-def why_not(need: str, snapshot: Any, running: str) -> str:
+def reason_against(need: str, snapshot: Any, running: str) -> str:
     """Why an operation is not possible now, in a sentence; "" = it is.
 
     Args:
@@ -157,3 +157,24 @@ def log_rows(lines: Sequence[Any], everything: bool) -> list[tuple[str, ...]]:
         for line in reversed(lines)
         if everything or line.level in ("WARN", "ERROR", "FATAL")
     ]
+
+
+#: Phases of the action `calibrate`, by their number.
+PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
+
+
+def calibration_step(feedback: Any) -> str:
+    """Feedback of the action `calibrate`: phase, what is measured, what was dropped."""
+    dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
+    phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
+    return f"{phase} {feedback.label}{dropped}"
+
+
+def converge_step(feedback: Any) -> str:
+    """Feedback of the action `converge`: the map and how far off it was."""
+    return f"map {feedback.step}: largest coefficient {feedback.max_zernike * 1e9:.1f} nm"
+
+
+def recipe_step(feedback: Any) -> str:
+    """Feedback of the action `build_recipes`: the curvature, the map and how far off it was."""
+    return f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"

@@ -26,7 +26,7 @@ class SurfaceView:
 
     Attributes:
         version: rises whenever something changed.
-        measured, predicted, difference: None with a reason in `why_no_...`. `predicted` is for now, `difference` for
+        measured, predicted, difference: None with a reason in `..._reason`. `predicted` is for now, `difference` for
             the moment of the map.
         predicted_zernike: (K,) m for the moment of the map; None = not known.
         doubt: why the prediction is a guess only, in words; "" = it is none.
@@ -41,8 +41,8 @@ class SurfaceView:
         self.predicted: Surface | None = None
         self.difference: Surface | None = None
         self.predicted_zernike: NDArray[np.float64] | None = None
-        self.why_no_map = "No map was measured yet."
-        self.why_no_prediction = self.why_no_difference = NO_CALIBRATION
+        self.no_map_reason = "No map was measured yet."
+        self.no_prediction_reason = self.no_difference_reason = NO_CALIBRATION
         self.doubt = self.remark = self.when = ""
         self._model: SurfaceModel | None = None
         self._calibration: Any = None
@@ -72,12 +72,12 @@ class SurfaceView:
         if calibration is self._calibration:
             return False
         self._calibration, self._model, self._effective = calibration, None, None
-        self.why_no_prediction = NO_CALIBRATION
+        self.no_prediction_reason = NO_CALIBRATION
         if calibration is not None and calibration.id:
             try:
                 self._model = SurfaceModel(calibration)
             except ValueError as error:
-                self.why_no_prediction = str(error)
+                self.no_prediction_reason = str(error)
         return True
 
     def _take_map(self, snapshot: Snapshot) -> bool:
@@ -90,9 +90,9 @@ class SurfaceView:
         self._map = (stamp, image)
         self._at_map = self._state_observer.at(1e-9 * stamp)
         try:
-            self.measured, self.why_no_map = measured_surface(map_of(image), info), ""
+            self.measured, self.no_map_reason = measured_surface(map_of(image), info), ""
         except ValueError as error:
-            self.measured, self.why_no_map = None, f"The last map cannot be shown: {error}"
+            self.measured, self.no_map_reason = None, f"The last map cannot be shown: {error}"
         return True
 
     def _take_prediction(self, snapshot: Snapshot) -> bool:
@@ -103,7 +103,7 @@ class SurfaceView:
         standing = self._state_observer.now(snapshot.bench_time)
         if standing.effective is None or standing.effective.shape != (self._model.actuators,):
             changed = self.predicted is not None
-            self.predicted, self.why_no_prediction = None, standing.doubt or "the calibration is of another mirror"
+            self.predicted, self.no_prediction_reason = None, standing.doubt or "the calibration is of another mirror"
             return changed
         before = self._effective
         if (
@@ -120,18 +120,20 @@ class SurfaceView:
     def _compare(self) -> None:
         self.difference = self.predicted_zernike = None
         if self._model is None:
-            self.why_no_difference = self.why_no_prediction
+            self.no_difference_reason = self.no_prediction_reason
         elif self.measured is None or self._at_map is None:
-            self.why_no_difference = self.why_no_map
+            self.no_difference_reason = self.no_map_reason
         elif self._at_map.effective is None or self._at_map.effective.shape != (self._model.actuators,):
-            self.why_no_difference = f"Not comparable: {self._at_map.doubt or 'the calibration is of another mirror'}."
+            self.no_difference_reason = (
+                f"Not comparable: {self._at_map.doubt or 'the calibration is of another mirror'}."
+            )
         else:
             try:
                 self.difference = difference(self.measured, self._model.surface(self._at_map.effective))
                 self.predicted_zernike = self._model.coefficients(self._at_map.effective)
-                self.why_no_difference = ""
+                self.no_difference_reason = ""
             except ValueError as error:
-                self.why_no_difference = f"Not comparable: {error}."
+                self.no_difference_reason = f"Not comparable: {error}."
 
     def _when(self) -> str:
         if self.measured is None:

@@ -60,7 +60,7 @@ class Cell:
     mark: str
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """What a screen reader says."""
         at = "nothing commanded yet" if self.signal is None else f"signal {self.signal:+.3f}"
         return ", ".join([f"actuator {self.number}", at, *self.remarks])
@@ -102,7 +102,7 @@ def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
                 signal=float(applied[index]) if known else None,
                 fill=fill,
                 ink=ink_on(fill),
-                remarks=tuple(words for _sign, words in marks),
+                remarks=tuple(text for _sign, text in marks),
                 mark=marks[0][0] if marks else "",
             )
         )
@@ -110,7 +110,7 @@ def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
 
 
 def _marks(flags: int, grade: int, signal: float | None, mirror: Any) -> list[tuple[str, str]]:
-    """(sign, words), the most important first."""
+    """(sign, text), the most important first."""
     middle = 0.5 * (mirror.signal_min + mirror.signal_max)
     marks = []
     if flags & ActuatorState.FLAG_REFUSED:
@@ -178,21 +178,21 @@ def reachable(capabilities: Any) -> tuple[float, float] | None:
     return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None
 
 
-def prediction_words(state: Any) -> str:
+def prediction_text(state: Any) -> str:
     """A dm_msgs/FocusState's prediction as a sentence."""
-    words = (
+    text = (
         f"Predicted residual {state.predicted_rms * NM:.1f} nm rms "
         f"(95 %: {state.predicted_rms_lower * NM:.1f} to {state.predicted_rms_upper * NM:.1f} nm), "
         f"largest coefficient error below {state.predicted_max_zernike_upper * NM:.1f} nm"
     )
     if state.predicted_duration > 0:
-        words += f", shape stands after {state.predicted_duration:.2f} s"
-    words += f". Mode: {MODES.get(state.mode, '?').lower()}."
+        text += f", shape stands after {state.predicted_duration:.2f} s"
+    text += f". Mode: {MODES.get(state.mode, '?').lower()}."
     if state.saturated:
-        words += f" Saturated: actuators {', '.join(map(str, state.saturated_actuators))}."
+        text += f" Saturated: actuators {', '.join(map(str, state.saturated_actuators))}."
     if not state.history_known:
-        words += " The history of the actuators is not known: a degauss would make this better."
-    return words
+        text += " The history of the actuators is not known: a degauss would make this better."
+    return text
 
 
 def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: float, high: float) -> list[float]:
@@ -225,7 +225,7 @@ def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:
     ]
 
 
-def calibration_words(calibration: Any) -> list[str]:
+def calibration_text(calibration: Any) -> list[str]:
     """A dm_msgs/Calibration in lines: what it is, how good, and its limitations."""
     if calibration is None or not calibration.id:
         return ["No calibration is in use."]
@@ -235,10 +235,11 @@ def calibration_words(calibration: Any) -> list[str]:
         f"Residual {calibration.in_sample_rms * NM:.2f} nm rms in-sample, {calibration.held_out_rms * NM:.2f} nm held "
         f"out; largest held-out coefficient error {calibration.held_out_max_zernike * NM:.2f} nm.",
     ]
-    if calibration.hysteresis.play_radius:
+    law = calibration.hysteresis
+    if law.play_radius:
         lines.append(
-            f"Hysteresis: {calibration.memory.law}; creep {calibration.memory.creep_rate:.2%} per decade; held-out "
-            f"moves to {calibration.memory.held_out_max_zernike * NM:.2f} nm."
+            f"Hysteresis: {law.law}; creep {law.creep_rate:.2%} per decade; held-out "
+            f"moves to {law.held_out_max_zernike * NM:.2f} nm."
         )
     if calibration.recipes.recipes:
         lines.append(f"Conditioned recipes: {len(calibration.recipes.recipes)}.")

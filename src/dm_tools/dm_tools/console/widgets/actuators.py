@@ -6,24 +6,19 @@ import dataclasses
 import math
 from typing import Any
 
-from matplotlib import colormaps
-from matplotlib.colors import to_hex
 from nicegui import ui
 
 from dm_tools.console import operations
+from dm_tools.console.charts.command_map import command_map
+from dm_tools.console.charts.plots import loop_chart
 from dm_tools.console.console_node import Snapshot
-from dm_tools.console.drawing.charts import loop_chart
-from dm_tools.console.drawing.command_map import command_map, signal_scale
 from dm_tools.console.loops import modelled_loop
 from dm_tools.console.session import Session
-from dm_tools.console.status import why_not
-from dm_tools.console.view_models import SIGNAL_COLOURS, Cell, cells
-from dm_tools.console.widgets.components import ActionButton, Line, Picture, card, labelled
+from dm_tools.console.status import reason_against
+from dm_tools.console.view_models import Cell, cells
+from dm_tools.console.widgets.components import ActionButton, Chart, Line, card, labelled
 
-#: What a click on the map emits: the number of the hexagon under it.
-CLICKED = "(event) => { const cell = event.target.closest('[data-actuator]'); if (cell) emit(+cell.dataset.actuator); }"
 ARROWS = {"right": 0.0, "up": math.pi / 2, "left": math.pi, "down": -math.pi / 2}
-SCALE_COLOURS = [to_hex(colormaps[SIGNAL_COLOURS](share / 39)) for share in range(40)]
 
 
 def towards(found: list[Cell], chosen: int, direction: float) -> int:
@@ -50,16 +45,14 @@ class ActuatorCards:
         with ui.element("div").classes("pair"):
             with card("Command map"):
                 with ui.element("div").classes("map w-full").props('tabindex="0" role="group"') as self._map:
-                    self._picture = Picture()
+                    self._picture = Chart("square", lambda value: self._clicked(int(value[2])))
                 labelled(self._map, "Actuators. Arrow keys choose, Enter pokes, Escape releases")
-                self._map.on("click", lambda event: self._clicked(int(event.args)), js_handler=CLICKED)
                 for key, direction in ARROWS.items():
                     self._map.on(f"keydown.{key}.prevent", lambda _event, way=direction: self._step(way))
                 self._map.on("keydown.enter.prevent", lambda: self._poke())
-                self._scale = Picture()
-                ui.label("▲▼ at a limit · … on its way · ! refused · ? doubtful grade · × not wired").classes("words")
+                ui.label("▲▼ at a limit · … on its way · ! refused · ? doubtful grade · × not wired").classes("text")
             with card("Actuator"):
-                self._words = Line("words figures", live=True)
+                self._text = Line("text figures", live=True)
                 with ui.element("div").classes("line"):
                     self._number = ui.number(
                         "Number", value=session.chosen, min=1, step=1, format="%d", on_change=self._typed
@@ -73,9 +66,9 @@ class ActuatorCards:
                     self._poke_button = ActionButton("Poke", self._poke)
                     self._release = ActionButton("Release (Esc)", self._start_release, True)
                     self._measure_loop = ActionButton("Measure its loop", self._start_loop, True)
-                self._why = Line("why")
-                self._loop_words = Line("words figures")
-                self._loop_picture = Picture()
+                self._reason = Line("reason")
+                self._loop_text = Line("text figures")
+                self._loop_picture = Chart("loop")
         ui.keyboard(on_key=self._key, ignore=[])
 
     # --- choosing ---
@@ -105,11 +98,11 @@ class ActuatorCards:
 
     def _poke(self) -> None:
         session, number, amplitude = self._session, self._session.chosen, self._amplitude.value
-        why = why_not("move", session.snapshot(), session.running)
-        if why or amplitude is None:
-            session.fail(f"Poke {number}", why or "the amplitude must be a number")
+        reason = reason_against("move", session.snapshot(), session.running)
+        if reason or amplitude is None:
+            session.fail(f"Poke {number}", reason or "the amplitude must be a number")
             return
-        maps = bool(self._with_map.value) and not why_not("measure", session.snapshot(), "")
+        maps = bool(self._with_map.value) and not reason_against("measure", session.snapshot(), "")
         session.begin(f"Poke {number}", lambda: operations.poke(session, number, float(amplitude), maps))
 
     def _start_release(self) -> None:
@@ -127,35 +120,34 @@ class ActuatorCards:
 
     def refresh(self, snapshot: Snapshot) -> None:
         mirror, session = snapshot.mirror_info, self._session
-        why = why_not("move", snapshot, session.running)
-        self._poke_button.allow(why)
-        self._release.allow(why or ("" if session.base is not None else "Nothing is poked."))
-        self._measure_loop.allow(why_not("converge", snapshot, session.running))
-        self._why.show(f"Not possible now: {why}" if why else "")
+        reason = reason_against("move", snapshot, session.running)
+        self._poke_button.allow(reason)
+        self._release.allow(reason or ("" if session.base is not None else "Nothing is poked."))
+        self._measure_loop.allow(reason_against("converge", snapshot, session.running))
+        self._reason.show(f"Not possible now: {reason}" if reason else "")
         if mirror is None:
-            self._picture.show("", "The driver has not told its actuators yet.")
+            self._picture.show(None, "The driver has not told its actuators yet.")
             return
         calibration = snapshot.calibration if snapshot.calibration is not None and snapshot.calibration.id else None
         self._cells = cells(mirror, snapshot.actuator_state, calibration)
         session.chosen = min(session.chosen, len(self._cells))
         radius = 0.5e3 * mirror.working_aperture_diameter
-        self._picture.show(command_map(self._cells, session.chosen, radius))
-        self._scale.show(signal_scale(mirror.signal_min, mirror.signal_max, SCALE_COLOURS))
+        self._picture.show(command_map(self._cells, session.chosen, radius, mirror.signal_min, mirror.signal_max))
         cell, state = self._cells[session.chosen - 1], snapshot.actuator_state
         volts = f", {state.volts[session.chosen - 1]:.1f} V" if state is not None and len(state.volts) else ""
         limits = f"limits {mirror.signal_min:+.1f} to {mirror.signal_max:+.1f}"
-        self._words.show(f"{cell.words[0].upper()}{cell.words[1:]}{volts}; {limits}.")
+        self._text.show(f"{cell.text[0].upper()}{cell.text[1:]}{volts}; {limits}.")
         self._show_loop(snapshot, calibration)
 
     def _show_loop(self, snapshot: Snapshot, calibration: Any) -> None:
         session, mirror = self._session, snapshot.mirror_info
-        law = session.ros.following.law
+        law = session.ros.observer.law
         if calibration is None or not law.remembers:
-            fault = session.ros.following.fault if calibration is not None else ""
-            self._loop_words.show(f"The hysteresis in the calibration cannot be used: {fault}" if fault else "")
-            self._loop_picture.show("", "No hysteresis was identified: the plan “Memory” of a calibration does.")
+            fault = session.ros.observer.fault if calibration is not None else ""
+            self._loop_text.show(f"The hysteresis in the calibration cannot be used: {fault}" if fault else "")
+            self._loop_picture.show(None, "No hysteresis was identified: the plan “Hysteresis” of a calibration does.")
             return
-        standing = session.ros.following.now(snapshot.bench_time)
+        standing = session.ros.observer.now(snapshot.bench_time)
         signal, stands = self._cells[session.chosen - 1].signal, None
         if standing.effective is not None and signal is not None:
             stands = (signal, round(float(standing.effective[session.chosen - 1]), 4))
@@ -167,5 +159,5 @@ class ActuatorCards:
         loop = measured or modelled_loop(law, session.chosen, mirror.signal_min, mirror.signal_max)
         loop = dataclasses.replace(loop, stands=stands)
         doubt = f" Its place in the loop is a guess: {standing.doubt}." if standing.doubt else ""
-        self._loop_words.show(f"Hysteresis as identified: {loop.words}; the cross is where it stands.{doubt}")
+        self._loop_text.show(f"Hysteresis as identified: {loop.text}; the cross is where it stands.{doubt}")
         self._loop_picture.show(loop_chart(loop))

@@ -11,12 +11,12 @@ from nicegui import background_tasks, ui
 
 from dm_common.errors import Refusal
 from dm_tools.console import operations
+from dm_tools.console.charts.plots import residual_chart
 from dm_tools.console.console_node import Snapshot
-from dm_tools.console.drawing.charts import residual_chart
 from dm_tools.console.session import Session
-from dm_tools.console.status import why_not
-from dm_tools.console.view_models import NM, calibration_words
-from dm_tools.console.widgets.components import ActionButton, Line, Picture, card
+from dm_tools.console.status import reason_against
+from dm_tools.console.view_models import NM, calibration_text
+from dm_tools.console.widgets.components import ActionButton, Chart, Line, card
 
 
 class CalibrationCard:
@@ -27,12 +27,12 @@ class CalibrationCard:
         #: What the list of the store depends on; None = it must be asked for.
         self._listed: tuple[Any, ...] | None = None
         with card("Calibration"):
-            self._words = ui.html("", sanitize=False).classes("words figures")
+            self._text = ui.html("", sanitize=False).classes("text figures")
             self._shown = ""
             self._plan = ui.select(operations.PLANS, value=Calibrate.Goal.PLAN_HYSTERESIS, label="Plan").classes(
                 "w-full"
             )
-            self._maps = ui.number("Length: commands of the memory plan", min=0, step=10, format="%d")
+            self._maps = ui.number("Length: commands of the plan", min=0, step=10, format="%d")
             self._maps.classes("w-full").props('placeholder="as configured"')
             self._maps.bind_visibility_from(self._plan, "value", value=Calibrate.Goal.PLAN_HYSTERESIS)
             self._note = ui.input("Note, stored with it").classes("w-full")
@@ -40,9 +40,9 @@ class CalibrationCard:
                 self._start = ActionButton("Calibrate", self._begin)
                 self._estimate = ActionButton("How long?", self._begin_estimate, True)
                 self._cancel = ActionButton("Cancel calibration", session.cancel, True)
-            self._why = Line("why")
-            self._progress = Line("words figures", live=True)
-            self._residuals = Picture()
+            self._reason = Line("reason")
+            self._progress = Line("text figures", live=True)
+            self._residuals = Chart("run")
             self._choice = ui.select({}, label="In the store").classes("w-full")
             self._choice.on("popup-show", self._forget_list)
             self._load = ActionButton("Load", self._begin_load, True)
@@ -84,24 +84,23 @@ class CalibrationCard:
 
     def refresh(self, snapshot: Snapshot) -> None:
         session = self._session
-        why = why_not("calibrate", snapshot, session.running)
-        self._start.allow(why)
-        self._estimate.allow(why)
-        self._why.show(f"Not possible now: {why}" if why else "")
+        reason = reason_against("calibrate", snapshot, session.running)
+        self._start.allow(reason)
+        self._estimate.allow(reason)
+        self._reason.show(f"Not possible now: {reason}" if reason else "")
         running = session.calibrating
         self._cancel.allow("" if running else "No calibration is under way.")
         progress = session.shown_progress
-        step = f"Step {progress.step} of {progress.steps}: {progress.words}" if progress.steps else "The run begins."
+        step = f"Step {progress.step} of {progress.steps}: {progress.text}" if progress.steps else "The run begins."
         self._progress.show(step if running else "")
         residuals_nm = [NM * residual for residual in list(session.ros.watched["calibrate"].residuals)]
-        self._residuals.show(residual_chart(residuals_nm) if residuals_nm else "")
-        lines = "".join(f"<div>{escape(line)}</div>" for line in calibration_words(snapshot.calibration))
+        self._residuals.show(residual_chart(residuals_nm) if residuals_nm else None)
+        lines = "".join(f"<div>{escape(line)}</div>" for line in calibration_text(snapshot.calibration))
         if lines != self._shown:
             self._shown = lines
-            self._words.set_content(lines)
-        self._load.allow(
-            why_not("store", snapshot, session.running) or ("" if self._choice.value else "Choose a calibration first.")
-        )
+            self._text.set_content(lines)
+        unchosen = "" if self._choice.value else "Choose a calibration first."
+        self._load.allow(reason_against("store", snapshot, session.running) or unchosen)
         in_use = snapshot.calibration.id if snapshot.calibration is not None else ""
         # Also after runs that were not started here, and after the node was started again.
         key = (in_use, session.ros.watched["calibrate"].goals, "calibration" in snapshot.present)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from html import escape
 from typing import Any
 
 from nicegui import ui
 
+from dm_tools.console.charts.plots import Drawing
 
-def heading(words: str, level: int = 2) -> None:
+
+def heading(text: str, level: int = 2) -> None:
     """A heading that screen readers list."""
-    ui.html(words, tag=f"h{level}", sanitize=False)
+    ui.html(text, tag=f"h{level}", sanitize=False)
 
 
 @contextlib.contextmanager
@@ -32,15 +33,15 @@ class ActionButton:
     """A button that is disabled with its reason as a tooltip.
 
     Args:
-        words: on it.
+        text: on it.
         on_click: called without arguments.
         outline: for what is not the main thing to do.
     """
 
-    def __init__(self, words: str, on_click: Callable[[], Any], outline: bool = False) -> None:
+    def __init__(self, text: str, on_click: Callable[[], Any], outline: bool = False) -> None:
         self._reason: str | None = None
         with ui.element("span") as self._shell:
-            self._button = ui.button(words, on_click=lambda: on_click()).props("no-caps unelevated")
+            self._button = ui.button(text, on_click=lambda: on_click()).props("no-caps unelevated")
             if outline:
                 self._button.props("outline")
 
@@ -55,29 +56,55 @@ class ActionButton:
         self._shell.update()
 
 
-class Picture:
-    """A drawing that is replaced only when it changed; `words` stand there while there is none."""
+class Chart:
+    """A chart that is sent only when it changed; a text stands there while there is none.
 
-    def __init__(self) -> None:
-        self._shown = ""
-        self._html = ui.html("", sanitize=False).classes("w-full")
+    Args:
+        shape: class of the page's style that gives its height.
+        on_click: called with the value of the datum that was clicked.
+    """
 
-    def show(self, svg: str, words: str = "") -> None:
-        content = svg or (f'<div class="empty">{escape(words)}</div>' if words else "")
-        if content != self._shown:
-            self._shown = content
-            self._html.set_content(content)
+    def __init__(self, shape: str, on_click: Callable[[Any], None] | None = None) -> None:
+        self._shape, self._on_click = shape, on_click
+        self._shown: Drawing | None = None
+        self._chart: ui.echart | None = None  # made with the first drawing: it must have its size from the beginning
+        self._place = ui.element("div").classes("chart")
+        with self._place:
+            self._text = ui.label("").classes("empty")
+            self._text.set_visibility(False)
+
+    def show(self, drawing: Drawing | None, text: str = "") -> None:
+        """Show a drawing, or `text` when there is none."""
+        self._text.set_visibility(drawing is None and bool(text))
+        self._text.set_text(text)
+        if self._chart is not None:
+            self._chart.set_visibility(drawing is not None)
+        if drawing is not None and drawing != self._shown:
+            chart = self._chart = self._chart or self._new_chart()
+            chart.options.clear()
+            chart.options.update(drawing.options)
+            chart.props["aria-label"] = drawing.description
+            chart.update()
+        self._shown = drawing
+
+    def _new_chart(self) -> ui.echart:
+        with self._place:
+            chart = ui.echart({}, renderer="svg").classes(self._shape).props('role="img"')
+        if self._on_click is not None:
+            on_click = self._on_click
+            chart.on_point_click(lambda event: on_click(event.value))
+        return chart
 
 
 class Line:
     """A line of text that is sent only when it changed."""
 
-    def __init__(self, classes: str = "words", live: bool = False) -> None:
+    def __init__(self, classes: str = "text", live: bool = False) -> None:
         self.label = ui.label("").classes(classes)
         if live:
             self.label.props('role="status" aria-live="polite"')
 
-    def show(self, words: str) -> None:
-        if self.label.text != words:
-            self.label.set_text(words)
-        self.label.set_visibility(bool(words))
+    def show(self, text: str) -> None:
+        if self.label.text != text:
+            self.label.set_text(text)
+        self.label.set_visibility(bool(text))

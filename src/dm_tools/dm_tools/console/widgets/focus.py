@@ -12,7 +12,7 @@ from dm_common.errors import Refusal
 from dm_tools.console import operations
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
-from dm_tools.console.status import why_not
+from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import MODES, reachable
 from dm_tools.console.widgets.components import ActionButton, Line, card, labelled
 
@@ -33,7 +33,7 @@ class FocusCard:
         #: What a prediction depends on beside the wish.
         self._basis: tuple[object, ...] = ()
         with card("Focus"):
-            self._words = Line("words figures")
+            self._text = Line("text figures")
             self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
             labelled(self._slider, "Curvature in 1 per metre").props("label switch-label-side")
             with ui.element("div").classes("line"):
@@ -41,10 +41,10 @@ class FocusCard:
                 self._number.classes("w-36")
                 self._conic = ui.number("Conic constant", value=0.0, step=0.1, on_change=lambda: self._touch())
                 self._conic.classes("w-28")
-                self._power = Line("words figures")
+                self._power = Line("text figures")
             self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO, on_change=lambda: self._touch())
             labelled(self._mode.props("inline"), "Mode")
-            self._prediction = Line("words figures", live=True)
+            self._prediction = Line("text figures", live=True)
             with ui.element("div").classes("line"):
                 self._move = ActionButton("Move", self._start_move)
                 self._flatten = ActionButton(
@@ -54,7 +54,7 @@ class FocusCard:
                     "Degauss", lambda: session.begin("Degauss", lambda: operations.degauss(session)), True
                 )
                 self._converge = ActionButton("Converge", self._start_converge, True)
-            self._why = Line("why")
+            self._reason = Line("reason")
 
     def _slid(self) -> None:
         if not self._typing:
@@ -95,12 +95,12 @@ class FocusCard:
 
     def refresh(self, snapshot: Snapshot) -> None:
         session = self._session
-        why = why_not("focus", snapshot, session.running)
-        self._move.allow(why)
-        self._flatten.allow(why)
-        self._degauss.allow(why_not("move", snapshot, session.running))
-        self._converge.allow(why_not("converge", snapshot, session.running))
-        self._why.show(f"Not possible now: {why}" if why else "")
+        reason = reason_against("focus", snapshot, session.running)
+        self._move.allow(reason)
+        self._flatten.allow(reason)
+        self._degauss.allow(reason_against("move", snapshot, session.running))
+        self._converge.allow(reason_against("converge", snapshot, session.running))
+        self._reason.show(f"Not possible now: {reason}" if reason else "")
         self._take_range(snapshot)
         value = self._number.value
         self._power.show(f"= {2 * value:+.4f} dioptre" if value is not None else "")
@@ -109,7 +109,7 @@ class FocusCard:
             self._basis = basis
             self._touch()
         calm = time.monotonic() - self._changed_at > CALM_S
-        if not why and calm and not self._asked and not self._asking:
+        if not reason and calm and not self._asked and not self._asking:
             self._asked = self._asking = True
             background_tasks.create(self._predict())
 
@@ -123,14 +123,14 @@ class FocusCard:
     def _take_range(self, snapshot: Snapshot) -> None:
         found = reachable(snapshot.capabilities)
         if found is None:
-            self._words.show("Reachable range: not known without a calibration.")
+            self._text.show("Reachable range: not known without a calibration.")
             self._slider.set_enabled(False)
             return
         self._slider.set_enabled(True)
         capabilities = snapshot.capabilities
         conditioned = capabilities.error_bound_conditioned
         extra = f", conditioned {conditioned * 1e9:.1f} nm" if conditioned > 0 else ""
-        self._words.show(
+        self._text.show(
             f"Reachable {found[0]:+.4f} to {found[1]:+.4f} 1/m ({2 * found[0]:+.3f} to {2 * found[1]:+.3f} dioptre).\n"
             f"95 % bound on a coefficient: {capabilities.error_bound * 1e9:.1f} nm{extra}."
         )
@@ -143,9 +143,9 @@ class FocusCard:
         request = self._request()
         try:
             if request is not None:
-                words = await operations.predict(self._session, request)
+                text = await operations.predict(self._session, request)
                 self._prediction.label.classes(remove="refused")
-                self._prediction.show(words)
+                self._prediction.show(text)
         except Refusal as error:
             self._prediction.label.classes(add="refused")
             self._prediction.show(str(error))

@@ -1,4 +1,4 @@
-"""The top of the page, always in sight: state of the bench, what is missing, and everything that was refused."""
+"""The header of the page, always in sight: state of the bench, what is missing, and everything that was refused."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ class Header:
         self._session = session
         self._shown: tuple[object, ...] = ()
         self._badges_shown = ""
-        with ui.element("header").classes("top"):
+        with ui.element("header").classes("header"):
             with ui.element("div").classes("line"):
                 heading("Deformable mirror console", 1)
                 self._badges = ui.html("", sanitize=False).classes("state").props('role="status" aria-label="State"')
             with ui.element("div").classes("line") as self._line:
                 self._bar = ui.linear_progress(show_value=False).classes("grow").style("flex: 1; min-width: 120px")
                 self._bar.props('aria-label="Progress"')
-                self._words = Line("words figures")
+                self._text = Line("text figures")
                 self._cancel = ActionButton("Cancel", session.cancel, outline=True)
-            self._outcome = Line("words", live=True)
+            self._outcome = Line("text", live=True)
             self._failures = ui.element("div").classes("failures")
             self._failures.props('role="alert" aria-live="assertive" aria-label="Errors"')
 
     def refresh(self, snapshot: Snapshot) -> None:
         progress = self._session.shown_progress
-        shown = badges(snapshot, self._session.ros.following.now(snapshot.bench_time).doubt)
-        content = "".join(f'<span class="badge {badge.kind}">{escape(badge.words)}</span>' for badge in shown)
+        shown = badges(snapshot, self._session.ros.observer.now(snapshot.bench_time).doubt)
+        content = "".join(f'<span class="badge {badge.kind}">{escape(badge.text)}</span>' for badge in shown)
         if content != self._badges_shown:
             self._badges_shown = content
             self._badges.set_content(content)
@@ -48,7 +48,7 @@ class Header:
                 add="indeterminate" if not progress.steps else "", remove="" if not progress.steps else "indeterminate"
             )
         count = f" {progress.step}/{progress.steps}" if progress.steps else ""
-        self._words.show(f"{progress.title}{count}: {progress.words}" if running else "")
+        self._text.show(f"{progress.title}{count}: {progress.text}" if running else "")
         self._cancel.allow("" if progress.can_cancel else "This operation cannot be cancelled; it ends by itself.")
         self._outcome.show(self._session.outcome)
         lacking = missing(snapshot.present, snapshot.mirror_info is not None)

@@ -12,14 +12,14 @@ from dm_tools.console.status import diagnostic_rows, log_rows, shortened
 from dm_tools.console.widgets.components import card
 
 
-def _short(words: str) -> str:
+def _short(text: str) -> str:
     """HTML of a sentence with its paths shortened; the whole of it is the tooltip."""
-    short = shortened(words)
-    return escape(short) if short == words else f'<span title="{escape(words)}">{escape(short)}</span>'
+    short = shortened(text)
+    return escape(short) if short == text else f'<span title="{escape(text)}">{escape(short)}</span>'
 
 
-def _empty(words: str) -> str:
-    return f'<div class="empty">{escape(words)}</div>'
+def _empty(text: str) -> str:
+    return f'<div class="empty">{escape(text)}</div>'
 
 
 def _table(rows: list[tuple[str, ...]]) -> str:

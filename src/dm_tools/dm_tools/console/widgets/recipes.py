@@ -10,7 +10,7 @@ from nicegui import ui
 from dm_tools.console import operations
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
-from dm_tools.console.status import why_not
+from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import recipe_rows
 from dm_tools.console.widgets.components import ActionButton, Line, card
 
@@ -46,7 +46,7 @@ class RecipesCard:
         self._session = session
         self._shown = ""
         with card("Recipes"):
-            self._words = Line("words")
+            self._text = Line("text")
             self._table = ui.html("", sanitize=False).classes("scroll")
             self._table.props('tabindex="0" role="region" aria-label="Recipes of the calibration in use"')
             with ui.element("div").classes("line"):
@@ -55,7 +55,7 @@ class RecipesCard:
                 self._number = ui.number("Recipes", value=NUMBER, min=1, max=NUMBER_MAX, step=1, format="%d")
                 self._number.classes("w-20")
             self._build = ActionButton("Build recipes", self._begin)
-            self._why = Line("why")
+            self._reason = Line("reason")
 
     def _begin(self) -> None:
         session = self._session
@@ -68,14 +68,14 @@ class RecipesCard:
         session.begin("Recipes", work, lambda: session.ros.cancel("build_recipes"))
 
     def refresh(self, snapshot: Snapshot) -> None:
-        why = why_not("converge", snapshot, self._session.running)
-        self._build.allow(why)
-        self._why.show(f"Not possible now: {why}" if why else "")
+        reason = reason_against("converge", snapshot, self._session.running)
+        self._build.allow(reason)
+        self._reason.show(f"Not possible now: {reason}" if reason else "")
         rows = recipe_rows(snapshot.calibration)
         self._table.set_visibility(bool(rows))
         in_use = snapshot.calibration is not None and bool(snapshot.calibration.id)
         none = "This calibration holds none." if in_use else "No calibration is in use."
-        self._words.show(
+        self._text.show(
             "A recipe is a command that was corrected on the interferometer from the conditioned mirror; the mode "
             f"“Conditioned” uses them. {'' if rows else none}"
         )

@@ -9,15 +9,15 @@ from nicegui import ui
 
 from dm_common.messages import stamp_ns
 from dm_tools.console import operations
+from dm_tools.console.charts.heat_map import DIFFERENCE_COLOURS, SAG_COLOURS, heat_map
+from dm_tools.console.charts.plots import zernike_chart
 from dm_tools.console.console_node import Snapshot
-from dm_tools.console.drawing.charts import zernike_chart
-from dm_tools.console.drawing.heat_map import DIFFERENCE_COLOURS, SAG_COLOURS, heat_map
 from dm_tools.console.session import Session
-from dm_tools.console.status import why_not
+from dm_tools.console.status import reason_against
 from dm_tools.console.surface_view import SurfaceView
 from dm_tools.console.surfaces import Surface
 from dm_tools.console.view_models import bars
-from dm_tools.console.widgets.components import ActionButton, Line, Picture, card, labelled
+from dm_tools.console.widgets.components import ActionButton, Chart, Line, card, labelled
 
 #: Share of the pixels that the scale of a difference covers: a few stray ones must not flatten it.
 COVERED = 99.5
@@ -31,24 +31,24 @@ class SurfaceCard:
     def __init__(self, session: Session, view: SurfaceView) -> None:
         self._session, self._view = session, view
         self._shown = -1
-        self._panels: list[tuple[Picture, Line]] = []
+        self._panels: list[tuple[Chart, Line]] = []
         with card("Surface"):
             with ui.element("div").classes("line"):
                 self._measure = ActionButton(
                     "Measure", lambda: session.begin("Measure", lambda: operations.measure(session))
                 )
-                self._when = Line("words")
-            self._why = Line("why")
+                self._when = Line("text")
+            self._reason = Line("reason")
             with ui.element("div").classes("panels"):
                 for name in ("Measured", "Predicted now", "Measured − predicted"):
                     with ui.element("div").classes("panel"):
-                        ui.label(name).classes("words").style("font-weight: 600")
-                        self._panels.append((Picture(), Line("words figures")))
+                        ui.label(name).classes("text").style("font-weight: 600")
+                        self._panels.append((Chart("heat"), Line("text figures")))
 
     def refresh(self, snapshot: Snapshot) -> None:
-        why = why_not("measure", snapshot, self._session.running)
-        self._measure.allow(why)
-        self._why.show(f"Not possible now: {why}" if why else "")
+        reason = reason_against("measure", snapshot, self._session.running)
+        self._measure.allow(reason)
+        self._reason.show(f"Not possible now: {reason}" if reason else "")
         view = self._view
         view.update(snapshot)
         if view.version == self._shown:
@@ -56,23 +56,23 @@ class SurfaceCard:
         self._shown = view.version
         self._when.show(view.when)
         limit = max([s.extent for s in (view.measured, view.predicted) if s is not None], default=np.nan)
-        self._panel(0, view.measured, limit, SAG_COLOURS, "measured surface", view.why_no_map)
-        words = " ".join([f"A guess: {view.doubt}." if view.doubt else "", view.remark]).strip()
-        self._panel(1, view.predicted, limit, SAG_COLOURS, "predicted surface", view.why_no_prediction, words)
+        self._panel(0, view.measured, limit, SAG_COLOURS, "measured surface", view.no_map_reason)
+        text = " ".join([f"A guess: {view.doubt}." if view.doubt else "", view.remark]).strip()
+        self._panel(1, view.predicted, limit, SAG_COLOURS, "predicted surface", view.no_prediction_reason, text)
         gap = view.difference
         extent = float(np.nanpercentile(np.abs(gap.sag), COVERED)) if gap is not None else np.nan
-        self._panel(2, gap, extent, DIFFERENCE_COLOURS, "measured minus predicted", view.why_no_difference)
+        self._panel(2, gap, extent, DIFFERENCE_COLOURS, "measured minus predicted", view.no_difference_reason)
 
     def _panel(
-        self, place: int, surface: Surface | None, limit: float, colours: str, name: str, why: str, remark: str = ""
+        self, place: int, surface: Surface | None, limit: float, colours: str, name: str, reason: str, remark: str = ""
     ) -> None:
-        picture, words = self._panels[place]
+        picture, text = self._panels[place]
         if surface is None:
-            picture.show("", why)
-            words.show("")
+            picture.show(None, reason)
+            text.show("")
             return
         picture.show(heat_map(surface, limit, colours, name))
-        words.show(
+        text.show(
             f"Peak to valley {surface.peak_to_valley * 1e9:.1f} nm, rms {surface.rms * 1e9:.2f} nm, "
             f"piston and tilt removed. {remark}"
         )
@@ -87,8 +87,8 @@ class ZernikeCard:
         with card("Zernike coefficients"):
             self._kind = ui.radio(KINDS, value=True)
             labelled(self._kind.props("inline"), "What the bars show")
-            self._bars = Picture()
-            self._note = Line("words")
+            self._bars = Chart("bars")
+            self._note = Line("text")
 
     def refresh(self, snapshot: Snapshot) -> None:
         zernike, wanted = snapshot.zernike, bool(self._kind.value)
@@ -100,10 +100,10 @@ class ZernikeCard:
         predicted = self._view.predicted_zernike if of_this_map else None
         as_difference = wanted and predicted is not None
         found = bars(zernike, predicted, as_difference) if zernike is not None else []
-        self._bars.show(zernike_chart(found, KINDS[as_difference]) if found else "", "No map was measured yet.")
-        words = ["Terms beyond tilt with their 95 % intervals from the fit of the map."] if found else []
+        self._bars.show(zernike_chart(found, KINDS[as_difference]) if found else None, "No map was measured yet.")
+        text = ["Terms beyond tilt with their 95 % intervals from the fit of the map."] if found else []
         if found and predicted is not None and not as_difference:
-            words.append("The diamond is the prediction for the moment of the map.")
+            text.append("The diamond is the prediction for the moment of the map.")
         if found and wanted and not as_difference:
-            words.append(f"Shown as measured. {self._view.why_no_difference}")
-        self._note.show(" ".join(words))
+            text.append(f"Shown as measured. {self._view.no_difference_reason}")
+        self._note.show(" ".join(text))

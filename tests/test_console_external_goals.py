@@ -1,0 +1,99 @@
+"""Whose goal runs, from status and feedback in any order."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from dm_msgs.action import Calibrate
+
+from dm_tools.console.external_goals import ExternalGoals
+
+EXECUTING, SUCCEEDED = 2, 4
+
+
+class FakeNode:
+    """Hands out the callbacks that a node would call."""
+
+    def __init__(self) -> None:
+        self.callbacks: dict[str, Any] = {}
+        self.publishers = 1
+
+    def create_subscription(self, _kind: Any, topic: str, callback: Any, _qos: Any) -> None:
+        self.callbacks[topic] = callback
+
+    def create_client(self, _kind: Any, _name: str) -> Any:
+        return SimpleNamespace(call_async=lambda request: setattr(self, "asked", request))
+
+    def count_publishers(self, _topic: str) -> int:
+        return self.publishers
+
+
+class Goal:
+    """A goal with its messages."""
+
+    def __init__(self, node: FakeNode, number: int) -> None:
+        self.node, self.identity = node, SimpleNamespace(uuid=[number] * 16)
+
+    def tell(self, status: int) -> None:
+        entry = SimpleNamespace(goal_info=SimpleNamespace(goal_id=self.identity), status=status)
+        self.node.callbacks["calibrate/_action/status"](SimpleNamespace(status_list=[entry]))
+
+    def feed(self, step: int, residual: float) -> None:
+        feedback = SimpleNamespace(step=step, residual_rms=residual)
+        self.node.callbacks["calibrate/_action/feedback"](SimpleNamespace(goal_id=self.identity, feedback=feedback))
+
+
+def watched() -> tuple[ExternalGoals, FakeNode]:
+    node: Any = FakeNode()
+    return ExternalGoals(node, Calibrate, "calibrate"), node
+
+
+def test_a_goal_of_this_console_is_not_elsewhere() -> None:
+    watch, node = watched()
+    goal = Goal(node, 1)
+    watch.own(goal.identity)
+    goal.tell(EXECUTING)
+    goal.feed(1, 2e-9)
+    assert not watch.running
+    assert watch.residuals == [2e-9]
+
+
+def test_a_goal_of_somebody_else_is_seen_until_it_ends() -> None:
+    watch, node = watched()
+    goal = Goal(node, 2)
+    goal.feed(1, 2e-9)
+    assert watch.running
+    goal.tell(SUCCEEDED)
+    goal.feed(2, 3e-9)  # feedback that comes late
+    assert not watch.running
+
+
+def test_a_goal_whose_node_has_gone_has_ended() -> None:
+    watch, node = watched()
+    Goal(node, 3).tell(EXECUTING)
+    assert watch.running
+    node.publishers = 0
+    assert not watch.running
+
+
+def test_residuals_stay_until_the_next_run_tells_its_first() -> None:
+    watch, node = watched()
+    first, second = Goal(node, 4), Goal(node, 5)
+    first.feed(1, 2e-9)
+    first.feed(1, 2e-9)  # the same map
+    first.feed(2, 3e-9)
+    first.tell(SUCCEEDED)
+    second.tell(EXECUTING)
+    assert watch.residuals == [2e-9, 3e-9]
+    second.feed(1, 4e-9)
+    assert watch.residuals == [4e-9]
+
+
+def test_the_goal_that_runs_is_the_one_that_is_cancelled() -> None:
+    watch, node = watched()
+    watch.cancel()
+    assert not hasattr(node, "asked")
+    Goal(node, 6).tell(EXECUTING)
+    watch.cancel()
+    assert list(node.asked.goal_info.goal_id.uuid) == [6] * 16  # type: ignore[attr-defined]
