@@ -29,7 +29,7 @@ import documentation as told
 from dm_bringup.suite import load_config, own_domain, save_config
 from dm_client import DeformableMirrorClient
 from dm_tools.cli import app
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from dm_tools.documentation.parameters import TABLES
 from documentation import Block, blocks

@@ -28,7 +28,7 @@ from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_controller.planning.target import FocusTarget
 from dm_simulation.parameters import PARAMETERS
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from dm_tools.verify import map_of, surface_error
 from support import bench_figures, wait_until
 

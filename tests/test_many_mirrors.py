@@ -13,7 +13,7 @@ import pytest
 
 from dm_bringup.suite import save_config
 from dm_client import DeformableMirrorClient
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from dm_tools.verbs.up import configurations
 
 pytestmark = pytest.mark.processes

@@ -22,7 +22,7 @@ from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from dm_tools.verbs.up import shared_config
 from dm_tools.verify import map_of, surface_error
 from support import bench_figures

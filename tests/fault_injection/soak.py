@@ -40,7 +40,7 @@ from rclpy.signals import SignalHandlerOptions
 from dm_bringup.suite import Suite, stop_processes
 from dm_common.ros import qos
 from dm_common.ros.executor import make_executor
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from fault_injection.soak_result import NODES, SoakResult, Window
 from studies.benchmarks import stand_in_mirror
 

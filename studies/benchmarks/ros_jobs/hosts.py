@@ -16,7 +16,7 @@ from typing import Any
 
 from dm_bringup.nodes import MODULES
 from dm_bringup.suite import save_config, stop_processes
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from studies.benchmarks.timing import Effort
 from studies.network_namespaces import NotPermittedError, command_on, one_host, received_bytes, two_hosts
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from dm_bringup.suite import Suite, own_domain
 from dm_client import STARTING_S, DeformableMirrorClient
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from studies.benchmarks.timing import Effort
 
 #: Time for starts to be over, and time measured, s.

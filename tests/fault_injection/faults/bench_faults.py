@@ -21,7 +21,7 @@ from dm_msgs.srv import Measure
 
 from dm_bringup.suite import Suite
 from dm_client import STARTING_S, DeformableMirrorClient, DeformableMirrorError
-from dm_tools.demo.demo import bench_config
+from dm_tools.demo.demo_bench import bench_config
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import ACTUATORS, PATIENCE_S, RigError
 

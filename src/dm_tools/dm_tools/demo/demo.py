@@ -11,8 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.demo.demo_bench import bench_config
-from dm_tools.demo.demo_bench import free_ports as free_ports
+from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
 from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
 
 #: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
@@ -26,12 +25,6 @@ class Hysteresis(StrEnum):
     prandtl_ishlinskii = "prandtl_ishlinskii"
     preisach = "preisach"
     bouc_wen = "bouc_wen"
-
-
-def sample_map() -> Path | None:
-    """A real ZYGO map at hand beside the checkout, if there is one."""
-    folder = Path(os.environ.get("DM_ROOT", ".")).resolve().parent / "shared" / "samples"
-    return next(iter(sorted(folder.glob("*.dat"))), None)
 
 
 def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
@@ -132,7 +125,7 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
     )
 
 
-def remember(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str, Any]]]:
+def identify_hysteresis(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str, Any]]]:
     """Identify hysteresis and creep, degauss, sweep again; returns the result of the run and the rows."""
     from dm_msgs.action import Calibrate
 
@@ -143,8 +136,7 @@ def remember(client: Any, maps: int, settle: float) -> tuple[Any, list[dict[str,
     )
     result = run_calibration(client, goal)
     show_result(result)
-    if not client.wait(lambda: client.capabilities.calibration_id == result.id):
-        raise RuntimeError("the focus controller did not take the new calibration")
+    wait_for_calibration(client, result.id)
     client.degauss()
     return result, sweep(client, settle)
 
@@ -194,56 +186,41 @@ def demo(
         return
     from dm_msgs.action import Calibrate
 
-    from dm_bringup.suite import Suite, own_domain
-    from dm_client import STARTING_S, DeformableMirrorClient
+    from dm_bringup.suite import own_domain
+    from dm_client import DeformableMirrorClient
     from dm_tools.demo.figures import save_sweep_figure
     from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
 
     started = time.monotonic()
-    folder = out.resolve()
-    if folder.exists():
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
+    folder = new_folder(out)
     actual_creep = creep if creep is not None else (0.0 if hysteresis is Hysteresis.off else 0.01)
     config = bench_config(folder, hysteresis.value, actual_creep, seed, speed, config_file)
     name = config["pdm_driver"].get("mirror.name", "PDM30-37")
     figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": actual_creep, "seed": seed}
     with own_domain() as domain:
-        real = map_file if map_file is not None else sample_map()
-        if real is not None:
-            figures["real_map"] = ingest_real_map(real, folder, domain)
-        else:
-            console.print("no real ZYGO map at hand; give one with --map FILE")
+        if map_file is not None:
+            figures["real_map"] = ingest_real_map(map_file, folder, domain)
         console.print(
             f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
             f"seed {seed}; logs in {os.path.relpath(folder)}"
         )
-        with (
-            Suite(config, folder, domain) as suite,
-            DeformableMirrorClient(domain=domain, timeout_s=STARTING_S) as client,
-        ):
-            try:
-                client.wait_until_active(20.0)
-                begun = time.monotonic()
-                result = run_calibration(client, Calibrate.Goal(activate=True, note="demo"))
-                wall_time = time.monotonic() - begun
-                show_result(result)
-                if not client.wait(lambda: client.capabilities.calibration_id == result.id):
-                    raise RuntimeError("the focus controller did not take the new calibration")
-                console.print(f"reachable: {client.capabilities.message}")
-                mirror = client.mirror_info
-                fitting_limit = best_possible(client.latest("calibration"), mirror)
-                settle = float(config["calibration"]["settle_time"])
-                rows, without_hysteresis = sweep(client, settle), []
-                if hysteresis_maps and (hysteresis is not Hysteresis.off or actual_creep):
-                    show_sweep(rows, fitting_limit, "influence function alone")
-                    without_hysteresis = rows
-                    remembering, rows = remember(client, hysteresis_maps, settle)
-                    figures["hysteresis"] = figures_of(remembering)
-                    figures["focus_without_hysteresis"] = rows_for_json(without_hysteresis)
-            except Exception:
-                suite.check()  # a node that died explains more than the request that failed
-                raise
+        with running_bench(config, folder, domain, DeformableMirrorClient) as client:
+            begun = time.monotonic()
+            result = run_calibration(client, Calibrate.Goal(activate=True, note="demo"))
+            wall_time = time.monotonic() - begun
+            show_result(result)
+            wait_for_calibration(client, result.id)
+            console.print(f"reachable: {client.capabilities.message}")
+            mirror = client.mirror_info
+            fitting_limit = best_possible(client.latest("calibration"), mirror)
+            settle = float(config["calibration"]["settle_time"])
+            rows, without_hysteresis = sweep(client, settle), []
+            if hysteresis_maps and (hysteresis is not Hysteresis.off or actual_creep):
+                show_sweep(rows, fitting_limit, "influence function alone")
+                without_hysteresis = rows
+                identified, rows = identify_hysteresis(client, hysteresis_maps, settle)
+                figures["hysteresis"] = figures_of(identified)
+                figures["focus_without_hysteresis"] = rows_for_json(without_hysteresis)
     show_sweep(
         rows, fitting_limit, "hysteresis and creep inverted" if without_hysteresis else "influence function alone"
     )

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import shutil
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +83,37 @@ def bench_config(
         for name in config:
             config[name]["use_sim_time"] = name != "virtual_bench"
     return config
+
+
+def new_folder(path: Path) -> Path:
+    """An empty folder; what was there before is gone."""
+    folder = path.resolve()
+    if folder.exists():
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+    return folder
+
+
+@contextlib.contextmanager
+def running_bench(config: dict[str, dict[str, Any]], logs: Path, domain: int, client_class: Any) -> Iterator[Any]:
+    """The nodes of a configuration and a client of theirs, once the driver accepts commands."""
+    from dm_bringup.suite import Suite
+    from dm_client import STARTING_S
+
+    with Suite(config, logs, domain) as suite, client_class(domain=domain, timeout_s=STARTING_S) as client:
+        try:
+            client.wait_until_active(20.0)
+            yield client
+        except Exception:
+            suite.check()  # a node that died explains more than the request that failed
+            raise
+
+
+def wait_for_calibration(client: Any, identifier: str) -> None:
+    """Wait until the focus controller uses a calibration.
+
+    Raises:
+        RuntimeError: it does not.
+    """
+    if not client.wait(lambda: client.capabilities.calibration_id == identifier):
+        raise RuntimeError("the focus controller did not take the new calibration")

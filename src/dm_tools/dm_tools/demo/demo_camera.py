@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
 from dm_tools.output import console, progress_bar, write_json
 
 if TYPE_CHECKING:  # both are slow to import, and `dm --help` needs neither
@@ -59,8 +60,6 @@ class Focused:
 
 def camera_config(folder: Path, law: str, creep: float, seed: int) -> dict[str, dict[str, Any]]:
     """The bench in real time, with the camera and the node `autofocus`; the calibration is the newest in `folder`."""
-    from dm_tools.demo.demo import bench_config
-
     config = bench_config(folder, law, creep, seed, speed=0.0)
     config["virtual_bench"] |= {
         "camera.rate": RATE,
@@ -183,61 +182,42 @@ def demo_camera(
     from dm_msgs.action import Calibrate
 
     from dm_autofocus import CameraFocusClient
-    from dm_bringup.suite import Suite, own_domain
-    from dm_client import STARTING_S, DeformableMirrorClient
-    from dm_tools.demo.demo import bench_config
+    from dm_bringup.suite import own_domain
+    from dm_client import DeformableMirrorClient
     from dm_tools.demo.pictures import save_animation, save_contact_sheet
     from dm_tools.verbs.calibrate import figures_of as calibration_figures
     from dm_tools.verbs.calibrate import run_calibration, show_result
 
     started = time.monotonic()
-    folder = out.resolve()
-    if folder.exists():
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
+    folder = new_folder(out)
     law = hysteresis.value
     actual_creep = creep if creep is not None else (0.0 if law == "off" else 0.01)
     console.print(f"virtual bench with a camera: PDM30-37, hysteresis {law}, creep {actual_creep:.0%}, seed {seed}")
     with own_domain() as domain:
         config = bench_config(folder, law, actual_creep, seed, speed)
         config["virtual_bench"]["interferometer.pixels"] = PIXELS
-        with (
-            Suite(config, folder / "calibration", domain) as suite,
-            DeformableMirrorClient(domain=domain, timeout_s=STARTING_S) as client,
-        ):
-            try:
-                client.wait_until_active(20.0)
-                goal = Calibrate.Goal(
-                    plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=MAPS, activate=True, note="camera"
-                )
-                calibrated = run_calibration(client, goal)
-            except Exception:
-                suite.check()  # a node that died explains more than the request that failed
-                raise
+        with running_bench(config, folder / "calibration", domain, DeformableMirrorClient) as client:
+            goal = Calibrate.Goal(
+                plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=MAPS, activate=True, note="camera"
+            )
+            calibrated = run_calibration(client, goal)
         show_result(calibrated)
     shutil.rmtree(folder / "maps")
     # A domain of its own: the first suite's time ran ahead, and nothing of it must be taken for news.
     with own_domain() as domain:
         config = camera_config(folder, law, actual_creep, seed)
-        with Suite(config, folder / "camera", domain) as suite, CameraFocusClient(domain=domain) as camera:
-            try:
-                camera.wait_until_active(20.0)
-                if not camera.wait(lambda: camera.capabilities.calibration_id == calibrated.id):
-                    raise RuntimeError("the focus controller did not take the new calibration")
-                camera.degauss()  # from here on the controller knows the actuators' history
-                recorder = Recorder(camera)
-                reach = camera.focus_range()
-                console.print(f"the camera focuses {reach.message}")
-                image_now(camera, recorder)
-                found = [
-                    Focused(distance, region)
-                    for distance, region in zip(DISTANCES, regions(len(DISTANCES)), strict=True)
-                ]
-                for item in found:
-                    focus_on(camera, recorder, item)
-            except Exception:
-                suite.check()
-                raise
+        with running_bench(config, folder / "camera", domain, CameraFocusClient) as camera:
+            wait_for_calibration(camera, calibrated.id)
+            camera.degauss()  # from here on the controller knows the actuators' history
+            recorder = Recorder(camera)
+            reach = camera.focus_range()
+            console.print(f"the camera focuses {reach.message}")
+            image_now(camera, recorder)
+            found = [
+                Focused(distance, region) for distance, region in zip(DISTANCES, regions(len(DISTANCES)), strict=True)
+            ]
+            for item in found:
+                focus_on(camera, recorder, item)
     show(found, reach.curvature_tolerance)
     title = f"autofocus through a simulated PDM30-37, hysteresis: {law}"
     with console.status("writing the animation"):

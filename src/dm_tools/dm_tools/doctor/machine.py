@@ -193,10 +193,10 @@ def clock() -> Finding | None:
     program = shutil.which("timedatectl")
     if program is None:
         return None
-    told = subprocess.run(
+    answer = subprocess.run(
         [program, "show", "--property=NTPSynchronized", "--value"], capture_output=True, text=True, check=False
     )
-    if told.stdout.strip() == "no":
+    if answer.stdout.strip() == "no":
         return Finding(
             "the system clock is not synchronised",
             "timedatectl set-ntp true; it matters when nodes or the instrument run on other machines",

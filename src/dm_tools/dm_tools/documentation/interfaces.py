@@ -48,12 +48,11 @@ class Offer:
     qos: str = ""
 
 
-def qos_words(profile: QoSProfile) -> str:
+def qos_text(profile: QoSProfile) -> str:
     """A quality of service in words."""
     reliable = profile.reliability == ReliabilityPolicy.RELIABLE
     latched = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    words = ["reliable" if reliable else "best effort", *(["latched"] if latched else []), f"depth {profile.depth}"]
-    return ", ".join(words)
+    return f"{'reliable' if reliable else 'best effort'}, {'latched, ' if latched else ''}depth {profile.depth}"
 
 
 def type_name(cls: Any) -> str:
@@ -72,11 +71,11 @@ def offers_of(node: Any) -> list[Offer]:
         return name if name in ("/clock", "/diagnostics") else name.removeprefix("/")
 
     found = [
-        Offer("publishes", short(item.topic_name), type_name(item.msg_type), qos_words(item.qos_profile))
+        Offer("publishes", short(item.topic_name), type_name(item.msg_type), qos_text(item.qos_profile))
         for item in node.publishers
     ]
     found += [
-        Offer("subscribes", short(item.topic_name), type_name(item.msg_type), qos_words(item.qos_profile))
+        Offer("subscribes", short(item.topic_name), type_name(item.msg_type), qos_text(item.qos_profile))
         for item in node.subscriptions
     ]
     found += [Offer("service", short(item.srv_name), type_name(item.srv_type)) for item in node.services]
@@ -109,7 +108,7 @@ def nodes_and_offers() -> dict[str, list[Offer]]:
 
     from dm_bringup.nodes import NODES
     from dm_bringup.suite import own_domain, save_config
-    from dm_tools.demo.demo import bench_config
+    from dm_tools.demo.demo_bench import bench_config
 
     result: dict[str, list[Offer]] = {}
     with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import rclpy
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 from dm_tools.recording.bag import BagReader, Topic
@@ -87,19 +86,11 @@ def _offer(topic: Topic) -> QoSProfile:
     """The quality of service that the recorded publishers had in common."""
 
     def all_are(key: str, value: str) -> bool:
-        return bool(topic.qos) and all(_word(profile, key) == value for profile in topic.qos)
+        return bool(topic.qos) and all(profile.get(key) == value for profile in topic.qos)
 
+    loose, latched = all_are("reliability", "best_effort"), all_are("durability", "transient_local")
     return QoSProfile(
         depth=DEPTH,
-        history=HistoryPolicy.KEEP_LAST,
-        reliability=ReliabilityPolicy.BEST_EFFORT
-        if all_are("reliability", "best_effort")
-        else ReliabilityPolicy.RELIABLE,
-        durability=(
-            DurabilityPolicy.TRANSIENT_LOCAL if all_are("durability", "transient_local") else DurabilityPolicy.VOLATILE
-        ),
+        reliability=ReliabilityPolicy.BEST_EFFORT if loose else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
-
-
-def _word(profile: Any, key: str) -> str:
-    return str(profile.get(key, ""))

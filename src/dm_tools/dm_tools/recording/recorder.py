@@ -74,8 +74,8 @@ class Recorder:
         self._subscribed: set[str] = set()
         self._parameters: dict[str, dict[str, Any]] = {}
         self._clients: dict[str, AsyncParameterClient] = {}
-        self._look()
-        self._node.create_timer(DISCOVERY_PERIOD_S, self._look)
+        self._discover()
+        self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
         # The events executor cannot hand over messages as they came (it fails on raw subscriptions).
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -138,7 +138,7 @@ class Recorder:
         except Exception as error:  # or the recording would go on without a word and without messages
             self._failure = error
 
-    def _look(self) -> None:
+    def _discover(self) -> None:
         """Subscribe to topics that are new."""
         for name, types in self._node.get_topic_names_and_types():
             if name not in self._subscribed and self._records(name):

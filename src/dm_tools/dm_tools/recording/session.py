@@ -166,15 +166,15 @@ def _decode(message: Message) -> Any:
     return deserialize_message(message.data, message_class(message.topic.type_name))
 
 
-def _runs(feedback: Iterable[tuple[int, Any]]) -> list[_Run]:
+def _runs(messages: Iterable[tuple[int, Any]]) -> list[_Run]:
     """Goals in the order they began."""
     runs: dict[bytes, _Run] = {}
-    for time, message in feedback:
-        told = message.feedback
+    for time, message in messages:
+        feedback = message.feedback
         run = runs.setdefault(bytes(message.goal_id.uuid), _Run(begun=time))
-        run.ended, run.steps = time, told.steps
-        if told.step < told.steps and told.phase not in (told.PHASE_FIT, told.PHASE_STORE):
-            run.labels[told.step] = told.label
+        run.ended, run.steps = time, feedback.steps
+        if feedback.step < feedback.steps and feedback.phase not in (feedback.PHASE_FIT, feedback.PHASE_STORE):
+            run.labels[feedback.step] = feedback.label
     return list(runs.values())
 
 

@@ -41,9 +41,9 @@ def check_keystore(folder: Path, profile: Profile) -> list[str]:
 def keys_missing(folder: Path, profile: Profile) -> list[str]:
     """The enclaves that have no key and permissions yet."""
     paths = [profile.path(enclave) for enclave in profile.enclaves()]
-    parts = ("key.pem", "cert.pem", "permissions.p7s", "governance.p7s")
+    files = ("key.pem", "cert.pem", "permissions.p7s", "governance.p7s")
     return [
-        path for path in paths if not all((folder / "enclaves" / path.lstrip("/") / part).exists() for part in parts)
+        path for path in paths if not all((folder / "enclaves" / path.lstrip("/") / name).exists() for name in files)
     ]
 
 
@@ -54,9 +54,9 @@ def _compare_text(path: Path, wanted: str) -> list[str]:
     more, less = sorted(old - new), sorted(new - old)
     if path.read_text(errors="replace") == wanted:
         return []
-    words = [f"more: {' '.join(more[:3])}"] if more else []
-    words += [f"missing: {' '.join(less[:3])}"] if less else []
-    return [f"{path}: differs from the profile; {'; '.join(words) or 'in its order'}"]
+    text = [f"more: {' '.join(more[:3])}"] if more else []
+    text += [f"missing: {' '.join(less[:3])}"] if less else []
+    return [f"{path}: differs from the profile; {'; '.join(text) or 'in its order'}"]
 
 
 def _check_permissions(path: Path, profile: Profile, enclave: str) -> list[str]:
