@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import SURFACE, MapSet
@@ -87,10 +88,13 @@ class Samples:
     def hysteresis(self) -> HysteresisFit:
         """The hysteresis and creep of the actuators, identified from the maps of the calibration.
 
+        One law for all actuators: the sample surfaces turn single actuators too rarely for laws of their own.
+
         Raises:
             ExcitationError: the maps do not show them.
         """
-        return fit_hysteresis(self.calibration.maps)
+        shared = [candidate for candidate in CANDIDATES if not candidate.own]
+        return fit_hysteresis(self.calibration.maps, candidates=shared)
 
     @cached_property
     def effective_maps(self) -> MapSet:
