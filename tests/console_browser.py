@@ -159,7 +159,10 @@ class Browser:
         )
         clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
         self.driver.execute_script("scrollTo(0, 0)")
-        shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})
+        # The first one lays the page out anew, and the charts follow only after it.
+        for _again in range(2):
+            shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})
+            time.sleep(0.5)
         path.write_bytes(base64.b64decode(shot["data"]))
 
 
