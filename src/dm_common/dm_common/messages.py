@@ -157,6 +157,8 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         message.creep_rate,
         creep_time,
         spectrum.reshape(-1, creep_time.size) if spectrum.size > creep_time.size else spectrum,
+        1e-9 * stamp_ns(message.crept_at),
+        np.array(message.crept, dtype=np.float64),
     )
 
 

@@ -73,7 +73,7 @@ def fit_hysteresis(
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
     return HysteresisFit(
         name=found.fit.candidate.name,
-        law=found.fit.law,
+        law=_followed(maps, found.fit.law)[1],
         zernike_sigma=sigma,
         held_out_max_zernike=float(np.quantile(np.abs(draws).max(axis=1), 0.95)),
         unknown_sigma=unknown_history_sigma(found.fit.law),
@@ -113,6 +113,15 @@ def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
     Raises:
         ValueError: time stamps that run backwards.
     """
+    return _followed(maps, law)[0]
+
+
+def _followed(maps: MapSet, law: HysteresisModel) -> tuple[MapSet, HysteresisModel]:
+    """Maps with effective signals, and the law with what the actuators had crept to before the last part of the run.
+
+    Raises:
+        ValueError: time stamps that run backwards.
+    """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
     moved, parts = maps.moved_s(), parts_of(maps.segment)
     start = dict(zip(range(len(parts)), [-BEFORE_FIRST_MAP_S, *starts_of(parts, time, moved)], strict=True))
@@ -122,12 +131,14 @@ def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
         return follow(law, state, maps.applied[part], time[part], moved[part])[0]
 
     effective = in_parts(parts, followed)
-    if law.creep_rate:
-        fading = np.zeros((len(maps), len(parts)))
-        for number, part in enumerate(parts):
-            fading[part, number] = _fading(law, time[part] - start[number])
-        effective += fading @ _crept_before(maps, effective, fading)
-    return replace(maps, applied=effective)
+    if not law.creep_rate:
+        return replace(maps, applied=effective), law
+    fading = np.zeros((len(maps), len(parts)))
+    for number, part in enumerate(parts):
+        fading[part, number] = _fading(law, time[part] - start[number])
+    crept = _crept_before(maps, effective, fading)
+    began = 1e-9 * int(maps.stamp_ns[0]) + start[len(parts) - 1]
+    return replace(maps, applied=effective + fading @ crept), replace(law, crept_at=began, crept=crept[-1])
 
 
 def _fading(law: HysteresisModel, elapsed: Floats) -> Floats:

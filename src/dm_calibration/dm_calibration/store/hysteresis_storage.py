@@ -41,8 +41,9 @@ def hysteresis_from(columns: Mapping[str, Column]) -> HysteresisFit | None:
         return None
     values: dict[str, Any] = {}
     for field in fields(HysteresisModel):
-        if f"memory/law/{field.name}" not in columns and field.default_factory is not MISSING:
-            continue  # a file older than this field
+        older = field.default is not MISSING or field.default_factory is not MISSING
+        if older and f"memory/law/{field.name}" not in columns:
+            continue  # a file from before there was this field
         value = np.asarray(columns[f"memory/law/{field.name}"], dtype=np.float64)
         values[field.name] = value if value.ndim else float(value)
     held_out, unknown, maps = np.asarray(columns["memory/figures"], dtype=np.float64)

@@ -67,6 +67,8 @@ class HysteresisModel:
         creep_rate: growth of a step per decade of time, in the mean over actuators and elements.
         creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
         creep_spectrum: (J,) or (N, J) weight of each creep element relative to an even spectrum; empty = even.
+        crept_at, crept: s, and (N,) effective signals that the actuators had crept to by then, just before the maps of
+            the calibration: its figure is relative to that. Empty = not told.
 
     Raises:
         ValueError: shapes, numbers that are not finite, or a law that cannot be inverted, naming the field.
@@ -79,6 +81,8 @@ class HysteresisModel:
     creep_rate: float
     creep_time: Floats
     creep_spectrum: Floats = field(default_factory=lambda: np.zeros(0))
+    crept_at: float = 0.0
+    crept: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if self.play_radius.ndim != 1 or not self.play_radius.size:
@@ -160,6 +164,18 @@ class HysteresisModel:
         waited = self.advance(state, time)
         fresh = self.demagnetised(len(state.signals), waited.time, middle)
         return replace(fresh, crept=waited.crept)
+
+    def rested(self, signals: Floats, time: float, middle: float = 0.0) -> HysteresisState:
+        """The state at `time` (s) of a mirror that stands at `signals` (N,), if it has stood there since a calibration.
+
+        Elements slower than that is ago hold what they held then.
+        """
+        moved = self.move(self.demagnetised(len(signals), time, middle), signals, time)
+        settled = np.repeat(moved.position[:, None], len(self.creep_time), axis=1)
+        if self.crept.shape == signals.shape and time >= self.crept_at:
+            left = np.exp(-(time - self.crept_at) / self.creep_time)
+            settled += (self.crept[:, None] - settled) * left
+        return replace(moved, crept=settled)
 
     def advance(self, state: HysteresisState, time: float) -> HysteresisState:
         """The same signals at a later time (s). A time before the state's is taken as the state's."""
@@ -252,7 +268,12 @@ class HysteresisModel:
         if factors.shape == (1,):
             factors = factors[0]
         duhem = factors * self.duhem_weight if self.duhem_slope.size else self.duhem_weight
-        return replace(self, play_weight=factors[..., None, None] * self.play_weight, duhem_weight=duhem)
+        return replace(
+            self,
+            play_weight=factors[..., None, None] * self.play_weight,
+            duhem_weight=duhem,
+            crept=factors * self.crept if self.crept.size else self.crept,
+        )
 
 
 def follow(
