@@ -85,6 +85,23 @@ class HysteresisTracker:
         """
         if not np.isfinite(report.signals).all():
             raise ValueError("applied: holds values that are not finite")
+        last = self._last
+        at_calibration = last is not None and last.time < self.law.crept_at <= report.time
+        degaussed = last is not None and report.degausses > last.degausses
+        if at_calibration and not degaussed:
+            self._creep_as_calibrated()
+        self._take(report)
+        if at_calibration and degaussed:
+            self._creep_as_calibrated()
+
+    def _creep_as_calibrated(self) -> None:
+        """What the creep elements had followed, as the calibration found: its figure is relative to that."""
+        state = self.state
+        if state is not None and self.law.crept.shape == state.signals.shape:
+            state = self.law.advance(state, max(state.time, self.law.crept_at))
+            self.state = replace(state, crept=np.repeat(self.law.crept[:, None], state.crept.shape[1], axis=1))
+
+    def _take(self, report: Applied) -> None:
         last, self._last = self._last, report
         if self.state is not None and len(report.signals) != len(self.state.signals):
             raise ValueError(f"applied: {len(report.signals)} signals, before there were {len(self.state.signals)}")
@@ -133,10 +150,7 @@ class HysteresisTracker:
         self.state = self.law.move(self.state, report.signals, report.time)
 
     def _guess(self, report: Applied, reason: str) -> None:
-        fresh = self.law.demagnetised(len(report.signals), report.time, self._middle)
-        moved = self.law.move(fresh, report.signals, report.time)
-        settled = np.repeat(moved.position[:, None], moved.crept.shape[1], axis=1)
-        self.state, self.unknown = replace(moved, crept=settled), reason
+        self.state, self.unknown = self.law.rested(report.signals, report.time, self._middle), reason
 
     def _guess_keeping_creep(self, report: Applied, reason: str) -> None:
         """Where the mirror stands is known, on which branch is not."""

@@ -118,6 +118,7 @@ class CalibratedMirror:
 
     Attributes:
         matrix: (K - 3 + P, N), `rows` of the influence function.
+        ridge: weight of the squared signals beside the squared rows.
         sag_root: (N, N), m: its product with signals is as long as their rms sag, piston and tilt removed.
     """
 
@@ -132,7 +133,8 @@ class CalibratedMirror:
         reduced = self._reduce(model.influence_sag, self._tilt_free)
         self.sag_root: NDArray[np.float64] = np.linalg.qr(reduced)[1]
         response = np.linalg.norm(reduced, axis=0)
-        self._programme = BoundedProgramme(self.matrix, limits, ridge=(RIDGE_SHARE * float(np.median(response))) ** 2)
+        self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
+        self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._closed_form = ClosedForm(
             model.aperture_radius,
             (model.sample_x, model.sample_y),
@@ -215,6 +217,14 @@ class CalibratedMirror:
             max_zernike_upper=largest + model.held_out_max_zernike,
             saturated=self.limits.at_limit(signals),
         )
+
+    def wanted_rows(self, target: FocusTarget) -> NDArray[np.float64]:
+        """(K - 3 + P,) `rows` of `target` less those at zero signals.
+
+        Raises:
+            TargetError: no such surface exists over the aperture.
+        """
+        return self.rows(*self._wanted(target))
 
     def _wanted(self, target: FocusTarget) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Coefficients (K,) and sag (P,) of `target` less those at zero signals, m."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
+from dm_controller.planning.constrained import ConstrainedInverse, within
 from dm_controller.planning.fast_path import PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
@@ -33,7 +34,7 @@ DRAWS = 4000
 #: age is extrapolated.
 YOUNGEST_MAP_S = 1.0
 #: Uncertainty of that extrapolation.
-YOUNG_SHARE = 0.1
+YOUNG_SHARE = 0.2
 #: Effective signals that a limit denies count from here on, normalised.
 MISSED_MAX = 1e-6
 #: A message's constants are properties of its class, which take longer to look up.
@@ -98,6 +99,11 @@ class Planner:
         self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[PISTON_TILT:])
         self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
         self._prepared: PreparedInverse | None = None
+        self._limits = within(mirror.limits)
+
+    @cached_property
+    def _constrained(self) -> ConstrainedInverse:
+        return ConstrainedInverse(self.law, self._limits, self.mirror.matrix, self.mirror.ridge)
 
     def prepare(self, state: HysteresisState) -> None:
         """Work out now what plans from exactly this `state`, of a mirror at rest, will need."""
@@ -149,7 +155,7 @@ class Planner:
             state, known = law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
         # A move counts from its last write; older creep goes on during the way.
         begun, arrival = state, time + travel
-        signals, missed = self._inverted(begun, arrival, aim, ahead)
+        signals, missed = self._inverted(begun, arrival, aim, ahead, target if effective is None else None)
         reached = aim
         if missed is not None and np.abs(missed).max() > MISSED_MAX:
             reached = aim - missed
@@ -164,29 +170,31 @@ class Planner:
             step = (aim if missed is None else aim - missed) - law.effective(law.advance(begun, arrival))
             return self._bounded(plan, signals, known, self._young_creep(step, ahead), error)
 
-        return Move(target, signals, aim, largest, known, travel + ahead, predict)
+        return Move(target, signals, reached if effective is None else aim, largest, known, travel + ahead, predict)
 
     def _inverted(
-        self, state: HysteresisState, arrival: float, aim: Floats, ahead: float
+        self, state: HysteresisState, arrival: float, aim: Floats, ahead: float, target: FocusTarget | None
     ) -> tuple[Floats, Floats | None]:
-        """Signals (N,) for the effective signals `aim`, and what limits make them miss; None = nothing."""
-        limits, ready = self.mirror.limits, self._prepared
+        """Signals (N,) for the effective signals `aim`, and what limits make them miss; None = nothing.
+
+        Where the limits bind the signals are the nearest to `target`, or to the shape of `aim` without one.
+        """
+        limits, ready = self._limits, self._prepared
         if ready is not None and ready.state is state:
             found = ready.invert(arrival, aim, ahead)
             if found is not None and limits.allow_neighbours(found):
                 return found, None
         at = self.law.advance(state, arrival)
         inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
-        if limits.allow_neighbours(inverted.signals):
-            return inverted.signals, inverted.missed
-        return self._within_neighbours(inverted.signals, at, aim)
+        if np.abs(inverted.missed).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
+            return inverted.signals, None
+        wanted = self.mirror.matrix @ aim if target is None else self.mirror.wanted_rows(target)
+        nearest = self._constrained.solve(at, wanted, ahead, inverted.signals)
+        return nearest.signals, aim - nearest.effective
 
     def hold(self, state: HysteresisState, time: float, effective: Floats, ahead: float = 0.0) -> Floats:
         """(N,) signals, applied at `time` (s), that keep `effective` (N,) and are right `ahead` s later."""
-        limits = self.mirror.limits
-        at = self.law.advance(state, time)
-        signals = invert(self.law, at, effective, limits.low, limits.high, ahead).signals
-        return signals if limits.allow_neighbours(signals) else state.signals
+        return self._inverted(state, time, effective, ahead, None)[0]
 
     def drift(self, state: HysteresisState, time: float, effective: Floats) -> float:
         """Largest coefficient error (m) at `time` (s) of a mirror that should stand at `effective` (N,)."""
@@ -227,19 +235,6 @@ class Planner:
             max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, young[0])),
             saturated=self.mirror.limits.at_limit(signals),
         )
-
-    def _within_neighbours(self, signals: Floats, at: HysteresisState, aim: Floats) -> tuple[Floats, Floats]:
-        """The part of the way from the present signals that keeps neighbours within their limit, and what it misses."""
-        limits = self.mirror.limits
-        a, b = limits.pairs.T
-        now, then = at.signals[a] - at.signals[b], signals[a] - signals[b]
-        room = limits.neighbour_difference - np.sign(then) * now
-        share = np.where(
-            np.abs(then) > limits.neighbour_difference, room / np.maximum(np.sign(then) * (then - now), 1e-12), 1.0
-        )
-        moved = at.signals + float(np.clip(share.min(), 0.0, 1.0)) * (signals - at.signals)
-        reached = self.law.position_at(at, moved) + self.law.creep(at)
-        return moved, aim - reached
 
     def _unknown_history(self) -> tuple[float, float]:
         """95 % quantile of the largest coefficient error, and rms sag error, when the history is not known; m."""
