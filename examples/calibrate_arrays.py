@@ -9,7 +9,7 @@ import numpy as np
 
 from dm_calibration import calibrate
 from dm_calibration.acquisition.ingest import IngestSettings
-from dm_common.hysteresis.model import follow
+from dm_calibration.hysteresis.features import follow
 from dm_common.mirror import Mirror
 
 run = np.load(sys.argv[1])

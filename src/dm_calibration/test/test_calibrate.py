@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from dm_calibration import calibrate
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.hysteresis.excitation import excitation
+from dm_calibration.hysteresis.features import follow
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import MeasurementError
-from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, follow
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints
 from linear_mirror import RADIUS, LinearMirror, make_mirror

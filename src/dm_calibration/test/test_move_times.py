@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dm_calibration.hysteresis.features import crept, play_features
+from dm_calibration.hysteresis.features import crept, follow, play_features
 from dm_calibration.influence.maps import MapSet
-from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, certain_reach, follow
+from dm_common.hysteresis.inverse import certain_reach
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
 
@@ -63,3 +64,20 @@ def test_what_is_certainly_within_reach_leaves_room_for_hysteresis_and_creep() -
     for _ in range(20):
         state = LAW.move(state, rng.uniform(-1.0, 1.0, 50), state.time + 600.0)
     assert LAW.effective(LAW.move(state, np.ones(50), state.time)).min() > high - 0.01
+
+
+def test_follow_is_step_by_step() -> None:
+    law, rng = LAW, np.random.default_rng(1)
+    signals, time = rng.uniform(-1.0, 1.0, (20, 3)), np.cumsum(rng.uniform(0.1, 5.0, 20))
+    start = law.demagnetised(3, 0.0)
+    effective, last = follow(law, start, signals, time)
+    state = start
+    for row, (shape, when) in enumerate(zip(signals, time, strict=True)):
+        state = law.advance(law.move(state, shape, state.time), when)
+        np.testing.assert_allclose(effective[row], law.effective(state), atol=1e-14)
+    np.testing.assert_array_equal(last.crept, state.crept)
+
+
+def test_follow_refuses_time_that_runs_backwards() -> None:
+    with pytest.raises(ValueError, match=r"row 2 is 1\.000 s before"):
+        follow(LAW, LAW.demagnetised(1, 0.0), np.zeros((3, 1)), np.array([0.0, 2.0, 1.0]))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
+from dm_calibration.hysteresis.features import follow
 from dm_calibration.procedure.event_frames import record_hash
 from dm_calibration.procedure.outcome import Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
@@ -22,7 +23,6 @@ from dm_calibration.procedure.resumable_run import ResumeOptions, identity_of, o
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.hysteresis.model import follow
 from dm_common.messages import hysteresis_model_from, recipe_book_from
 from linear_mirror import make_mirror
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dm_common.hysteresis.duhem import DuhemOperator
-from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, follow
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from example_hysteresis import RADIUS, plays, rich
 
 signal = st.floats(-1.0, 1.0)
@@ -118,22 +118,9 @@ def test_duhem_of_first_order_is_an_exponential() -> None:
     np.testing.assert_allclose(operator.move(np.zeros(4), change), rising, atol=5e-5)  # a table of 2001 knots
 
 
-def test_follow_is_step_by_step() -> None:
-    law, rng = rich(), np.random.default_rng(1)
-    signals, time = rng.uniform(-1.0, 1.0, (20, 3)), np.cumsum(rng.uniform(0.1, 5.0, 20))
-    start = law.demagnetised(3, 0.0)
-    effective, last = follow(law, start, signals, time)
-    state = start
-    for row, (shape, when) in enumerate(zip(signals, time, strict=True)):
-        state = law.advance(law.move(state, shape, state.time), when)
-        np.testing.assert_allclose(effective[row], law.effective(state), atol=1e-14)
-    np.testing.assert_array_equal(last.crept, state.crept)
-
-
-def test_follow_refuses_time_that_runs_backwards() -> None:
-    law = plays()
-    with pytest.raises(ValueError, match=r"row 2 is 1\.000 s before"):
-        follow(law, law.demagnetised(1, 0.0), np.zeros((3, 1)), np.array([0.0, 2.0, 1.0]))
+def test_a_duhem_operator_without_end_is_refused() -> None:
+    with pytest.raises(ValueError, match="does not stay within"):
+        DuhemOperator(np.array([-3.0]))
 
 
 @pytest.mark.parametrize(
@@ -149,8 +136,3 @@ def test_follow_refuses_time_that_runs_backwards() -> None:
 def test_a_law_that_makes_no_sense_is_refused(field: str, value: object, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         replace(rich(), **{field: value})  # type: ignore[arg-type]
-
-
-def test_a_duhem_operator_without_end_is_refused() -> None:
-    with pytest.raises(ValueError, match="does not stay within"):
-        DuhemOperator(np.array([-3.0]))

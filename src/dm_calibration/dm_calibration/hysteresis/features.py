@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.duhem import DuhemOperator
-from dm_common.hysteresis.model import CREEP_TIMES
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 
 Floats = NDArray[np.float64]
 
@@ -84,3 +84,30 @@ def crept(features: Floats, time: Floats, start: float, moved: Floats | None = N
 def relaxation(time: Floats, start: float) -> Floats:
     """(M,) how much of an old displacement's creep is still to fade at `time` (s) when it ended at `start`."""
     return np.asarray(np.exp(-(time[:, None] - start) / CREEP_TIMES).sum(axis=1) * PER_ELEMENT)
+
+
+def follow(
+    law: HysteresisModel, state: HysteresisState, signals: Floats, time: Floats, moved: Floats | None = None
+) -> tuple[Floats, HysteresisState]:
+    """Effective signals of a sequence, looked at at `time`.
+
+    Args:
+        signals: (M, N) as applied.
+        time: (M,) s, rising.
+        moved: (M,) s, when each was applied, between the looks; None = right after the look before.
+
+    Returns:
+        (M, N) effective signals, and the state after the last.
+
+    Raises:
+        ValueError: time stamps that run backwards.
+    """
+    if (np.diff(time) < 0.0).any():
+        row = int(np.flatnonzero(np.diff(time) < 0.0)[0]) + 1
+        raise ValueError(f"time stamps: row {row} is {time[row - 1] - time[row]:.3f} s before the row before it")
+    result = np.empty_like(signals)
+    starts = np.concatenate(([state.time], time[:-1])) if moved is None else moved
+    for row, (shape, start, when) in enumerate(zip(signals, starts, time, strict=True)):
+        state = law.advance(law.move(state, shape, float(start)), float(when))
+        result[row] = law.effective(state)
+    return result, state

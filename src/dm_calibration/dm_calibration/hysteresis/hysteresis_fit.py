@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
+from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import responses_of
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of
 from dm_calibration.influence.maps import CHECK, MapSet
-from dm_common.hysteresis.model import HysteresisModel, follow, random_histories
+from dm_common.hysteresis.inverse import random_histories
+from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 Floats = NDArray[np.float64]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.hysteresis.features import follow
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.surfaces import MODEL_NAMES
@@ -20,7 +21,6 @@ from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory, SagModel
 from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import ErrorRegression, Reading, regress_surface_errors
-from dm_common.hysteresis.model import follow
 from dm_common.optics.piston_tilt import rms
 
 Floats = NDArray[np.float64]

@@ -3,19 +3,28 @@
 On a straight way the play operators set in one after another, and between two of these places the law is a polynomial
 in the signal. Its value at all places tells the piece that holds the solution, Newton's method finds it there. The work
 grows with actuators times operators.
+
+Where limits bind, they are those of the signals, and the shape is that of the effective signals. A limit on signals is
+another one on effective signals for every state, so the programme is solved for signals, with the model taken as
+straight about the last solution (sequential quadratic programming): a few rounds end where the next one changes
+nothing. Each ends inside the limits: what comes out is the nearest legal shape, not a part of the way to one that is
+not legal.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import comb
+from math import ceil, comb
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.bounded import BoundedProgramme
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.limits import Limits
 
 Floats = NDArray[np.float64]
 
@@ -24,6 +33,12 @@ TOLERANCE = 1e-7
 ROUNDS_MAX = 60
 #: Newton's step never divides by less; laws that can be inverted are steeper by far.
 SLOPE_MIN = 1e-3
+#: What neighbours stay below their limit: one step of a 16-bit DAC, since each of the two is rounded.
+DAC_STEP = 2.0**-15
+#: Rounds of the programme, and the change of a signal at which it ends.
+ROUNDS, CONVERGED = 8, 1e-6
+#: Half the step that the slope of the law is taken over.
+SLOPE_STEP = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,3 +188,89 @@ def horner(coefficients: Floats, x: Floats) -> Floats:
     for coefficient in coefficients[-3::-1]:
         total = total * x + coefficient
     return np.asarray(total)
+
+
+@dataclass(frozen=True, eq=False)
+class Constrained:
+    """A legal command.
+
+    Attributes:
+        signals: (N,) inside all limits.
+        effective: (N,) effective signals that it leads to.
+    """
+
+    signals: Floats
+    effective: Floats
+
+
+def within(limits: Limits) -> Limits:
+    """`limits` with room for the rounding of the electronics."""
+    return replace(limits, neighbour_difference=max(limits.neighbour_difference - DAC_STEP, 0.5 * DAC_STEP))
+
+
+class ConstrainedInverse:
+    """Nearest legal commands on one mirror.
+
+    Args:
+        law: of its actuators.
+        limits: of the signals.
+        matrix: (M, N) what a unit of each effective signal does, in the rows that are to be met.
+        ridge: weight of the squared effective signals, in the squared unit of `matrix`.
+    """
+
+    def __init__(self, law: HysteresisModel, limits: Limits, matrix: Floats, ridge: float) -> None:
+        self._law, self._limits = law, limits
+        stacked = np.vstack((matrix, np.sqrt(ridge) * np.eye(matrix.shape[1])))
+        orthogonal, self._root = np.linalg.qr(stacked)
+        self._project = orthogonal[: len(matrix)].T
+
+    def solve(self, at: HysteresisState, rows: Floats, ahead: float, start: Floats) -> Constrained:
+        """The legal command at the state's time whose rows, `ahead` s later, come nearest to `rows` (M,).
+
+        Args:
+            start: (N,) signals to begin with, for instance those of the inverse without limits between neighbours.
+        """
+        wanted = self._project @ rows
+        law, limits = self._law, self._limits
+        rest = np.exp(-ahead / law.creep_time)
+        growth = 1.0 + law.creep_share @ (1.0 - rest)  # of a step taken now, until it counts
+        crept = (law.creep_share * at.crept) @ rest
+        signals = np.clip(start, limits.low, limits.high)
+        for _ in range(ROUNDS):
+            reached = growth * law.position_at(at, signals) + crept
+            rise = law.position_at(at, signals + SLOPE_STEP) - law.position_at(at, signals - SLOPE_STEP)
+            slope = growth * rise / (2.0 * SLOPE_STEP)
+            programme = BoundedProgramme(self._root * slope, limits)
+            before = signals
+            signals = programme.solve(wanted - self._root @ (reached - slope * signals))
+            if np.abs(signals - before).max() <= CONVERGED:
+                break
+        return Constrained(signals, growth * law.position_at(at, signals) + crept)
+
+
+#: Random histories that tell what is always within reach, their moves, and the time between those, s.
+HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
+
+
+def random_histories(
+    law: HysteresisModel, low: float, high: float, rng: np.random.Generator, histories: int = HISTORIES
+) -> Iterator[HysteresisState]:
+    """States after random moves between `low` and `high`: of `histories` actuators, or of those of the law so often."""
+    count = law.actuators or histories
+    for _ in range(ceil(histories / count)):
+        state = law.demagnetised(count, 0.0, 0.5 * (low + high))
+        for _ in range(HISTORY_MOVES):
+            state = law.move(state, rng.uniform(low, high, count), state.time + HISTORY_PAUSE_S)
+        yield state
+
+
+def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float, float]:
+    """Effective signals that signals of `low` .. `high` reach whatever was before: hysteresis and creep take some away.
+
+    The least of what random histories leave at either end.
+    """
+    ends: dict[float, list[Floats]] = {low: [], high: []}
+    for state in random_histories(law, low, high, np.random.default_rng(0)):
+        for end, reached in ends.items():
+            reached.append(law.effective(law.move(state, np.full(len(state.signals), end), state.time)))
+    return float(np.max(ends[low])), float(np.min(ends[high]))

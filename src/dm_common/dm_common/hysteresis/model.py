@@ -18,8 +18,6 @@ Nothing here depends on how a straight way is cut into steps, so only turning po
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -274,58 +272,3 @@ class HysteresisModel:
             duhem_weight=duhem,
             crept=factors * self.crept if self.crept.size else self.crept,
         )
-
-
-def follow(
-    law: HysteresisModel, state: HysteresisState, signals: Floats, time: Floats, moved: Floats | None = None
-) -> tuple[Floats, HysteresisState]:
-    """Effective signals of a sequence, looked at at `time`.
-
-    Args:
-        signals: (M, N) as applied.
-        time: (M,) s, rising.
-        moved: (M,) s, when each was applied, between the looks; None = right after the look before.
-
-    Returns:
-        (M, N) effective signals, and the state after the last.
-
-    Raises:
-        ValueError: time stamps that run backwards.
-    """
-    if (np.diff(time) < 0.0).any():
-        row = int(np.flatnonzero(np.diff(time) < 0.0)[0]) + 1
-        raise ValueError(f"time stamps: row {row} is {time[row - 1] - time[row]:.3f} s before the row before it")
-    result = np.empty_like(signals)
-    starts = np.concatenate(([state.time], time[:-1])) if moved is None else moved
-    for row, (shape, start, when) in enumerate(zip(signals, starts, time, strict=True)):
-        state = law.advance(law.move(state, shape, float(start)), float(when))
-        result[row] = law.effective(state)
-    return result, state
-
-
-#: Random histories that tell what is always within reach, their moves, and the time between those, s.
-HISTORIES, HISTORY_MOVES, HISTORY_PAUSE_S = 400, 12, 600.0
-
-
-def random_histories(
-    law: HysteresisModel, low: float, high: float, rng: np.random.Generator, histories: int = HISTORIES
-) -> Iterator[HysteresisState]:
-    """States after random moves between `low` and `high`: of `histories` actuators, or of those of the law so often."""
-    count = law.actuators or histories
-    for _ in range(math.ceil(histories / count)):
-        state = law.demagnetised(count, 0.0, 0.5 * (low + high))
-        for _ in range(HISTORY_MOVES):
-            state = law.move(state, rng.uniform(low, high, count), state.time + HISTORY_PAUSE_S)
-        yield state
-
-
-def certain_reach(law: HysteresisModel, low: float, high: float) -> tuple[float, float]:
-    """Effective signals that signals of `low` .. `high` reach whatever was before: hysteresis and creep take some away.
-
-    The least of what random histories leave at either end.
-    """
-    ends: dict[float, list[Floats]] = {low: [], high: []}
-    for state in random_histories(law, low, high, np.random.default_rng(0)):
-        for end, reached in ends.items():
-            reached.append(law.effective(law.move(state, np.full(len(state.signals), end), state.time)))
-    return float(np.max(ends[low])), float(np.min(ends[high]))

@@ -85,29 +85,18 @@ class HysteresisTracker:
         """
         if not np.isfinite(report.signals).all():
             raise ValueError("applied: holds values that are not finite")
-        last = self._last
-        at_calibration = last is not None and last.time < self.law.crept_at <= report.time
-        degaussed = last is not None and report.degausses > last.degausses
-        if at_calibration and not degaussed:
-            self._creep_as_calibrated()
-        self._take(report)
-        if at_calibration and degaussed:
-            self._creep_as_calibrated()
-
-    def _creep_as_calibrated(self) -> None:
-        """What the creep elements had followed, as the calibration found: its figure is relative to that."""
-        state = self.state
-        if state is not None and self.law.crept.shape == state.signals.shape:
-            state = self.law.advance(state, max(state.time, self.law.crept_at))
-            self.state = replace(state, crept=np.repeat(self.law.crept[:, None], state.crept.shape[1], axis=1))
-
-    def _take(self, report: Applied) -> None:
         last, self._last = self._last, report
         if self.state is not None and len(report.signals) != len(self.state.signals):
             raise ValueError(f"applied: {len(report.signals)} signals, before there were {len(self.state.signals)}")
         if last is None or self.state is None:
             self._guess(report, "it moved before this node followed it")
             return
+        law = self.law
+        if last.time < law.crept_at <= report.time and law.crept.shape == report.signals.shape:
+            # The figure of a calibration is relative to what the actuators had crept to, as it found.
+            state = law.advance(self.state, law.crept_at)
+            crept = np.repeat(law.crept[:, None], len(law.creep_time), axis=1)
+            self.state, self._set_off = replace(state, crept=crept), None
         if report.time < self.state.time:
             # Hysteresis knows no time; creep stands still until the clock has caught up.
             self.state = replace(self.state, time=report.time)

@@ -16,10 +16,9 @@ import numpy as np
 from dm_msgs.msg import FocusRequest
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.inverse import invert
+from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
-from dm_controller.planning.constrained import ConstrainedInverse, within
 from dm_controller.planning.fast_path import PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
