@@ -79,6 +79,8 @@ class SteadyMirror:
 
 
 def without_effect(error: float = 1e-10) -> HysteresisFit:
-    """A hysteresis model without hysteresis, predicted within `error` (m), so that only its history counts."""
+    """A play operator of no weight, predicted within `error` (m): of the history only counts whether it is known."""
     sigma = np.concatenate((np.zeros(3), np.full(18, error)))
-    return HysteresisFit("none", HysteresisModel.linear(), sigma, 3.0 * error, 0.05, 100, ())
+    none = np.zeros(0)
+    law = HysteresisModel(np.array([0.0, 0.5]), np.array([[1.0], [0.0]]), none, 0.0, 0.0, none)
+    return HysteresisFit("none", law, sigma, 3.0 * error, 0.05, 100, ())
