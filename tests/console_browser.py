@@ -136,9 +136,10 @@ class Browser:
         return []
 
     def hexagons(self) -> dict[int, Any]:
-        """{number: its text on the command map}, without those that carry a sign."""
+        """{number: its text on the command map, which a sign may follow}."""
         found = self.driver.find_elements(By.CSS_SELECTOR, '[role="img"][aria-label^="command map"] svg text')
-        return {int(element.text): element for element in found if element.text.isdecimal()}
+        texts = [(element.text.split()[:1], element) for element in found]
+        return {int(first[0]): element for first, element in texts if first and first[0].isdecimal()}
 
     def dismiss_all(self) -> None:
         """Take every refusal off the page."""
