@@ -28,6 +28,8 @@ Attribute = bool | int | float | str | tuple[str, ...]
 HASH = "content_sha256"
 #: Larger files are not calibrations [bytes].
 SIZE_MAX = 1 << 28
+#: Size of the smallest superblock that such a file begins with [bytes].
+SUPERBLOCK = 96
 #: More groups and datasets than this are not a calibration, but perhaps a loop.
 _OBJECTS_MAX = 1000
 
@@ -71,6 +73,8 @@ def read_image(path: Path) -> tuple[dict[str, Column], dict[str, Attribute]]:
         if size > SIZE_MAX:
             raise ImageError(f"{size} bytes: a calibration has at most {SIZE_MAX}")
         content = raw.read(size)
+    if size < SUPERBLOCK:  # the library would read on into whatever lies behind
+        raise ImageError(f"not a whole HDF5 file: {size} bytes, must be {SUPERBLOCK} at least")
     try:
         answer = read_in_sandbox("image", content)
     except SandboxError as error:
