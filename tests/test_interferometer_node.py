@@ -126,7 +126,12 @@ def test_ingested_map_is_published_whole(observer: Observer, start: Start, tmp_p
 def test_map_of_a_large_fizeau(observer: Observer, start: Start, tmp_path: Path) -> None:
     """As such an instrument leaves it: an intensity frame of the whole camera before the phase, a rim without data."""
     counts = np.pad(disc_counts(400, 34000), 10, constant_values=2147483640)
-    fields = {"intensity": np.full((1, 480, 640), 200), "pitch": 117.9e-6, "origin_x": 116, "origin_y": 30}
+    fields: dict[str, Any] = {
+        "intensity": np.full((1, 480, 640), 200),
+        "pitch": 117.9e-6,
+        "origin_x": 116,
+        "origin_y": 30,
+    }
     path = tmp_path / "fizeau.dat"
     path.write_bytes(dat_bytes(counts, **fields))
     sag = np.where(counts < 2147483640, counts * 0.5 * WAVELENGTH / 32768, np.nan)
