@@ -75,6 +75,7 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         amplifier_gain=values["volts.amplifier_gain"],
         volts_min=values["volts.min"],
         volts_max=values["volts.max"],
+        law=values["drive.law"],
     )
     x, y = _positions(values, actuators)
     if values["mirror.working_aperture_diameter"] > values["mirror.full_aperture_diameter"]:

@@ -9,6 +9,7 @@ from dm_common.ros.parameters import REQUIRED, Parameter
 from dm_driver.electronics import BACK_ENDS
 from dm_driver.electronics.check_sums import CHECK_SUMS
 from dm_driver.electronics.frame_format import BYTE_ORDERS, MOST_BITS, MOST_WORD_BITS, PARITIES, FrameFormat
+from dm_driver.output.volts import LAWS, LINEAR
 
 _FRAME: Final = FrameFormat()
 
@@ -137,6 +138,14 @@ PARAMETERS: Final = (
     Parameter("volts.amplifier_gain", float, REQUIRED, "Actuator volts per DAC volt (about 80)."),
     Parameter("volts.min", float, REQUIRED, "Actuator voltage for signal -1.", "V"),
     Parameter("volts.max", float, REQUIRED, "Actuator voltage for signal +1.", "V"),
+    Parameter(
+        "drive.law",
+        str,
+        LINEAR,
+        "What is linear in the signal from volts.min to volts.max: the volts (piezo), or their square (electrostatic "
+        "membrane).",
+        choices=tuple(LAWS),
+    ),
     Parameter("limits.signal_min", float, -1.0, "Lowest signal.", low=-1.0, high=1.0),
     Parameter("limits.signal_max", float, 1.0, "Highest signal.", low=-1.0, high=1.0),
     Parameter(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dm_driver.output.output_stage import OutputStage
-from dm_driver.output.volts import VoltScale
+from dm_driver.output.volts import LAWS, VoltScale
 from dm_driver.output.wiring import TABLES, wiring_table
 
 
@@ -75,14 +76,39 @@ def test_edac40_as_delivered() -> None:
     assert (scale.volts_of_codes(codes) >= 0).all() and (scale.volts_of_codes(codes) <= 300).all()
 
 
+def test_square_law() -> None:
+    """Equal steps of the signal are equal steps of the volts squared, and what is applied is what the codes do."""
+    scale = VoltScale(4095, 0.0, 5.0, 60.0, 0.0, 300.0, "square")
+    signals = np.linspace(-1, 1, 9)
+    assert scale.volts(signals) == pytest.approx(300.0 * np.sqrt(np.arange(9) / 8))
+    stage = OutputStage(scale, np.arange(9), 40)
+    codes = stage.codes(signals)
+    assert codes[:9].tolist() == [0, 1448, 2048, 2508, 2896, 3237, 3546, 3831, 4095]
+    assert codes[9:].tolist() == [0] * 31
+    applied, volts = stage.outcome(codes)
+    assert volts == pytest.approx(codes[:9] * (300.0 / 4095))
+    assert applied == pytest.approx(2.0 * (codes[:9] / 4095) ** 2 - 1.0)
+    assert np.abs(applied - signals).max() <= 0.5 * scale.resolution
+    # Codes count most at the upper end, twice as much as with the linear law, and least at 0 V.
+    assert scale.resolution == pytest.approx(4 / 4095)
+    neighbours = scale.signals_of_codes(np.arange(4096, dtype=np.uint16))
+    assert (np.diff(neighbours) <= scale.resolution).all() and np.diff(neighbours)[0] < 1e-6
+    # A range that does not begin at 0 V.
+    assert VoltScale(4095, 0.0, 5.0, 60.0, 100.0, 260.0, "square").volts(np.zeros(1)) == pytest.approx(
+        np.sqrt((100**2 + 260**2) / 2)
+    )
+
+
 scales = st.builds(
-    lambda bits, zero, span, inverted, gain, low, width: VoltScale(
+    lambda law, bits, zero, span, inverted, gain, low, width: VoltScale(
         2**bits - 1,
         *((zero + span, zero) if inverted else (zero, zero + span)),
         gain,
         gain * (zero + span * low) if gain > 0 else gain * (zero + span * (low + width)),
         gain * (zero + span * (low + width)) if gain > 0 else gain * (zero + span * low),
+        law if gain * zero >= 0.0 and gain * (zero + span) >= 0.0 else "linear",
     ),
+    st.sampled_from(sorted(LAWS)),
     st.sampled_from([12, 14, 16]),
     st.floats(-10, 10),
     st.floats(1, 20),
@@ -120,8 +146,10 @@ def test_codes_of_illegal_signals_are_refused(bad: float) -> None:
         ((65535, -6, 6, 80, 300, 0), "volts.max = 0 V: must be above volts.min = 300 V"),
         ((65535, -6, math.nan, 80, 0, 300), "volts.dac_at_full = nan: must be finite"),
         ((65535, -6, 6, 800000, 0, 300), "spans only 2 of 65535 codes"),
+        ((65535, -6, 6, 80, -10, 300, "square"), "volts.min = -10 V: must be at least 0 with drive.law = 'square'"),
+        ((65535, -6, 6, 80, 0, 300, "cube"), "drive.law = 'cube': must be one of linear, square"),
     ],
 )
-def test_contradictory_voltages_are_refused(arguments: tuple[float, ...], text: str) -> None:
+def test_contradictory_voltages_are_refused(arguments: tuple[Any, ...], text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(text)):
-        VoltScale(int(arguments[0]), *arguments[1:])
+        VoltScale(*arguments)

@@ -1,7 +1,8 @@
 """From the normalised signal to the DAC code and back: signal - actuator volts - DAC volts - code.
 
-Signal -1 is `volts_min` at the actuator, +1 is `volts_max`, linear between (the vendor's code = max_code (u + 1) / 2
-holds when that range is the DAC's whole range). The amplifier divides by its gain to DAC volts, and the DAC is linear
+Signal -1 is `volts_min` at the actuator, +1 is `volts_max`, and between them the volts are linear in the signal (the
+vendor's code = max_code (u + 1) / 2 holds when that range is the DAC's whole range), or their square is: electrodes
+attract a membrane with the square of the voltage. The amplifier divides by its gain to DAC volts, and the DAC is linear
 between its voltages at code 0 and at full scale.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,11 @@ from numpy.typing import NDArray
 #: Fewer codes than this between signal -1 and +1 is a mistake in the configuration, not a mirror.
 MIN_CODES = 100
 _CODE_SLACK = 1e-6
+
+LINEAR: Final = "linear"
+SQUARE: Final = "square"
+#: Laws of the drive: the power of the volts that is linear in the signal.
+LAWS: Final = {LINEAR: 1, SQUARE: 2}
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,7 @@ class VoltScale:
         amplifier_gain: V at the actuator per V at the DAC.
         volts_min: V at the actuator for signal -1.
         volts_max: V at the actuator for signal +1.
+        law: one of `LAWS`.
 
     Raises:
         ValueError: the values contradict each other; the message names the driver's parameters.
@@ -41,6 +49,7 @@ class VoltScale:
     amplifier_gain: float
     volts_min: float
     volts_max: float
+    law: str = LINEAR
 
     def __post_init__(self) -> None:
         for name, value in (
@@ -63,6 +72,10 @@ class VoltScale:
             raise ValueError("volts.amplifier_gain = 0: must not be zero")
         if not self.volts_max > self.volts_min:
             raise ValueError(f"volts.max = {self.volts_max:g} V: must be above volts.min = {self.volts_min:g} V")
+        if self.law not in LAWS:
+            raise ValueError(f"drive.law = {self.law!r}: must be one of {', '.join(LAWS)}")
+        if self.law == SQUARE and self.volts_min < 0.0:
+            raise ValueError(f"volts.min = {self.volts_min:g} V: must be at least 0 with drive.law = {SQUARE!r}")
         low, high = sorted((self.dac_volts_at_zero, self.dac_volts_at_full))
         slack = 1e-9 * (high - low)
         for name, value in (("volts.min", self.volts_min), ("volts.max", self.volts_max)):
@@ -83,11 +96,13 @@ class VoltScale:
 
     def volts(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
         """Actuator volts of normalised signals."""
-        return self.volts_min + (signals + 1.0) * (0.5 * (self.volts_max - self.volts_min))
+        low, span = self._powers
+        return np.asarray((low + (signals + 1.0) * (0.5 * span)) ** (1.0 / LAWS[self.law]), dtype=np.float64)
 
     def signals(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Normalised signals of actuator volts."""
-        return (volts - self.volts_min) * (2.0 / (self.volts_max - self.volts_min)) - 1.0
+        low, span = self._powers
+        return np.asarray((volts ** LAWS[self.law] - low) * (2.0 / span) - 1.0, dtype=np.float64)
 
     def codes(self, signals: NDArray[np.float64]) -> NDArray[np.uint16]:
         """Nearest codes of normalised signals; never one whose voltage lies outside volts_min..volts_max.
@@ -110,9 +125,17 @@ class VoltScale:
 
     @property
     def resolution(self) -> float:
-        """Normalised signal of one code; quantisation moves a signal by at most half of it at mid range."""
+        """Normalised signal of the code that counts most, the last one; quantisation moves no signal inside the range
+        by more than half of it."""
         volts_per_code = abs(self._dac_span * self.amplifier_gain) / self.max_code
-        return 2.0 * volts_per_code / (self.volts_max - self.volts_min)
+        power = LAWS[self.law]
+        return 2.0 * power * self.volts_max ** (power - 1) * volts_per_code / self._powers[1]
+
+    @property
+    def _powers(self) -> tuple[float, float]:
+        """What is linear in the signal: its value at signal -1, and at +1 less that."""
+        low = self.volts_min ** LAWS[self.law]
+        return low, self.volts_max ** LAWS[self.law] - low
 
     @property
     def _dac_span(self) -> float:
