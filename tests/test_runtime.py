@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
 from dm_common.ros.action_client import ThreadedActionClient
-from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare
+from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare, real, reals, text, whole
 from dm_common.ros.worker import (
     ServiceCallError,
     WorkerActionServer,
@@ -233,11 +233,11 @@ def test_sleep_ends_early_when_cancelled(observer: Observer) -> None:
 
 
 TABLE = (
-    Parameter("serial", str, REQUIRED, "serial number of the mirror"),
-    Parameter("gain", float, 2.0, "gain of the amplifier", "V/V", 0.0, 100.0, live=True),
-    Parameter("count", int, 3, "how many", low=1, high=5),
-    Parameter("kind", str, "a", "which kind", choices=("a", "b")),
-    Parameter("positions", "float[]", [], "where", "m", -1.0, 1.0),
+    Parameter("serial", text(REQUIRED), "serial number of the mirror"),
+    Parameter("gain", real(2.0, 0.0, 100.0, "V/V"), "gain of the amplifier", live=True),
+    Parameter("count", whole(3, 1, 5), "how many"),
+    Parameter("kind", text("a", choices=("a", "b")), "which kind"),
+    Parameter("positions", reals([], -1.0, 1.0, "m"), "where"),
 )
 
 

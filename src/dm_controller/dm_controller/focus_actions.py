@@ -18,7 +18,7 @@ from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Measurement
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.parameters import Parameter
+from dm_common.ros.parameters import Parameter, real, whole
 from dm_common.ros.worker import WorkerActionServer, sleep
 from dm_controller.focus_host import FocusHost
 from dm_controller.focus_types import Order
@@ -29,43 +29,31 @@ from dm_controller.planning.target import FocusTarget
 LOOP_PARAMETERS = (
     Parameter(
         "converge.tolerance",
-        float,
-        2e-9,
+        real(2e-9, 1e-11, 1e-5, "m"),
         "largest coefficient error at which a closed loop ends",
-        "m",
-        1e-11,
-        1e-5,
         live=True,
     ),
-    Parameter("converge.max_maps", int, 5, "maps that a closed loop may take", "", 1, 100, live=True),
+    Parameter("converge.max_maps", whole(5, 1, 100), "maps that a closed loop may take", live=True),
     Parameter(
         "converge.creep",
-        float,
-        0.01,
+        real(0.01, 0.0, 0.2),
         "growth of a move per decade of time that the loop foresees; 0 = none",
-        "",
-        0.0,
-        0.2,
         live=True,
     ),
     Parameter(
         "recipes.tolerance",
-        float,
-        6.3e-10,
+        real(6.3e-10, 1e-11, 1e-5, "m"),
         "largest re-measured coefficient error of a recipe",
-        "m",
-        1e-11,
-        1e-5,
         live=True,
     ),
-    Parameter("recipes.max_maps", int, 32, "maps that one recipe may take", "", 4, 100, live=True),
-    Parameter("recipes.average", int, 8, "maps averaged after each degauss of a recipe", "", 2, 50, live=True),
-    Parameter("converge.settle_time", float, 0.5, "wait between command and map, in ROS time", "s", 0.0, 600.0),
-    Parameter("converge.driver_timeout", float, 30.0, "longest wait for the driver to set a shape", "s", 0.1, 600.0),
-    Parameter("converge.measure_timeout", float, 60.0, "longest wait for one map", "s", 0.1, 3600.0),
-    Parameter("converge.measure_retries", int, 1, "further tries after a map that failed", "", 0, 20, live=True),
-    Parameter("recipes.degauss_steps", int, 100, "half-swings of the degauss that recipes begin with", "", 1, 10000),
-    Parameter("recipes.degauss_timeout", float, 120.0, "longest wait for a degauss", "s", 1.0, 3600.0),
+    Parameter("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take", live=True),
+    Parameter("recipes.average", whole(8, 2, 50), "maps averaged after each degauss of a recipe", live=True),
+    Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
+    Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
+    Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
+    Parameter("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed", live=True),
+    Parameter("recipes.degauss_steps", whole(100, 1, 10000), "half-swings of the degauss that recipes begin with"),
+    Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
 )
 
 

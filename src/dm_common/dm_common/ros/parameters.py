@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -34,70 +35,97 @@ class ParameterError(ValueError):
 
 
 @dataclass(frozen=True)
+class Value:
+    """What a parameter may be; made by `real`, `whole`, `text`, `switch`, and for arrays `reals`, `wholes`, `texts`.
+
+    Attributes:
+        kind: bool, int, float, str, "float[]", "int[]" or "str[]".
+        default: the value when none is given; REQUIRED when the configuration must give it; an empty list for arrays.
+        low, high: allowed range of numbers (of each element for arrays), inclusive.
+        unit: SI unit, "" when it has none.
+        choices: allowed strings.
+    """
+
+    kind: type | str
+    default: Any
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    choices: tuple[str, ...] = ()
+
+
+real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, bool))
+reals, wholes, texts = (partial(Value, kind) for kind in ("float[]", "int[]", "str[]"))
+
+
+@dataclass(frozen=True)
 class Parameter:
     """One parameter of a node.
 
     Attributes:
         name: snake_case; dots group.
-        kind: bool, int, float, str, "float[]", "int[]" or "str[]".
-        default: the value when none is given; REQUIRED when the configuration must give it; an empty list for arrays.
+        value: its type, default and range.
         description: what it is, for a person.
-        unit: SI unit, "" when it has none.
-        low, high: allowed range of numbers (of each element for arrays), inclusive.
-        choices: allowed strings.
         live: True when it may change while the node runs.
     """
 
     name: str
-    kind: type | str
-    default: Any
+    value: Value
     description: str
-    unit: str = ""
-    low: float = -math.inf
-    high: float = math.inf
-    choices: tuple[str, ...] = ()
     live: bool = False
+
+    @property
+    def kind(self) -> type | str:
+        return self.value.kind
+
+    @property
+    def default(self) -> Any:
+        return self.value.default
 
     def describe(self) -> str:
         """Description with unit and range, as `ros2 param describe` shows it."""
-        text = self.description + (f" [{self.unit}]" if self.unit else "")
-        if self.choices:
-            text += f" One of: {', '.join(self.choices)}."
-        return text
+        described = self.description + (f" [{self.value.unit}]" if self.value.unit else "")
+        if self.value.choices:
+            described += f" One of: {', '.join(self.value.choices)}."
+        return described
 
     def allowed(self) -> str:
         """The allowed values as text."""
-        if self.choices:
-            return "one of " + ", ".join(self.choices)
-        kind = self.kind if isinstance(self.kind, str) else self.kind.__name__
-        if math.isinf(self.low) and math.isinf(self.high):
+        value = self.value
+        if value.choices:
+            return "one of " + ", ".join(value.choices)
+        kind = value.kind if isinstance(value.kind, str) else value.kind.__name__
+        if math.isinf(value.low) and math.isinf(value.high):
             return f"a {kind}"
-        return f"{kind}, {self.low:g} to {self.high:g}{' ' + self.unit if self.unit else ''}"
+        return f"{kind}, {value.low:g} to {value.high:g}{' ' + value.unit if value.unit else ''}"
 
-    def check(self, value: Any) -> None:
-        """Raise ParameterError when `value` is not allowed."""
-        if self.choices and value not in self.choices:
-            raise ParameterError(f"{self.name} = {value!r}: must be {self.allowed()}")
-        numbers = value if self.kind in ("float[]", "int[]") else [value] if self.kind in (int, float) else []
+    def check(self, given: Any) -> None:
+        """Raise ParameterError when the value `given` is not allowed."""
+        value = self.value
+        if value.choices and given not in value.choices:
+            raise ParameterError(f"{self.name} = {given!r}: must be {self.allowed()}")
+        numbers = given if value.kind in ("float[]", "int[]") else [given] if value.kind in (int, float) else []
         for number in numbers:
-            if not (math.isfinite(number) and self.low <= number <= self.high):
-                raise ParameterError(f"{self.name} = {value!r}: must be {self.allowed()}")
+            if not (math.isfinite(number) and value.low <= number <= value.high):
+                raise ParameterError(f"{self.name} = {given!r}: must be {self.allowed()}")
 
     def descriptor(self) -> ParameterDescriptor:
+        value = self.value
         descriptor = ParameterDescriptor(
             name=self.name,
-            type=_TYPES[self.kind].value,
+            type=_TYPES[value.kind].value,
             description=self.describe(),
             additional_constraints=self.allowed(),
             read_only=not self.live,
         )
-        if self.kind is float and not (math.isinf(self.low) and math.isinf(self.high)):
+        bounded = not (math.isinf(value.low) and math.isinf(value.high))
+        if value.kind is float and bounded:
             descriptor.floating_point_range = [
-                FloatingPointRange(from_value=max(self.low, -1e308), to_value=min(self.high, 1e308))
+                FloatingPointRange(from_value=max(value.low, -1e308), to_value=min(value.high, 1e308))
             ]
-        if self.kind is int and not (math.isinf(self.low) and math.isinf(self.high)):
+        if value.kind is int and bounded:
             descriptor.integer_range = [
-                IntegerRange(from_value=int(max(self.low, -(2**62))), to_value=int(min(self.high, 2**62)))
+                IntegerRange(from_value=int(max(value.low, -(2**62))), to_value=int(min(value.high, 2**62)))
             ]
         return descriptor
 
