@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
-from dm_controller.planning.fast_path import ClosedForm
 from dm_controller.planning.target import FocusTarget
 
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
@@ -135,14 +134,6 @@ class CalibratedMirror:
         response = np.linalg.norm(reduced, axis=0)
         self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
-        self._closed_form = ClosedForm(
-            model.aperture_radius,
-            (model.sample_x, model.sample_y),
-            model.zernike_offset,
-            model.sag_offset,
-            lambda coefficients, sag: self._programme.unlimited(self.rows(coefficients, sag)),
-            self._coefficient_errors,
-        )
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
     def _reduce(self, sag: NDArray[np.float64], removed: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -186,16 +177,13 @@ class CalibratedMirror:
         Raises:
             TargetError: no such surface exists over the aperture.
         """
-        found = self._closed_form.find(target)
-        if found is not None and self.limits.allow(found[0]):
-            return found
-        return self.solve_target(target)
-
-    def solve_target(self, target: FocusTarget) -> tuple[NDArray[np.float64], float]:
-        """As :meth:`command`, by the bounded programme on the exact sag of `target`."""
         coefficients, sag = self._wanted(target)
         signals = self.solve(self.rows(coefficients, sag))
-        return signals, float(np.abs(self._coefficient_errors(signals, coefficients)).max())
+        return signals, float(np.abs(self.coefficient_errors(signals, coefficients)).max())
+
+    def unlimited(self, coefficients: NDArray[np.float64], sag: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Commands (N, M) for coefficients (K, M) and sag (P, M), m, less those at zero signals, without any limit."""
+        return self._programme.unlimited(self.rows(coefficients, sag))
 
     def predict(self, target: FocusTarget, signals: NDArray[np.float64]) -> Plan:
         """What `signals` (N,) are expected to do when `target` is wanted.
@@ -206,7 +194,7 @@ class CalibratedMirror:
         model = self.model
         coefficients, sag = self._wanted(target)
         rms = float(np.linalg.norm(self._reduce(model.influence_sag @ signals - sag, self._tilt_free)))
-        largest = float(np.abs(self._coefficient_errors(signals, coefficients)).max())
+        largest = float(np.abs(self.coefficient_errors(signals, coefficients)).max())
         lower, upper = rms_bounds(rms, model.held_out_rms)
         return Plan(
             signals=signals,
@@ -232,7 +220,7 @@ class CalibratedMirror:
         coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
         return coefficients, target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
 
-    def _coefficient_errors(
+    def coefficient_errors(
         self, signals: NDArray[np.float64], coefficients: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Coefficient errors beyond tilt, m: (K - 3,) of signals (N,), or columns of each."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
-from dm_controller.planning.fast_path import PreparedInverse
+from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
 
@@ -97,6 +97,7 @@ class Planner:
         self.law = hysteresis.law if hysteresis is not None else HysteresisModel.linear()
         self._zernike = np.ascontiguousarray(mirror.model.influence_zernike[PISTON_TILT:])
         self.unknown_max_zernike, self._unknown_rms = self._unknown_history()
+        self._closed_form = ClosedForm(mirror)
         self._prepared: PreparedInverse | None = None
         self._limits = within(mirror.limits)
 
@@ -134,7 +135,7 @@ class Planner:
         """
         mirror, law = self.mirror, self.law
         if effective is None:
-            aim, largest = mirror.command(target)
+            aim, largest = self._closed_form.find(target) or mirror.command(target)
         else:
             aim, largest = effective, mirror.predict(target, effective).max_zernike
         if error is not None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_common.optics.conic import Q_MAX, conic_coefficients, conic_sag, series, series_coefficients, series_sag
+from dm_common.optics.conic import conic_coefficients, conic_sag
+from dm_controller.planning.fast_path import Q_MAX, series, series_coefficients, series_sag
 
 RADIUS = 11e-3
 CASES = [(0.05, 0.0), (-0.3, -1.0), (0.2, 5.0), (0.9, 0.0), (0.3, -8.0), (0.0, 1.0)]
