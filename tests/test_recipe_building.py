@@ -15,13 +15,13 @@ from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS
 from dm_common.recipes import Recipe, RecipeError
+from dm_controller.converge.goals import UnreachableError, recipe_targets
 from dm_controller.converge.recipe_building import (
     BuildOptions,
     BuildStep,
     RecipeBuilder,
     recipe_book,
 )
-from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import find

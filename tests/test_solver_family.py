@@ -13,9 +13,7 @@ from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Shape, Solver, rms_sag, target_shape
-from dm_controller.solvers.iterative_learning import IterativeLearning
-from dm_controller.solvers.pseudo_inverse import PseudoInverse
-from dm_controller.solvers.region_weighted import AZWreg
+from dm_controller.solvers.least_squares import AZWreg, IterativeLearning, PseudoInverse
 from dm_controller.solvers.registry import DEFAULT
 from dm_simulation.mirror.plate import Plate
 from linear_mirror import LinearMirror, hexagon, make_mirror

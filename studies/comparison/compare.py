@@ -31,7 +31,7 @@ from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Solver, target_shape
-from dm_controller.solvers.pseudo_inverse import PseudoInverse
+from dm_controller.solvers.least_squares import PseudoInverse
 from dm_tools.verify import SurfaceError, surface_error
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, influence_model, plan_steps
 from studies.solvers.registry import SOLVERS, MirrorFacts, check_method, make_solver

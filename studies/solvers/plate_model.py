@@ -12,7 +12,7 @@ from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import PISTON_TILT, basis
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Floats, Shape, Solver, normalised_terms, points_of
-from dm_controller.solvers.pseudo_inverse import CUTOFF
+from dm_controller.solvers.least_squares import CUTOFF
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,24 @@
-"""What goals of `converge` and `build_recipes` have in common: the check of their figures, and how they end."""
+"""Goals of `converge` and `build_recipes`: what is checked before anything moves, and how they end."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
+from dm_common.recipes import RecipeError
+from dm_controller.planning.planner import Planner
+from dm_controller.planning.recipes import SAME_CURVATURE
+from dm_controller.planning.target import FocusTarget
 
 #: Most maps that a goal may ask for.
 MAPS_MAX = 100
+
+
+class UnreachableError(RecipeError):
+    """The limits of the actuators deny the shape."""
 
 
 def check_figures(goal: Any) -> None:
@@ -17,6 +27,38 @@ def check_figures(goal: Any) -> None:
         raise ValueError(f"tolerance = {goal.tolerance} m: must be 0 (= configured) or above, and finite")
     if goal.max_maps > MAPS_MAX:
         raise ValueError(f"max_maps = {goal.max_maps}: must be 0 (= configured) to {MAPS_MAX}")
+
+
+def recipe_targets(
+    curvatures: Sequence[float], conic_constant: float, loop: Planner, error_max: float
+) -> list[FocusTarget]:
+    """The shapes to build recipes for, by rising curvature.
+
+    Args:
+        error_max: largest coefficient error, m, that the model may leave.
+
+    Raises:
+        RecipeError: a curvature that is not finite or asked for twice, naming it.
+        UnreachableError: one out of reach.
+        TargetError: no such surface exists over the aperture.
+    """
+    for place, curvature in enumerate(curvatures):
+        if not math.isfinite(curvature):
+            raise RecipeError(f"curvatures[{place}] = {curvature}: must be a finite number")
+    ordered = sorted(float(curvature) for curvature in curvatures)
+    for one, next_one in pairwise(ordered):
+        if next_one - one <= SAME_CURVATURE:
+            raise RecipeError(f"curvatures: {one:+.4f} 1/m is there twice; each recipe once")
+    targets = [FocusTarget(curvature, conic_constant) for curvature in ordered]
+    for target in targets:
+        left = loop.mirror.plan(target).max_zernike
+        if left > error_max:
+            low, high = loop.mirror.reachable_range(target, error_max)
+            raise UnreachableError(
+                f"curvature = {target.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error of "
+                f"{left * 1e9:.1f} nm (allowed {error_max * 1e9:.1f} nm); reachable: {low:+.4f} to {high:+.4f} 1/m"
+            )
+    return targets
 
 
 def ending(error: Exception) -> tuple[str, int, str]:

@@ -21,7 +21,7 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import Recipe, RecipeBook, RecipeError
-from dm_controller.converge.recipe_targets import UnreachableError
+from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import interpolation_error
 from dm_controller.planning.target import FocusTarget

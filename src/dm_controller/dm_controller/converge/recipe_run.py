@@ -23,9 +23,8 @@ from dm_common.hysteresis.observer import Applied, HysteresisTracker
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import Recipe, RecipeError
 from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
-from dm_controller.converge.goals import check_figures, ending
+from dm_controller.converge.goals import UnreachableError, check_figures, ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
-from dm_controller.converge.recipe_targets import UnreachableError, recipe_targets
 from dm_controller.focus_actions import LoopBench
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget, TargetError

@@ -11,10 +11,7 @@ from dm_common.limits import Limits
 from dm_common.names import UnknownNameError
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Floats, Solver
-from dm_controller.solvers.bounded_command import Bounded
-from dm_controller.solvers.iterative_learning import IterativeLearning
-from dm_controller.solvers.pseudo_inverse import AZreg, PseudoInverse
-from dm_controller.solvers.region_weighted import AZWreg
+from dm_controller.solvers.least_squares import AZreg, AZWreg, Bounded, IterativeLearning, PseudoInverse
 
 #: The method taken when none is named.
 DEFAULT = Bounded.name

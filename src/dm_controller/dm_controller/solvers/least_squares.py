@@ -1,0 +1,154 @@
+"""The methods that closed loops offer: least squares, with and without the limits of the actuators."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dm_common.bounded import BoundedProgramme
+from dm_common.limits import Limits
+from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.sample_regions import AREA_FRACTIONS, command_row_weights
+from dm_common.optics.zernike import PISTON_TILT
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.solvers.base import Command, Floats, Shape, Solver, miss_rows, normalised_terms, points_of
+
+#: Singular values below this share of the largest are left out: they would turn noise into signals.
+CUTOFF = 1e-3
+#: β relative to the squared largest singular value of G: the price of a signal change.
+BETA = 1e-3
+#: Ridge of a correction, m per unit signal: only for actuators without any influence, which stay where they are.
+TINY = 1e-12
+
+
+class PseudoInverse(Solver):
+    """Δs = G⁺ Δc by singular value decomposition ([1], introduction, its reference 18).
+
+    The shortest of all signals that give the wanted coefficients beyond tilt. Nothing holds it inside the range
+    ("severe overflow of the control voltage", section 1), so it is clipped and reports by how much; and nothing holds
+    down the sag beyond the terms.
+    """
+
+    name = "pseudo_inverse"
+    source = "SVD pseudo-inverse of the influence matrix, reference 18 of [1]"
+
+    def __init__(self, model: InfluenceModel, limits: Limits) -> None:
+        super().__init__(model, limits)
+        matrix, self._factors = normalised_terms(model)
+        self._inverse = np.linalg.pinv(matrix, rcond=CUTOFF)
+
+    def _signals(self, start: Floats, change: Shape) -> Floats:
+        step: Floats = self._inverse @ (self._factors * change.coefficients[PISTON_TILT:])
+        return start + step
+
+
+class AZreg(PseudoInverse):
+    """Eq. (6): the least-squares solution Δs of Δc = GΔs with G fitted to all sample surfaces.
+
+    [1] gives no other command solve than this equation, so it differs from the pseudo-inverse only in the
+    influence function it is given: the regression on all surfaces of Table 1 in place of single pokes. Its way of
+    starting from a measured state (section 3.2: c_ini, s_ini of p55 or p56) is `correct(s_ini, c_ini - c)`.
+    """
+
+    name = "AZreg"
+    source = "Eq. (6), least squares on the 21 coefficients"
+
+
+class IterativeLearning(Solver):
+    """s_{k+1} = s_k + L e_k, L = (GᵀG + β)⁻¹Gᵀ (iterative learning control, references 12 and 13 of [1]).
+
+    [1] names the method, its about three iterations and what β does ("by decreasing β, we increase the convergence
+    speed", section 2.2), but no formula. Norm-optimal learning, min ‖e - GΔs‖² + β‖Δs‖² in each repetition [12], is the
+    form of it in which a β does just that. Between steepest descent (large β) and the pseudo-inverse (β = 0): weak
+    modes are learned over several maps, so that noise and a wrong G disturb them less.
+    """
+
+    name = "iterative_learning"
+    source = "iterative learning control, references 12 and 13 of [1]"
+
+    def __init__(self, model: InfluenceModel, limits: Limits, beta: float = BETA) -> None:
+        if not (np.isfinite(beta) and beta > 0.0):
+            raise ValueError(f"beta = {beta:g}: must be above 0 and finite; 0.001 is the default")
+        super().__init__(model, limits)
+        matrix, self._factors = normalised_terms(model)
+        left, singular, right = np.linalg.svd(matrix, full_matrices=False)
+        self._learning = (right.T * (singular / (singular**2 + beta * singular[0] ** 2))) @ left.T
+
+    def _signals(self, start: Floats, change: Shape) -> Floats:
+        step: Floats = self._learning @ (self._factors * change.coefficients[PISTON_TILT:])
+        return start + step
+
+
+class AZWreg(Solver):
+    """min over Δs of ‖W(Δz - HΔs)‖ on the sag points, W of Eq. (8); place (b) of `dm_calibration.influence.weights`.
+
+    On the coefficient vector W would cancel or act on coefficients, not regions; on the sag points, which outnumber
+    the actuators, a smaller weight lets a region keep more of the error. Piston and tilt are free: three columns of
+    their own in the weighted problem. Least squares as in Eq. (7), so the result is clipped and reports the overflow.
+    Corrections also weigh what actuators miss of their moves, see `miss_rows`.
+    """
+
+    name = "AZWreg"
+    source = "Eqs. (7) and (8), region-weighted least squares on the sag points"
+
+    def __init__(self, model: InfluenceModel, limits: Limits, region_weights: ArrayLike | None = None) -> None:
+        """`region_weights`: (10,) Eq. (8), from the centre outwards; None = all equal."""
+        super().__init__(model, limits)
+        weights = np.ones(len(AREA_FRACTIONS)) if region_weights is None else np.asarray(region_weights, dtype=float)
+        points = points_of(model)
+        self._row = command_row_weights(points, weights)
+        plane = self._row[:, None] * np.column_stack([np.ones(len(points)), points.x, points.y])
+        self._plane = np.linalg.qr(plane)[0]
+        influence = remove_piston_tilt(model.influence_sag.T, points).T
+        matrix = self._reduce(influence)
+        if not matrix.any():
+            raise ValueError("influence_sag is zero: no actuator moves the surface; calibrate first")
+        self._inverse = np.linalg.pinv(matrix, rcond=CUTOFF)
+        self._correction = np.linalg.pinv(np.vstack([matrix, miss_rows(matrix)]))[:, : len(matrix)]
+
+    def _reduce(self, sag: Floats) -> Floats:
+        """Weighted sag (P,) or (P, N) without what a weighted plane explains."""
+        weighted = (sag.T * self._row).T
+        result: Floats = weighted - self._plane @ (self._plane.T @ weighted)
+        return result
+
+    def _signals(self, start: Floats, change: Shape) -> Floats:
+        step: Floats = self._inverse @ self._reduce(change.sag)
+        return start + step
+
+    def correct(self, signals: Floats, error: Shape) -> Command:
+        """As in the base class, with moves priced by what the actuators miss of them."""
+        self._check(error)
+        self._check_signals(signals)
+        return self.limited(signals - self._correction @ self._reduce(error.sag))
+
+
+class Bounded(Solver):
+    """Least squares inside the box: `CalibratedMirror` for shapes and corrections of any kind.
+
+    The coefficients beyond tilt weigh so much that they act as equalities, the sag beyond the 21 terms is as small as
+    possible, and the limits hold by construction: nothing is ever clipped. Corrections also weigh what
+    actuators miss of their moves, see `miss_rows`.
+    """
+
+    name = "bounded"
+    source = "bounded quadratic programme ([9], chapter 23)"
+
+    def __init__(self, model: InfluenceModel, limits: Limits) -> None:
+        super().__init__(model, limits)
+        self._mirror = CalibratedMirror(model, limits)
+        # A correction must not pull at signals that the error says nothing of: its rows price moves, not signals.
+        self._miss = miss_rows(self._mirror.matrix)
+        self._correction = BoundedProgramme(np.vstack([self._mirror.matrix, self._miss]), limits, ridge=TINY**2)
+
+    def _signals(self, start: Floats, change: Shape) -> Floats:
+        # The programme bounds the signals themselves, so a change is asked for as the surface it leads to.
+        mirror = self._mirror
+        return mirror.solve(mirror.matrix @ start + mirror.rows(change.coefficients, change.sag))
+
+    def correct(self, signals: Floats, error: Shape) -> Command:
+        """As in the base class, with moves priced by what the actuators miss of them."""
+        self._check(error)
+        self._check_signals(signals)
+        wanted = self._mirror.matrix @ signals - self._mirror.rows(error.coefficients, error.sag)
+        return self.limited(self._correction.solve(np.concatenate([wanted, self._miss @ signals])))
