@@ -153,8 +153,8 @@ ELSEWHERE = {
     './dm exec python -c "import dm_client"': "would set up within the tests",
     "./dm exec pip install pre-commit": "needs the network",
     "./dm exec pre-commit install": "needs what the command before it installs",
-    "./dm exec python -m dm_tools.documentation.parameters > docs/parameters.md": "test_repository.py",
-    "./dm exec python -m dm_tools.documentation.interfaces > docs/interfaces.md": "test_interface_reference.py",
+    "./dm exec python -m studies.documentation.parameters > docs/parameters.md": "test_repository.py",
+    "./dm exec python -m studies.documentation.interfaces > docs/interfaces.md": "test_interface_reference.py",
 }
 #: What Python blocks take for granted, by page and number of the block on it.
 PRELUDES = {

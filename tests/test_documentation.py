@@ -31,8 +31,8 @@ from dm_client import DeformableMirrorClient
 from dm_tools.cli import app
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
-from dm_tools.documentation.parameters import TABLES
 from documentation import Block, blocks
+from studies.documentation.parameters import TABLES
 from support import wait_until
 
 pytestmark = pytest.mark.processes

@@ -15,11 +15,11 @@ from documentation import PAGES, ROOT
 def test_the_interface_page_is_what_the_code_says() -> None:
     """In a process of its own: it makes every node."""
     done = subprocess.run(
-        [sys.executable, "-m", "dm_tools.documentation.interfaces"], capture_output=True, text=True, timeout=200
+        [sys.executable, "-m", "studies.documentation.interfaces"], capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 0, done.stderr
     committed = (ROOT / "docs" / "interfaces.md").read_text()
-    assert committed == done.stdout, "./dm exec python -m dm_tools.documentation.interfaces > docs/interfaces.md"
+    assert committed == done.stdout, "./dm exec python -m studies.documentation.interfaces > docs/interfaces.md"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)

@@ -17,7 +17,7 @@ from rclpy.lifecycle import LifecycleNode
 from dm_bringup.nodes import NODES
 from dm_bringup.suite import load_config
 from dm_common.ros.parameters import REQUIRED
-from dm_tools.documentation.parameters import TABLES, parameters_page
+from studies.documentation.parameters import TABLES, parameters_page
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src"

@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
 from dm_common.ros.action_client import ThreadedActionClient
-from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, as_markdown, declare, real, reals, text, whole
+from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, declare, real, reals, text, whole
 from dm_common.ros.worker import (
     ServiceCallError,
     WorkerActionServer,
@@ -291,12 +291,6 @@ def test_live_parameters_are_checked_and_applied_on_set(observer: Observer) -> N
     assert changes == [{"gain": 5.0}]
     assert not node.set_parameters([RosParameter("serial", value="S2")])[0].successful
     node.destroy_node()
-
-
-def test_markdown_lists_every_parameter() -> None:
-    text = as_markdown(TABLE)
-    assert all(f"`{parameter.name}`" in text for parameter in TABLE)
-    assert "**required**" in text
 
 
 NODE_SCRIPT = """

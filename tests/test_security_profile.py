@@ -14,10 +14,10 @@ from dm_client import DeformableMirrorClient
 from dm_tools.cli import app
 from dm_tools.console.console_node import ConsoleNode
 from dm_tools.demo.demo_bench import bench_config
-from dm_tools.security.graph import declaration_of, differences
 from dm_tools.security.interfaces import interfaces
 from dm_tools.security.keystore import check_keystore, keys_missing
 from dm_tools.security.policy import Profile, dds_topics, write_profile
+from running_interfaces import declaration_of, differences
 from support import wait_until
 
 pytestmark = pytest.mark.processes

@@ -1,1 +1,1 @@
-"""Verbs of `dm` that run a study: bench, compare, paper."""
+"""Verbs of `dm` that a checkout has and an installation has not: bench, compare, paper, test."""

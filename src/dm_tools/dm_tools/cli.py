@@ -27,7 +27,7 @@ VERBS = {
     "security": "dm_tools.verbs.security",
     "doctor": "dm_tools.verbs.doctor",
     "check": "dm_tools.verbs.verify_calibration",
-    "test": "dm_tools.verbs.run_checks",
+    "test": "studies.verbs.run_checks",
 }
 #: Packages that are not installed: their verbs are there where the checkout is.
 CHECKOUT = ("studies", "fault_injection")

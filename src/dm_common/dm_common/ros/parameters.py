@@ -185,12 +185,3 @@ def declare(
     node.add_on_set_parameters_callback(validate)
     node.add_post_set_parameters_callback(apply)
     return values
-
-
-def as_markdown(table: Sequence[Parameter]) -> str:
-    """The table as a Markdown table, for the documentation."""
-    lines = ["| parameter | default | allowed | what it is |", "|---|---|---|---|"]
-    for parameter in table:
-        default = "**required**" if parameter.default is REQUIRED else f"`{parameter.default!r}`"
-        lines.append(f"| `{parameter.name}` | {default} | {parameter.allowed()} | {parameter.describe()} |")
-    return "\n".join(lines) + "\n"

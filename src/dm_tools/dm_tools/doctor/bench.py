@@ -7,9 +7,11 @@ import shutil
 import socket
 import time
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dm_bringup.nodes import NODES
 from dm_bringup.suite import Config, ConfigError, load_config
 from dm_common.names import unknown_name
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
@@ -57,15 +59,20 @@ def _folder_of(config: Config, node: str, name: str) -> Path | None:
     return Path(text).expanduser() if text and text != UNSET else None
 
 
-def _tables() -> Mapping[str, tuple[Parameter, ...]]:
-    from dm_tools.documentation.parameters import TABLES
+@cache
+def _known(name: str) -> dict[str, Parameter]:
+    """The parameters of a node, by their names."""
+    return {item.name: item for node in NODES if node.name == name for item in node.load_parameters()}
 
-    return TABLES
+
+def _effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a node that is started with those `given`."""
+    return {item.name: item.default for item in _known(name).values()} | dict(given)
 
 
 def required_parameters(config: Config) -> Finding | None:
     driver = config.get("pdm_driver", {})
-    missing = [item.name for item in _tables()["pdm_driver"] if item.default is REQUIRED and item.name not in driver]
+    missing = [name for name, item in _known("pdm_driver").items() if item.default is REQUIRED and name not in driver]
     if missing:
         return Finding(
             f"pdm_driver lacks {', '.join(missing)}", "add them; docs/parameters.md tells what each of them means"
@@ -84,7 +91,7 @@ def parameters(config: Config) -> Finding | None:
     """Names nobody knows, wrong types, values out of their range; all of them at once."""
     wrong: list[str] = []
     for node, values in config.items():
-        known = {item.name: item for item in _tables()[node]}
+        known = _known(node)
         for name, value in values.items():
             if name in known:
                 problem = "" if value == UNSET else _wrong(known[name], value)
@@ -118,9 +125,8 @@ def driver_configuration(config: Config) -> Finding | None:
     given = config.get("pdm_driver", {})
     if any(value == UNSET for value in given.values()) or required_parameters(config) or parameters(config):
         return None  # told already
-    values = {item.name: item.default for item in _tables()["pdm_driver"]} | given
     try:
-        build_configuration(values)
+        build_configuration(_effective("pdm_driver", given))
     except ValueError as error:
         return Finding(str(error), "correct the value; the driver refuses to configure with it")
     return None
@@ -205,15 +211,14 @@ def _holders(device: Path) -> list[str]:
 
 def free_ports(bench: Mapping[str, Any]) -> Finding | None:
     """Whether the ports that the bench wants are free."""
-    table = {item.name: item.default for item in _tables()["virtual_bench"]}
-    taken = []
+    values, taken = _effective("virtual_bench", bench), []
     for name, kind in (
         ("electronics.tcp_port", socket.SOCK_STREAM),
         ("electronics.udp_port", socket.SOCK_DGRAM),
         ("electronics.discovery_port", socket.SOCK_DGRAM),
         ("trigger.port", socket.SOCK_STREAM),
     ):
-        port = bench.get(name, table[name])
+        port = values[name]
         if not isinstance(port, int) or not 0 < port <= 65535:
             continue
         with socket.socket(socket.AF_INET, kind) as probe:
@@ -280,10 +285,9 @@ def stored_calibration(folder: Path, serial: str) -> Finding | None:
         )
     newest = own[0]
     assert newest is not None
-    table = {item.name: item.default for item in _tables()["calibration"]}
     checked = max(newest.created_ns * 1e-9, (folder / f"{newest.id}.h5").stat().st_mtime)  # updates rewrite the file
     days = (time.time() - checked) / DAY_S
-    if days * DAY_S > table["updates.stale_after"]:
+    if days * DAY_S > _known("calibration")["updates.stale_after"].default:
         return Finding(
             f"{newest.id} is {days:.0f} days old, and no map has been compared with it since",
             "./dm check tells whether it is still true, and mends small drifts; else ./dm calibrate",

@@ -1,4 +1,4 @@
-"""docs/interfaces.md from the code (`python -m dm_tools.documentation.interfaces`).
+"""docs/interfaces.md from the code (`python -m studies.documentation.interfaces`).
 
 Every node is made once, on a ROS domain of its own, and asked what it publishes, takes and serves; definitions come
 from the installed dm_msgs, commands from the `dm` command itself.
@@ -25,7 +25,7 @@ GRAPH_S = 20.0
 PART_TITLES = {"msg": ("",), "srv": ("request", "response"), "action": ("goal", "result", "feedback")}
 HEAD = """# Interfaces
 
-Written from the code by `./dm exec python -m dm_tools.documentation.interfaces`; a test keeps it true. Parameters are
+Written from the code by `./dm exec python -m studies.documentation.interfaces`; a test keeps it true. Parameters are
 on [a page of their own](parameters.md). Names are relative: with a namespace they lie in it. Units are SI where a
 comment names none; signals are normalised, −1 to +1; sag is that of the surface, positive curvature is concave.
 """

@@ -1,0 +1,38 @@
+"""docs/parameters.md from the tables that declare the parameters (`python -m studies.documentation.parameters`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dm_bringup.nodes import NODES
+from dm_common.ros.parameters import REQUIRED, Parameter
+
+#: Table of parameters by the name of the node, the virtual bench last.
+TABLES = {node.name: node.load_parameters() for node in (*NODES[1:], NODES[0])}
+
+
+def as_markdown(table: Sequence[Parameter]) -> str:
+    """A table of parameters in Markdown."""
+    lines = ["| parameter | default | allowed | what it is |", "|---|---|---|---|"]
+    for parameter in table:
+        default = "**required**" if parameter.default is REQUIRED else f"`{parameter.default!r}`"
+        lines.append(f"| `{parameter.name}` | {default} | {parameter.allowed()} | {parameter.describe()} |")
+    return "\n".join(lines) + "\n"
+
+
+def parameters_page() -> str:
+    """The page, in Markdown."""
+    parts = [
+        "# Parameters",
+        "",
+        "Written from the code by `./dm exec python -m studies.documentation.parameters`; a test keeps it true.",
+        "Numbers of type double need a point in YAML (`300.0`, not `300`): ROS 2 does not convert integers.",
+        "",
+    ]
+    for node, table in TABLES.items():
+        parts += [f"## {node}", "", as_markdown(table)]
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    print(parameters_page(), end="")
