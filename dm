@@ -48,7 +48,7 @@ On the bench
   record     write what the nodes say to an MCAP file;  replay  plays it back
   console    a web page of the bench, on the loopback
 
-On the twin, with figures
+On the simulation, with figures
   compare    all solvers, open and closed loop, beside the fitting limit (--hysteresis: hysteresis and creep)
   paper      the paper's tables and figures on one bench, as a page
   bench      how fast everything is, beside what one would use instead

@@ -227,7 +227,7 @@ def test_two_nodes_do_not_calibrate_into_one_folder(tmp_path: Path) -> None:
 def interrupted(
     kind: PlanKind, config: SimulationConfig, folder: Path, cuts: tuple[int, ...], maps: int = 100
 ) -> MapSet:
-    """The maps of a run on the twin, cut off before some of them, with the power off for an hour each time."""
+    """The maps of a run on the simulation, cut off before some of them, with the power off for an hour each time."""
     bench = SimulatedBench(config)
     options = PlanOptions(hysteresis_maps=maps)
     plan = make_plan(kind, bench.mirror, options)

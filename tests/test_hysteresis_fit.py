@@ -1,4 +1,4 @@
-"""The memory of a whole run on the twin, with maps that are missing or wrong."""
+"""Hysteresis and creep of a whole run on the simulation, with maps that are missing or wrong."""
 
 from __future__ import annotations
 

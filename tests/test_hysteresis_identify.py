@@ -1,4 +1,4 @@
-"""Identification of the memory on the twin's own actuators, and what it refuses."""
+"""Identification of hysteresis and creep on the simulation's own actuators, and what it refuses."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ pytestmark = pytest.mark.slow
 LINEAR = CANDIDATES[0]
 
 
-def twin_run(
+def simulated_run(
     law: str, maps: int = 150, noise: float = 2e-10, creep: float = 0.01, seed: int = 3
 ) -> tuple[Run, NDArray[np.bool_]]:
-    """A run of the excitation on the twin's actuators, seven of them, seen through a random matrix, and its checks."""
+    """A run of the excitation on seven of the simulation's actuators, seen through a random matrix, and its checks."""
     mirror = make_mirror(rings=1)
     rng = np.random.default_rng(seed)
     piezo = PiezoActuators(PiezoConfig(law=law, creep=creep), rng, np.zeros(mirror.actuators))
@@ -48,34 +48,34 @@ def held_out_rms(found: Identification) -> float:
 @pytest.fixture(scope="module")
 def rising() -> Run:
     """A run that can be spoilt."""
-    return twin_run("prandtl_ishlinskii", 80)[0]
+    return simulated_run("prandtl_ishlinskii", 80)[0]
 
 
 @pytest.mark.parametrize(
     ("law", "factor"), [("prandtl_ishlinskii", 20.0), ("preisach", 20.0), ("bouc_wen", 20.0), ("mixed", 8.0)]
 )
 def test_held_out_moves_are_predicted_much_better_than_by_a_linear_law(law: str, factor: float) -> None:
-    run, check = twin_run(law)
+    run, check = simulated_run(law)
     found, linear = identify(run, check), identify(run, check, [LINEAR])
     assert held_out_rms(linear) > factor * held_out_rms(found)
     assert found.fit.law.slope_min() > 0.1
 
 
 def test_the_creep_rate_is_found() -> None:
-    run, check = twin_run("prandtl_ishlinskii", creep=0.015)
-    # Rates are per unit of the settled step; the twin's are too.
+    run, check = simulated_run("prandtl_ishlinskii", creep=0.015)
+    # Rates are per unit of the settled step; the simulation's are too.
     assert identify(run, check, CANDIDATES[:2]).fit.law.creep_rate == pytest.approx(0.015, rel=0.05)
 
 
 def test_a_mirror_without_hysteresis_is_found_linear() -> None:
-    run, check = twin_run("none", creep=0.0)
+    run, check = simulated_run("none", creep=0.0)
     found = identify(run, check)
     assert found.fit.candidate is LINEAR
     assert held_out_rms(found) < 5e-10
 
 
 def test_maps_without_data_change_little() -> None:
-    run, check = twin_run("prandtl_ishlinskii")
+    run, check = simulated_run("prandtl_ishlinskii")
     usable = np.ones(len(run.time), dtype=bool)
     usable[10:14] = False
     values = np.where(usable[:, None], run.responses.values, 0.0)
@@ -115,13 +115,13 @@ def test_time_that_runs_backwards_is_refused(rising: Run) -> None:
 def test_more_maps_promise_more() -> None:
     promised = []
     for maps in (80, 160, 320):
-        run, check = twin_run("none", maps)
+        run, check = simulated_run("none", maps)
         promised.append(expected_accuracy(run.signals, run.time, check).max_zernike)
     assert promised[0] > 1.2 * promised[1] > 1.44 * promised[2]
 
 
 def test_a_promise_needs_check_moves_and_enough_maps() -> None:
-    run, check = twin_run("none", 60)
+    run, check = simulated_run("none", 60)
     with pytest.raises(ValueError, match="no moves that test"):
         expected_accuracy(run.signals, run.time, np.zeros_like(check))
     with pytest.raises(ValueError, match="must be more than"):

@@ -1,4 +1,4 @@
-"""Building recipes on the twin: what is stored makes the shape again, from the same condition, at another creep."""
+"""Building recipes on the simulation: what is stored makes the shape again, at another creep."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ WAVELENGTH = 632.8e-9
 
 
 class Stand:
-    """A calibrated twin with what its driver has reported since it was switched on."""
+    """A calibrated simulation with what its driver has reported since it was switched on."""
 
     def __init__(self) -> None:
         self.bench = SimulatedBench(SimulationConfig(law="preisach", seed=31, pixels=118, samples=200))

@@ -184,7 +184,7 @@ def test_region_weights_move_the_error_out_of_the_heavy_region(mirror: LinearMir
 
 
 def test_the_plate_model_resembles_a_free_edge_plate() -> None:
-    """Mechanics against mechanics: spline on springs against the twin's Rayleigh-Ritz solution, inside 22 mm."""
+    """Mechanics against mechanics: spline on springs against the simulation's Rayleigh-Ritz solution, inside 22 mm."""
     plate = Plate()
     grid = np.linspace(-0.011, 0.011, 23)
     x, y = (part.ravel() for part in np.meshgrid(grid, grid))

@@ -1,4 +1,4 @@
-"""Long runs: a steady stream of focus requests through controller, driver and twin, and whether anything grows.
+"""Long runs: a steady stream of focus requests through controller, driver and simulation, and whether anything grows.
 
 Each node is a process; memory, file handles and threads are read from /proc. Requests are a topic on which the latest
 wins: on a busy machine one may be overtaken by the next before it is looked at, so the number of answers is told too.
@@ -149,7 +149,7 @@ def soak(
         seconds: of requests, warm-up included.
         folder: for the nodes' files and logs.
         domain: ROS domain.
-        seed: of the twin and the requests.
+        seed: of the simulation and the requests.
         progress: called with the share that is done.
 
     Raises:

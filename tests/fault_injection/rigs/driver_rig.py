@@ -1,6 +1,7 @@
 """A real `pdm_driver` process against emulated electronics in this process, whose monitor judges every frame.
 
-The monitor belongs to the twin (:mod:`dm_simulation.electronics.monitor`) and shares no code with the driver's limiter.
+The monitor belongs to the simulation (:mod:`dm_simulation.electronics.monitor`) and shares no code with the driver's
+limiter.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A real `focus_controller` process in front of a driver rig, with a calibration and an interferometer played here.
 
-The calibration is that of an analytic plate whose memory was identified on the twin's actuators. The interferometer
-answers at once with the surface which that plate has under the signals that stand at the emulated electronics.
+The calibration is that of an analytic plate whose hysteresis was identified on the simulation's actuators. The
+interferometer answers at once with the surface which that plate has under the signals at the emulated electronics.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ _SERVICES = {
     ListCalibrations: "list_calibrations",
     SetFocus: "set_focus",
 }
-#: The calibration of the rig's twin by its file's name, measured once per process: every rig has the same twin.
+#: The calibration of the rig's simulation by its file's name, measured once per process: all rigs have the same.
 _CALIBRATION: dict[str, bytes] = {}
 _CALIBRATING = threading.Lock()
 

@@ -24,8 +24,8 @@ PLAYS, POWERS, SLOPE, CREEP_RATE = 20, 3, 1.5, 0.01
 #: Standard deviation of a coefficient of one map where no calibration tells it, m.
 TYPICAL_NOISE = 2e-10
 #: Standard deviation of a coefficient that stays however long the run is, m: steps of the electronics, creep older than
-#: the run, a law that is nearly right only. What held-out maps of twins show where (X'X)^-1 says much less, from 300
-#: maps on.
+#: the run, a law that is nearly right only. What held-out simulated maps show where (X'X)^-1 says much less, from
+#: 300 maps on.
 FLOOR = 3.5e-10
 #: Draws for quantiles of the largest of many errors.
 DRAWS = 4000

@@ -20,8 +20,8 @@ COEFFICIENT_WEIGHT = 100.0
 #: Combinations of coefficients that the actuators move less than this, relative to the one they move most, cannot be
 #: made equal to anything: with 19 actuators 3 of 18 stand below 2e-4, the others above 0.09; with 37 all above 0.1.
 LEAST_AUTHORITY = 0.01
-#: Ridge on the signals, as a share of a typical actuator's rms response. On a PDM30-37 twin it costs less than 1 % of
-#: the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
+#: Ridge on the signals, as a share of a typical actuator's rms response. On a simulated PDM30-37 it costs less than
+#: 1 % of the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
 RIDGE_SHARE = 0.01
 
 

@@ -28,15 +28,15 @@ def bench() -> SimulatedBench:
 
 
 def test_arrays_give_what_a_file_gives(bench: SimulatedBench, tmp_path: Path) -> None:
-    twin = bench.fork()
-    twin.apply(np.linspace(-0.5, 0.5, 37))
-    twin.settle()
-    sag = twin.take_map()
+    fork = bench.fork()
+    fork.apply(np.linspace(-0.5, 0.5, 37))
+    fork.settle()
+    sag = fork.take_map()
     path = tmp_path / "map.dat"
-    path.write_bytes(encode_dat(sag, twin.pitch, WAVELENGTH, 1_700_000_000))
+    path.write_bytes(encode_dat(sag, fork.pitch, WAVELENGTH, 1_700_000_000))
     np.testing.assert_allclose(read_map(path).sag, sag, atol=0.51 * COUNT)
-    ours = twin.measurement_of(sag)
-    surface, filed = Ingest(SMALL.samples).read(path, IngestSettings(aperture_radius=twin.mirror.working_radius))
+    ours = fork.measurement_of(sag)
+    surface, filed = Ingest(SMALL.samples).read(path, IngestSettings(aperture_radius=fork.mirror.working_radius))
     np.testing.assert_allclose(filed.coefficients, ours.coefficients, atol=COUNT)
     np.testing.assert_allclose(filed.sag, ours.sag, atol=COUNT)
     assert filed.valid_fraction == ours.valid_fraction
@@ -58,23 +58,23 @@ def test_a_seed_is_the_same_mirror_as_behind_the_sockets(bench: SimulatedBench) 
 
 
 def test_signals_stand_on_codes_of_the_dac(bench: SimulatedBench) -> None:
-    twin = bench.fork()
+    fork = bench.fork()
     wanted = np.random.default_rng(1).uniform(-0.6, 0.6, 37)
-    applied = twin.apply(wanted)
+    applied = fork.apply(wanted)
     step = 2 * 400.0 / 65535 / 300.0
     assert 0 < np.abs(applied - wanted).max() <= 0.5 * step
     np.testing.assert_allclose((applied + 1) / step, np.rint((applied + 1) / step), atol=1e-6)
 
 
 def test_moves_take_the_time_of_the_slew_limit(bench: SimulatedBench) -> None:
-    twin = bench.fork()
-    twin.apply(np.zeros(37))
-    before = twin.time
-    twin.apply(np.full(37, 0.8))
-    assert twin.time - before == pytest.approx(0.8 / 40.0)
-    twin.settle()
-    twin.measure("")
-    assert twin.time - before == pytest.approx(0.8 / 40.0 + SMALL.settle_time + SMALL.exposure)
+    fork = bench.fork()
+    fork.apply(np.zeros(37))
+    before = fork.time
+    fork.apply(np.full(37, 0.8))
+    assert fork.time - before == pytest.approx(0.8 / 40.0)
+    fork.settle()
+    fork.measure("")
+    assert fork.time - before == pytest.approx(0.8 / 40.0 + SMALL.settle_time + SMALL.exposure)
 
 
 def test_forks_go_their_own_ways_from_the_same_state(bench: SimulatedBench) -> None:
@@ -92,45 +92,45 @@ def test_forks_go_their_own_ways_from_the_same_state(bench: SimulatedBench) -> N
 def test_a_degauss_wipes_the_hysteresis(bench: SimulatedBench) -> None:
     shapes = []
     for first in (-0.9, 0.9):
-        twin = bench.fork()
-        twin.apply(np.full(37, first))
-        twin.degauss()
-        twin.time += 1e7  # creep of the two histories differs until it has died away
-        shapes.append(twin.true_map())
+        fork = bench.fork()
+        fork.apply(np.full(37, first))
+        fork.degauss()
+        fork.time += 1e7  # creep of the two histories differs until it has died away
+        shapes.append(fork.true_map())
     assert np.nanmax(np.abs(shapes[0] - shapes[1])) < 2e-9
 
 
 def test_illegal_signals_are_refused_and_move_nothing(bench: SimulatedBench) -> None:
-    twin = bench.fork()
-    before = twin.true_map()
+    fork = bench.fork()
+    before = fork.true_map()
     with pytest.raises(Refusal, match="must be -1 to 1"):
-        twin.apply(np.full(37, 1.2))
-    np.testing.assert_array_equal(twin.true_map(), before)
+        fork.apply(np.full(37, 1.2))
+    np.testing.assert_array_equal(fork.true_map(), before)
 
 
 @pytest.mark.parametrize("law", ["none", "bouc_wen"])
 def test_a_calibration_finds_the_true_influence(law: str) -> None:
-    twin = SimulatedBench(
+    bench = SimulatedBench(
         SimulationConfig(law=law, seed=3, creep=0.0 if law == "none" else 0.01, pixels=120, degauss_steps=20)
     )
     steps: list[int] = []
-    calibration = twin.calibrate(PlanKind.POKES, progress=lambda now: steps.append(now.done))
+    calibration = bench.calibrate(PlanKind.POKES, progress=lambda now: steps.append(now.done))
     assert len(steps) == plan_steps(PlanKind.POKES) + 1
     assert calibration.maps.points.x.size == 500
     model = influence_model(calibration.fit, calibration.aperture_radius)
-    true, _ = twin.true_influence()
-    rows, columns = np.nonzero(np.isfinite(twin.true_map()))
-    aperture = twin.aperture
+    true, _ = bench.true_influence()
+    rows, columns = np.nonzero(np.isfinite(bench.true_map()))
+    aperture = bench.aperture
     sag = np.full((SMALL.pixels, SMALL.pixels), np.nan)
     errors = []
     for actuator in range(37):
-        sag[rows, columns] = true[:, actuator] * twin.true_stroke[actuator]
-        wanted = twin.measurement_of(sag).coefficients[3:]
+        sag[rows, columns] = true[:, actuator] * bench.true_stroke[actuator]
+        wanted = bench.measurement_of(sag).coefficients[3:]
         errors.append(np.linalg.norm(model.influence_zernike[3:, actuator] - wanted) / np.linalg.norm(wanted))
     assert aperture.radius_px == pytest.approx(SMALL.pixels / 2)
     # Without hysteresis only noise is left (a few 0.1 nm of some 500 nm); with it, pokes are steeper or flatter.
     assert max(errors) < (0.01 if law == "none" else 0.2)
-    np.testing.assert_allclose(twin.apply(twin.mirror.rest), np.zeros(37), atol=1e-4)
+    np.testing.assert_allclose(bench.apply(bench.mirror.rest), np.zeros(37), atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Table 3 on the standard twin: what the plain linear model of [1] cannot predict, and what can be."""
+"""Table 3 on the standard simulation: what the plain linear model of [1] cannot predict, and what can be."""
 
 from __future__ import annotations
 

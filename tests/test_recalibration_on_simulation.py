@@ -1,4 +1,4 @@
-"""A hundred nights of drift on the twin: a map each night keeps true what would be wrong without."""
+"""A hundred nights of drift on the simulation: a map each night keeps true what would be wrong without."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ NIGHTS = 100
 ASTIGMATISM = 4
 
 
-class AgeingTwin:
-    """A Preisach twin whose gains and figure drift, with what its driver has reported."""
+class AgeingSimulation:
+    """A Preisach simulation whose gains and figure drift, with what its driver has reported."""
 
     def __init__(self) -> None:
         self.bench = SimulatedBench(SimulationConfig(law="preisach", seed=41))
@@ -63,24 +63,24 @@ class AgeingTwin:
 
 
 @pytest.fixture(scope="module")
-def twin() -> AgeingTwin:
-    return AgeingTwin()
+def simulation() -> AgeingSimulation:
+    return AgeingSimulation()
 
 
-def test_maps_of_the_nights_keep_the_calibration_true(twin: AgeingTwin, tmp_path: Path) -> None:
+def test_maps_of_the_nights_keep_the_calibration_true(simulation: AgeingSimulation, tmp_path: Path) -> None:
     updates = RecalibrationManager(tmp_path, UpdateOptions)
-    assert updates.begin(twin.calibration) == ""
+    assert updates.begin(simulation.calibration) == ""
     rng = np.random.default_rng(42)
     drift = 0.01 * rng.uniform(0.2, 1.0, 37)
     errors = []
     for night in range(NIGHTS):
         share = (night + 1) / NIGHTS
-        twin.age(drift * share, 20e-9 * share)
-        twin.night(rng)
-        measured = twin.measurement(twin.bench.take_map())
-        standing = twin.history.settled(1e-9 * measured.stamp_ns, 0.1)
-        fits = (twin.calibration.fit, updates.changed_fit())
-        errors.append([twin.error(fit, standing.effective) for fit in fits if fit is not None])
+        simulation.age(drift * share, 20e-9 * share)
+        simulation.night(rng)
+        measured = simulation.measurement(simulation.bench.take_map())
+        standing = simulation.history.settled(1e-9 * measured.stamp_ns, 0.1)
+        fits = (simulation.calibration.fit, updates.changed_fit())
+        errors.append([simulation.error(fit, standing.effective) for fit in fits if fit is not None])
         assert updates.take(measured, standing).accepted, night
     without, kept = np.median(errors[-20:], axis=0)
     assert kept < 0.2 * without
@@ -90,10 +90,10 @@ def test_maps_of_the_nights_keep_the_calibration_true(twin: AgeingTwin, tmp_path
     assert before.drift.offset_rms == pytest.approx(20e-9, rel=0.2)
 
     # A map of a bumped bench changes nothing.
-    twin.age(drift, 40e-9)
-    twin.night(rng)
-    bumped = twin.measurement(twin.bench.take_map())
-    verdict = updates.take(bumped, twin.history.settled(1e-9 * bumped.stamp_ns, 0.1))
+    simulation.age(drift, 40e-9)
+    simulation.night(rng)
+    bumped = simulation.measurement(simulation.bench.take_map())
+    verdict = updates.take(bumped, simulation.history.settled(1e-9 * bumped.stamp_ns, 0.1))
     assert not verdict.accepted
     after = updates.updates
     assert after is not None
