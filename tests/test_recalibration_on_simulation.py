@@ -31,13 +31,13 @@ class AgeingSimulation:
         self.history = AppliedHistory()
         assert self.calibration.hysteresis is not None
         self.history.follow(self.calibration.hysteresis.law)
-        self._gain = self.bench._piezo.gain.copy()
+        self._gain = self.bench.piezo.gain.copy()
         self._heard = 0
         self._figure = 0.0
         self.bench.degauss()
 
     def age(self, gain: np.ndarray | float, astigmatism_rms: float) -> None:
-        self.bench._piezo.gain = self._gain * (1.0 + gain)
+        self.bench.piezo.gain = self._gain * (1.0 + gain)
         self._figure = astigmatism_rms / TERM_RMS[ASTIGMATISM]
 
     def night(self, rng: np.random.Generator) -> None:

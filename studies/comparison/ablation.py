@@ -14,13 +14,10 @@ import numpy as np
 
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.procedure import Progress
-from dm_common.hysteresis.observer import HysteresisTracker
-from dm_controller.creep_hold import PERIOD_S
-from dm_controller.planning.planner import SETTLE_S, Move
-from dm_controller.planning.recipes import find
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.ablation_figures import Ablation, Identified, Requests, Series
 from studies.comparison.ablation_models import MODELS, Variant, make_variants
+from studies.comparison.driven_mirror import DrivenMirror
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, plan_steps
 from studies.comparison.true_surface import TrueSurface
 
@@ -37,9 +34,6 @@ DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
 CURVATURE_MAX = 0.05
 #: The longest hold, from when its drift counts, and the curvature, s, s, 1/m.
 HOLD_S, HOLD_FROM_S, HOLD_CURVATURE = 3600.0, 1.0, 0.03
-#: Share of the time since the move that the next correction of a held shape waits: creep slows down like that, and an
-#: experiment need not correct more often than it matters. The first ones come as the controller's do.
-CORRECTION_GROWTH = 0.07
 
 
 @dataclass(frozen=True)
@@ -71,48 +65,6 @@ class AblationOptions:
                 raise ValueError(f"history = {name!r}: must be one of {', '.join(HISTORIES)}")
 
 
-class _Mirror:
-    """A simulation under one model: moves, holds, follows hysteresis and creep."""
-
-    def __init__(self, bench: SimulatedBench, variant: Variant) -> None:
-        self.bench, self._variant = bench, variant
-        self._tracker = HysteresisTracker(variant.loop.law)
-        self._seen = 0
-        self._follow()
-
-    def _follow(self) -> None:
-        for report in self.bench.reports[self._seen :]:
-            self._tracker.observe(report)
-        self._seen = len(self.bench.reports)
-
-    def move(self, target: FocusTarget) -> Move:
-        effective, error = None, None
-        if self._variant.book.recipes:
-            found = find(self._variant.book, target)
-            effective, error = found.effective, found.error
-            self.bench.degauss()
-        self._follow()
-        tracker, loop = self._tracker, self._variant.loop
-        move = loop.plan(target, tracker.state, self.bench.time, tracker.known, effective, SETTLE_S, error)
-        self.bench.apply(move.plan.signals)
-        return move
-
-    def hold(self, move: Move, dwell: float) -> None:
-        """Let `dwell` s pass since the move, correcting what creep does."""
-        began = self.bench.time
-        passed = PERIOD_S
-        while self._variant.holds and passed < dwell:
-            self.bench.time = began + passed
-            self._follow()
-            wait = min(max(PERIOD_S, CORRECTION_GROWTH * passed), dwell - passed)
-            assert self._tracker.state is not None
-            self.bench.apply(
-                self._variant.loop.hold(self._tracker.state, self.bench.time, move.effective, 0.5 * wait)
-            )  # fmt: skip
-            passed += wait
-        self.bench.time = began + dwell
-
-
 def _prepare(bench: SimulatedBench, history: str, power_off: float) -> SimulatedBench:
     bench = bench.fork()
     if history == POWER_CYCLE:
@@ -127,11 +79,11 @@ def _sequence(
     bench: SimulatedBench, variant: Variant, surface: TrueSurface, curvatures: Floats, dwells: Floats, limits: Floats
 ) -> tuple[Requests, float]:
     """The requests in order, and then the drift of a shape held for an hour, m."""
-    mirror = _Mirror(bench, variant)
+    mirror = DrivenMirror(bench, variant.loop, variant.holds, variant.book)
     targets = [FocusTarget(float(c)) for c in curvatures]
     upper, stands = [], []
     for target, dwell in zip(targets, dwells, strict=True):
-        move = mirror.move(target)
+        move = mirror.go(mirror.plan(target))
         mirror.hold(move, float(dwell))
         upper.append(move.plan.max_zernike_upper)
         stands.append(bench.true_displacement)
@@ -140,10 +92,10 @@ def _sequence(
     return requests, _drift(mirror, surface)
 
 
-def _drift(mirror: _Mirror, surface: TrueSurface) -> float:
+def _drift(mirror: DrivenMirror, surface: TrueSurface) -> float:
     """Largest change of a coefficient while a shape is held for HOLD_S, from HOLD_FROM_S after the move on, m."""
     target = FocusTarget(HOLD_CURVATURE)
-    move = mirror.move(target)
+    move = mirror.go(mirror.plan(target))
     stands = []
     began = mirror.bench.time
     mirror.hold(move, HOLD_FROM_S)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from dm_simulation.interferometer.interferometer import InterferometerConfig
+from dm_simulation.mirror.piezo import PiezoConfig
+from dm_simulation.mirror.plate import PlateConfig
 
 
 @dataclass(frozen=True)
@@ -10,10 +14,11 @@ class SimulationConfig:
     """Which simulation, and how it is operated.
 
     Attributes:
-        law: hysteresis law: none, prandtl_ishlinskii, preisach, bouc_wen or mixed.
-        seed: of gains, figure and noise.
+        law: hysteresis law, one of dm_simulation's.
+        seed: of gains, figure and noise, and of laws that are drawn.
         hysteresis: loop opening as a share of the stroke.
         creep: per decade of time.
+        piezo, plate, instrument: everything else of the stacks, the plate and the interferometer; its camera apart.
         pixels: the camera has pixels x pixels; a small one is quicker, its terms hardly noisier, for the low-order
             noise of an interferometer does not average out.
         samples: sampling points.
@@ -27,6 +32,9 @@ class SimulationConfig:
     seed: int = 1
     hysteresis: float = 0.10
     creep: float = 0.01
+    piezo: PiezoConfig = field(default_factory=PiezoConfig)
+    plate: PlateConfig = field(default_factory=PlateConfig)
+    instrument: InterferometerConfig = field(default_factory=InterferometerConfig)
     pixels: int = 236
     samples: int = 500
     settle_time: float = 0.5

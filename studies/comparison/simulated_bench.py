@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
 from dm_simulation.electronics.drive_unit import EDAC40_FULL_SCALE, DriveConfig, DriveUnit
 from dm_simulation.electronics.frames import EDAC40_VALUE, EdacFrame
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
-from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+from dm_simulation.mirror.piezo import PiezoActuators
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
 from studies.comparison.bench_config import SimulationConfig
 
@@ -53,6 +54,7 @@ class SimulatedBench:
     Attributes:
         mirror: what the calibration is told of it.
         limits: what solvers are told of it.
+        piezo: its actuators, which nothing but an experiment may touch.
         time: s since the start.
         maps: maps taken so far.
         reports: what the driver would have reported after each move, from the first power-on.
@@ -61,7 +63,7 @@ class SimulatedBench:
     def __init__(self, config: SimulationConfig | None = None) -> None:
         self.config = config = config or SimulationConfig()
         gains, figure, noise = (np.random.default_rng(s) for s in np.random.SeedSequence(config.seed).spawn(3))
-        self.plate = Plate(PlateConfig())
+        self.plate = Plate(config.plate)
         self._drive = DriveUnit(DriveConfig())
         drive = self._drive.config
         self._scale = VoltScale(
@@ -73,10 +75,10 @@ class SimulatedBench:
             drive.volts_max,
         )
         self._channels = np.asarray(drive.wiring)
-        piezo = PiezoConfig(law=config.law, hysteresis=config.hysteresis, creep=config.creep)
-        self._piezo = PiezoActuators(piezo, gains, self._drive.signals(), 0.0)
+        piezo = replace(config.piezo, law=config.law, hysteresis=config.hysteresis, creep=config.creep)
+        self.piezo = PiezoActuators(piezo, gains, self._drive.signals(), 0.0)
         share = (config.pixels / FULL_CAMERA) ** 2
-        camera = InterferometerConfig(pixels=config.pixels, specks=round(InterferometerConfig().specks * share))
+        camera = replace(config.instrument, pixels=config.pixels, specks=round(config.instrument.specks * share))
         self._interferometer = Interferometer(camera, self.plate, figure, noise)
         self._noise = noise
         self._points = edge_clustered_points(config.samples)
@@ -102,7 +104,7 @@ class SimulatedBench:
     def fork(self) -> SimulatedBench:
         """A second bench in exactly this state, noise to come included, so that methods can be compared."""
         other = copy.copy(self)
-        other._drive, other._piezo = copy.deepcopy(self._drive), copy.deepcopy(self._piezo)
+        other._drive, other.piezo = copy.deepcopy(self._drive), copy.deepcopy(self.piezo)
         other._noise = copy.deepcopy(self._noise)
         other._interferometer = self._interferometer.with_noise(other._noise)
         other._fitter = None
@@ -133,11 +135,16 @@ class SimulatedBench:
         self._report()
         return self._drive.signals()
 
+    def power_cut(self, signals: Floats, share: float) -> None:
+        """Set off for `signals` (N,) and cut the power after `share` of the way."""
+        way = list(self._limiter.ramp(self._written, self._limiter.check_shape(signals)))
+        self._follow(way[: round(share * len(way))])
+
     def power_cycle(self, off: float) -> None:
         """Switch the electronics off for `off` s and on again: the actuators rest at 0 V, the driver starts anew."""
         self._drive = DriveUnit(self._drive.config)
         self._written = self._drive.signals()
-        self._piezo.apply(self._written, self.time)
+        self.piezo.apply(self._written, self.time)
         self.time += off
         self._moved = self.time
         self._turns = self._degausses = 0
@@ -155,7 +162,7 @@ class SimulatedBench:
         told = -REPORT_INTERVAL_S
         for shape in shapes:
             self._drive.take_edac40(EdacFrame(EDAC40_VALUE, self._channels, self._scale.codes(shape)))
-            self._piezo.apply(self._drive.signals(), self.time)
+            self.piezo.apply(self._drive.signals(), self.time)
             self._moved = self.time
             self.time += self._limiter.pause_after(self._written, shape)
             self._written = shape
@@ -178,13 +185,13 @@ class SimulatedBench:
 
     def take_map(self) -> Floats:
         """One noisy map (pixels, pixels), m, at this moment; row 0 = top, NaN = no data."""
-        self._piezo.advance(self.time)
-        return self._interferometer.measure(self._piezo.displacement)
+        self.piezo.advance(self.time)
+        return self._interferometer.measure(self.piezo.displacement)
 
     def true_map(self) -> Floats:
         """The noise-free surface (pixels, pixels), m, at this moment: for judging only."""
-        self._piezo.advance(self.time)
-        return self._interferometer.true_sag(self._piezo.displacement)
+        self.piezo.advance(self.time)
+        return self._interferometer.true_sag(self.piezo.displacement)
 
     @property
     def pitch(self) -> float:
@@ -229,14 +236,14 @@ class SimulatedBench:
     @property
     def true_displacement(self) -> Floats:
         """(N,) base displacements at this moment, m: for judging only."""
-        self._piezo.advance(self.time)
-        return np.asarray(self._piezo.displacement)
+        self.piezo.advance(self.time)
+        return np.asarray(self.piezo.displacement)
 
     @property
     def true_stroke(self) -> Floats:
         """(N,) largest base displacement from mid range of each actuator, m: for judging only."""
-        config = self._piezo.config
-        return np.asarray(0.5 * config.stroke * self._piezo.gain)
+        config = self.piezo.config
+        return np.asarray(0.5 * config.stroke * self.piezo.gain)
 
     # --- calibration ---
 

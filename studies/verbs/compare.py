@@ -100,7 +100,13 @@ def compare(
         bool,
         typer.Option("--hysteresis", help="What each part of the model brings: hysteresis, creep, recipes."),
     ] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="With --hysteresis: fewer maps and requests.")] = False,
+    mirrors: Annotated[
+        int,
+        typer.Option(min=0, help="So many mirrors drawn at random, one a seed, from --seed on: open loop, all told."),
+    ] = 0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="With --hysteresis or --mirrors: fewer maps and requests.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Compare all methods on the virtual bench: spheres from -0.05 to +0.05 1/m in random order.
@@ -108,7 +114,13 @@ def compare(
     Runs in process, without nodes. Errors are those of the true surface, which only a simulation knows.
     With --hysteresis it is models that are compared, in open loop: any order, dwell times from 0.1 s to 10 min, tracked
     from the calibration on, after a degauss and after a power cycle.
+    With --mirrors it is mirrors: each of another law and other parameters, at the shipped limits, with restarts.
     """
+    if mirrors:
+        if seed and len(seed) > 1:
+            raise typer.BadParameter("with --mirrors it is the first of the seeds: give one", param_hint="--seed")
+        _compare_mirrors(seed[0] if seed else 1, mirrors, quick, json)
+        return
     if hysteresis:
         _compare_hysteresis(plant, tuple(seed or (1,)), creep, pixels, quick, json)
         return
@@ -167,5 +179,16 @@ def _compare_hysteresis(
         "ablation": compare_hysteresis.rows_of(result),
         "identified": compare_hysteresis.identified_of(result),
     }
+    write_json(json, figures | {"seconds": time.monotonic() - started})
+    console.print(f"done in {time.monotonic() - started:.0f} s")
+
+
+def _compare_mirrors(first: int, count: int, quick: bool, json: Path | None) -> None:
+    from studies.verbs import compare_mirrors
+
+    started = time.monotonic()
+    rows = [compare_mirrors.row_of(outcome) for outcome in compare_mirrors.run(range(first, first + count), quick)]
+    compare_mirrors.show(rows)
+    figures = {"seeds": [row["seed"] for row in rows], "population": compare_mirrors.figures_of(rows), "mirrors": rows}
     write_json(json, figures | {"seconds": time.monotonic() - started})
     console.print(f"done in {time.monotonic() - started:.0f} s")

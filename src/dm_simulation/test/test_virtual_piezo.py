@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, PreisachHysteresis
+from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, PreisachHysteresis, skew_density
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 
 Array = NDArray[np.float64]
-HYSTERETIC = ("prandtl_ishlinskii", "preisach", "bouc_wen")
-RETURN_POINT = ("prandtl_ishlinskii", "preisach")
+HYSTERETIC = ("prandtl_ishlinskii", "preisach", "bouc_wen", "drawn_preisach", "drawn_bouc_wen")
+RETURN_POINT = ("prandtl_ishlinskii", "preisach", "drawn_preisach")
 signal = st.floats(-1, 1, allow_nan=False)
 
 
@@ -59,7 +59,8 @@ def test_rate_independence(law: str, turns: list[float], cuts: int) -> None:
     for turn in turns:
         whole = drive(at_once, turn)[-1]
         cut = drive(in_steps, *np.linspace(last, turn, cuts + 1)[1:])[-1]
-        assert cut == pytest.approx(whole, abs=1e-12)
+        # Bouc-Wen laws are integrated, the others exact.
+        assert cut == pytest.approx(whole, abs=1e-5 if "bouc_wen" in law else 1e-12)
         last = turn
 
 
@@ -121,8 +122,8 @@ def test_preisach_equals_a_crowd_of_relays() -> None:
     radii, centres = 128, 1200
     r = (np.arange(radii) + 0.5) / radii
     v = (np.arange(centres) + 0.5) / centres * 4 - 2
-    law = PreisachHysteresis(1)
-    weight = law.density(v[None, :], r[:, None]) * (4 / centres) / radii
+    law = PreisachHysteresis(1, skew_density)
+    weight = skew_density(v[None, :], r[:, None]) * (4 / centres) / radii
     up = np.repeat((v < 0)[None, :], radii, axis=0)
     start = (weight * up).sum()
     rng = np.random.default_rng(5)

@@ -1,19 +1,25 @@
 """Hysteresis laws of piezo ceramics: rate-independent, one state per actuator, vectorised over actuators.
 
 Each law is a reversible straight line plus a part m that depends on the past: y = scale (u + weight m[u]). Weight and
-scale follow from a simulated full cycle, such that y spans 2 over signals -1..+1 (total stroke 1 in units of half the
-stroke each way) and the loop opens by `fraction` of the total stroke where it is widest, which is how vendors state
-hysteresis.
+scale of each actuator follow from simulated full cycles, such that y spans 2 over signals -1..+1 (total stroke 1 in
+units of half the stroke each way) and the loop opens by `fraction` of the total stroke where it is widest, which is how
+vendors state hysteresis.
 """
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from functools import cache
 
 import numpy as np
 
+from dm_simulation.mirror.preisach import PreisachOperator, Relays, drawn_density
 from dm_simulation.mirror.zernike import Array
+
+#: Bouc-Wen laws are integrated in steps of at most so much of a signal.
+BOUC_WEN_STEP = 0.02
+#: Points of a sweep and cycles from which the opening of a loop is taken.
+SWEEP_POINTS, SWEEP_CYCLES = 101, 2
 
 
 class HysteresisLaw(ABC):
@@ -34,181 +40,173 @@ class NoHysteresis(HysteresisLaw):
         return self._zero
 
 
-class PlayHysteresis(HysteresisLaw):
-    """Prandtl-Ishlinskii: a weighted sum of play (backlash) operators with 40 half-widths.
-
-    Weights fall exponentially with the half-width, so that small moves have narrow loops. The loops are symmetric.
-    """
-
-    def __init__(self, count: int, radii: int = 40, decay: float = 0.25) -> None:
-        self._radius = (np.arange(radii) + 0.5) / radii
-        self._weight = np.exp(-self._radius / decay) / radii
-        self._play = np.zeros((count, radii))
-
-    def move(self, u: Array) -> Array:
-        u = u[:, None]
-        np.clip(self._play, u - self._radius, u + self._radius, out=self._play)
-        return self._play @ self._weight
-
-
 class PreisachHysteresis(HysteresisLaw):
-    """Preisach operator: relays switching up at v + r and down at v - r, with a density that is not symmetric in v.
+    """A Preisach operator whose density of relays is that of every actuator, or each actuator's own."""
 
-    The relays of half-width r that are up are those with v below the value of a play operator of that half-width ([16],
-    section 2.4), so the density integrated over v up to the play value is the output. That is continuous in u, where a
-    grid of relays would climb in stairs. Density: exp(-r/decay) (1 + skew v - bend v^2), positive over the whole range
-    of the electronics.
-    """
-
-    def __init__(
-        self, count: int, radii: int = 128, decay: float = 0.3, skew: float = 0.45, bend: float = 0.12
-    ) -> None:
-        self._radius = (np.arange(radii) + 0.5) / radii
-        self._weight = np.exp(-self._radius / decay) / radii
-        self._decay = decay
-        self._skew = skew
-        self._bend = bend
-        self._interface = np.zeros((count, radii))
-
-    def density(self, v: Array, r: Array) -> Array:
-        """Density of relays at centre v and half-width r, per unit of each."""
-        return np.exp(-r / self._decay) * (1 + self._skew * v - self._bend * v * v)
+    def __init__(self, count: int, relays: Relays) -> None:
+        self._operator = PreisachOperator(count, relays)
 
     def move(self, u: Array) -> Array:
-        v = self._interface
-        np.clip(v, u[:, None] - self._radius, u[:, None] + self._radius, out=v)
-        return (v * (1 + v * (self._skew / 2 - v * (self._bend / 3)))) @ self._weight
+        return self._operator.move(u)
+
+
+def prandtl_ishlinskii_density(v: Array, r: Array) -> Array:
+    """Relays whose number falls exponentially with the half-width, wherever their centre: loops are symmetric."""
+    return np.exp(-r / 0.25) + 0.0 * v
+
+
+def skew_density(v: Array, r: Array) -> Array:
+    """Relays of which there are more on one side, positive over the whole range of the electronics."""
+    return np.exp(-r / 0.3) * (1 + 0.45 * v - 0.12 * v * v)
 
 
 class BoucWenHysteresis(HysteresisLaw):
-    """Bouc-Wen: dz = du - (beta |du| z + gamma du |z|), the lag -z ([19] with n = 1).
+    """Bouc-Wen of any order n, the lag -z: along the way dz/d|u| = 1 - onward |z|^n, with onward = -back against it.
 
-    For n = 1 every monotone move has a closed form, so the result does not depend on how a move is cut into steps. The
-    law has no return-point memory: a minor loop does not close exactly.
+    The generalised law of [20] with three constants: z saturates earlier on falling than on rising moves where the two
+    values of `onward` differ. [19] with n = 1 is onward = beta + gamma, back = beta - gamma. The law has no
+    return-point memory: a minor loop does not close exactly.
+
+    Args:
+        order, rising, falling, back: n, `onward` of rising and of falling moves, `back`; numbers, or (N,).
     """
 
-    def __init__(self, count: int, beta: float = 1.6, gamma: float = 0.6) -> None:
-        self._rising = beta + gamma
-        self._returning = beta - gamma
+    def __init__(
+        self, count: int, order: Array | float, rising: Array | float, falling: Array | float, back: Array | float
+    ) -> None:
+        self._order, self._back = order, back
+        self._rising, self._falling = rising, falling
         self._z = np.zeros(count)
         self._u = np.zeros(count)
 
     def move(self, u: Array) -> Array:
-        way = np.sign(u - self._u)
-        left = np.abs(u - self._u)
+        way, left = np.sign(u - self._u), np.abs(u - self._u)
+        onward = np.where(way > 0, self._rising, self._falling)
         z = way * self._z  # a falling move is a rising one with both signs turned
-        # While z < 0: dz/du = 1 - returning z. It reaches zero after `to_zero`.
-        below = np.minimum(z, 0.0)
-        to_zero = np.log1p(-self._returning * below) / self._returning
-        first = np.minimum(left, to_zero)
-        limit = 1 / self._returning
-        z_below = limit + (below - limit) * np.exp(-self._returning * first)
-        # From zero on: dz/du = 1 - rising z.
-        start = np.maximum(z, 0.0)
-        limit = 1 / self._rising
-        z_above = limit + (start - limit) * np.exp(-self._rising * (left - first))
-        moved = np.where((z < 0) & (left <= to_zero), z_below, z_above)
-        self._z = np.where(way == 0, self._z, way * moved)
-        self._u = np.array(u, float)
-        return -self._z
 
+        def slope(z: Array) -> Array:
+            return 1 - np.where(z > 0, onward, -np.asarray(self._back)) * np.abs(z) ** self._order
 
-class AsymmetricBoucWenHysteresis(HysteresisLaw):
-    """Bouc-Wen of order 2 that saturates earlier on falling than on rising moves, the lag -z.
-
-    Along the way, dz/d|u| = 1 - onward z^2 where z points along the way and 1 + back z^2 where it points against it
-    (the generalised law of [20] with three constants). Monotone moves have a closed form.
-    """
-
-    def __init__(self, count: int, onward: tuple[float, float] = (2.0, 3.2), back: float = 0.8) -> None:
-        self._onward = onward
-        self._back = back
-        self._z = np.zeros(count)
-        self._u = np.zeros(count)
-
-    def move(self, u: Array) -> Array:
-        way = np.sign(u - self._u)
-        left = np.abs(u - self._u)
-        z = way * self._z
-        # While z < 0 it is a tangent of the way, which reaches zero after `to_zero`.
-        rate = np.sqrt(self._back)
-        angle = np.arctan(rate * np.minimum(z, 0.0))
-        to_zero = -angle / rate
-        first = np.minimum(left, to_zero)
-        z_below = np.tan(angle + rate * first) / rate
-        # From zero on a hyperbolic tangent.
-        limit = 1 / np.sqrt(np.where(way < 0, self._onward[1], self._onward[0]))
-        start = np.minimum(np.maximum(z, 0.0) / limit, 1 - 1e-12)
-        z_above = limit * np.tanh(np.arctanh(start) + (left - first) / limit)
-        moved = np.where((z < 0) & (left <= to_zero), z_below, z_above)
-        self._z = np.where(way == 0, self._z, way * moved)
+        steps = max(1, int(np.ceil(left.max() / BOUC_WEN_STEP)))
+        step = left / steps
+        for _ in range(steps):  # Runge-Kutta of order 4
+            first = slope(z)
+            second = slope(z + step / 2 * first)
+            third = slope(z + step / 2 * second)
+            z = z + step / 6 * (first + 2 * second + 2 * third + slope(z + step * third))
+        self._z = np.where(way == 0, self._z, way * z)
         self._u = np.array(u, float)
         return -self._z
 
 
 class MixedHysteresis(HysteresisLaw):
-    """Half the loop by a Preisach operator, half by an asymmetric Bouc-Wen law of order 2."""
+    """A weighted sum of two laws."""
 
-    def __init__(self, count: int, preisach: float = 4.0, bouc_wen: float = 0.5) -> None:
-        self._preisach = PreisachHysteresis(count)
-        self._bouc_wen = AsymmetricBoucWenHysteresis(count)
-        self._weight = (preisach, bouc_wen)
+    def __init__(self, parts: tuple[tuple[Array | float, HysteresisLaw], ...]) -> None:
+        self._parts = parts
 
     def move(self, u: Array) -> Array:
-        return self._weight[0] * self._preisach.move(u) + self._weight[1] * self._bouc_wen.move(u)
+        return np.sum([weight * law.move(u) for weight, law in self._parts], axis=0)
 
 
-_LAWS = {
-    "none": NoHysteresis,
-    "prandtl_ishlinskii": PlayHysteresis,
-    "preisach": PreisachHysteresis,
-    "bouc_wen": BoucWenHysteresis,
-    "mixed": MixedHysteresis,
-}
-LAWS = tuple(_LAWS)
+def _drawn_preisach(count: int, rng: np.random.Generator) -> HysteresisLaw:
+    return PreisachHysteresis(count, drawn_density(count, rng))
+
+
+def _drawn_bouc_wen(count: int, rng: np.random.Generator) -> HysteresisLaw:
+    """Order and constants of the mirror, from which those of an actuator differ by a tenth."""
+    middle = (rng.uniform(0.8, 3.0), rng.uniform(1.5, 3.0), rng.uniform(1.5, 3.0), rng.uniform(0.3, 1.2))
+    own = np.exp(0.1 * rng.standard_normal((4, count)))
+    return BoucWenHysteresis(count, *(own * np.array(middle)[:, None]))
+
+
+def _drawn_mixed(count: int, rng: np.random.Generator) -> HysteresisLaw:
+    """Both in parts that differ between the actuators, each law alone with a loop of the same opening."""
+    share = np.clip(rng.uniform(0.2, 0.8) + 0.1 * rng.standard_normal(count), 0.0, 1.0)
+    parts = []
+    for law, part in ((_drawn_preisach(count, rng), share), (_drawn_bouc_wen(count, rng), 1 - share)):
+        rising, falling = _full_loop(law, count)
+        parts.append((part / np.max(falling - rising, axis=0), law))
+    return MixedHysteresis(tuple(parts))
+
+
+def _make(law: str, count: int, rng: np.random.Generator) -> HysteresisLaw:
+    match law:
+        case "none":
+            return NoHysteresis(count)
+        case "prandtl_ishlinskii":
+            return PreisachHysteresis(count, prandtl_ishlinskii_density)
+        case "preisach":
+            return PreisachHysteresis(count, skew_density)
+        case "bouc_wen":
+            return BoucWenHysteresis(count, 1.0, 2.2, 2.2, 1.0)
+        case "mixed":
+            bouc_wen = BoucWenHysteresis(count, 2.0, 2.0, 3.2, 0.8)
+            return MixedHysteresis(((4.0, PreisachHysteresis(count, skew_density)), (0.5, bouc_wen)))
+        case "drawn_preisach":
+            return _drawn_preisach(count, rng)
+        case "drawn_bouc_wen":
+            return _drawn_bouc_wen(count, rng)
+        case "drawn_mixed":
+            return _drawn_mixed(count, rng)
+    raise ValueError(f"piezo.law = {law!r}: must be one of {', '.join(LAWS)}")
+
+
+#: Laws whose name begins with `drawn` are drawn at random, for each actuator its own; the others are all actuators'.
+LAWS = (
+    *("none", "prandtl_ishlinskii", "preisach", "bouc_wen", "mixed"),
+    *("drawn_preisach", "drawn_bouc_wen", "drawn_mixed"),
+)
 
 
 class Hysteresis:
-    """A law for `count` actuators with the same shape.
+    """A law for `count` actuators.
 
     Args:
         law: one of LAWS.
-        fraction: largest opening of the full loop over -1..+1, as a fraction of the total stroke.
+        fraction: largest opening of the full loop over -1..+1, as a fraction of the total stroke; a number, or (N,).
+        rng: draws the law, where it is one that is drawn.
 
     Raises:
         ValueError: unknown law, or an opening that the law cannot reach.
     """
 
-    def __init__(self, law: str, fraction: float, count: int) -> None:
-        if law not in _LAWS:
-            raise ValueError(f"piezo.law = {law!r}: must be one of {', '.join(LAWS)}")
-        self._weight, self._scale = _weight_and_scale(law, fraction)
-        self._law: HysteresisLaw = _LAWS[law](count)
+    def __init__(self, law: str, fraction: Array | float, count: int, rng: np.random.Generator | None = None) -> None:
+        self._law = _make(law, count, rng if rng is not None else np.random.default_rng(0))
+        self._weight, self._scale = np.zeros(count), np.ones(count)
+        if law != "none" and np.any(fraction):
+            self._weight, self._scale = _weight_and_scale(law, self._law, np.broadcast_to(fraction, count))
 
     def move(self, u: Array) -> Array:
         """Go to signals u (N,) and return y (N,), in units of half the total stroke."""
         return self._scale * (u + self._weight * self._law.move(u))
 
 
-@cache
-def _weight_and_scale(law: str, fraction: float) -> tuple[float, float]:
-    """Weight of the law and scale of the whole for the wanted opening, from a steady full cycle."""
-    if law == "none" or fraction == 0:
-        return 0.0, 1.0
-    grid = np.linspace(-1, 1, 801)
-    trial = _LAWS[law](1)
+def _full_loop(law: HysteresisLaw, count: int) -> tuple[Array, Array]:
+    """m on the rising and on the falling branch (SWEEP_POINTS, N) of a steady full cycle, over rising signals."""
+    trial = copy.deepcopy(law)
+    grid = np.linspace(-1, 1, SWEEP_POINTS)
 
     def sweep(signals: Array) -> Array:
-        return np.array([trial.move(np.array([u]))[0] for u in signals])
+        return np.array([trial.move(np.full(count, u)) for u in signals])
 
-    for _ in range(4):
+    for _ in range(SWEEP_CYCLES):
         rising, falling = sweep(grid), sweep(grid[::-1])[::-1]
-    opening = float(np.max(falling - rising))
-    span = float(rising[-1] - rising[0])
+    return rising, falling
+
+
+def _weight_and_scale(name: str, law: HysteresisLaw, fraction: Array) -> tuple[Array, Array]:
+    """Weight (N,) of the law and scale (N,) of the whole for the wanted openings (N,)."""
+    rising, falling = _full_loop(law, len(fraction))
+    opening, span = np.max(falling - rising, axis=0), rising[-1] - rising[0]
     # fraction = weight * opening / (2 + weight * span)
-    if fraction * span >= opening:
-        raise ValueError(f"piezo.hysteresis = {fraction:g}: {law} reaches at most {opening / span:.2f}")
-    weight = 2 * fraction / (opening - fraction * span)
-    if 1 + weight * np.min(np.diff(rising) / np.diff(grid)) <= 0:
-        raise ValueError(f"piezo.hysteresis = {fraction:g}: too wide, {law} would no longer rise with the signal")
+    free = opening - fraction * span
+    if np.any(free <= 0):
+        raise ValueError(f"piezo.hysteresis = {fraction.max():g}: {name} reaches at most {np.min(opening / span):.2f}")
+    weight = 2 * fraction / free
+    steepest = np.min(np.diff(rising, axis=0), axis=0) / (2 / (SWEEP_POINTS - 1))
+    if np.any(1 + weight * steepest <= 0):
+        raise ValueError(
+            f"piezo.hysteresis = {fraction.max():g}: too wide, {name} would no longer rise with the signal"
+        )
     return weight, 2 / (2 + weight * span)

@@ -1,4 +1,7 @@
-"""The piezo stacks: gain spread, hysteresis and creep, from signals to base displacements of the plate's springs."""
+"""The piezo stacks: gains, hysteresis and creep, from signals to base displacements of the plate's springs.
+
+What stacks differ in, and what they do beyond a rate-independent law and creep, is off by default.
+"""
 
 from __future__ import annotations
 
@@ -9,35 +12,61 @@ import numpy as np
 from dm_simulation.mirror.hysteresis import Hysteresis
 from dm_simulation.mirror.zernike import Array
 
-#: Creep: first-order elements between these time constants (s), so many per decade. Their sum follows log t to 1 % of
-#: the creep rate in between.
+#: Creep: first-order elements with time constants (s), so many per decade. Their sum follows log t to 1 % of the creep
+#: rate in between.
 CREEP_FASTEST_S = 0.1
 CREEP_SLOWEST_S = 1e5
 CREEP_PER_DECADE = 3
+CREEP_TIMES_S = tuple(np.geomspace(CREEP_FASTEST_S, CREEP_SLOWEST_S, 19).tolist())
+#: The same of the part of a loop that lags behind fast moves.
+LAG_TIMES_S = np.geomspace(1e-3, 10.0, 13)
+#: Periods of the drift of a day, s.
+DRIFT_PERIODS_S = np.array([86400.0, 7 * 3600.0, 3600.0])
 
 
 @dataclass(frozen=True)
 class PiezoConfig:
-    """Properties of the stacks.
+    """Properties of the stacks. Spreads are standard deviations between them, cut at three.
 
     Attributes:
         stroke: base displacement from signal -1 to +1, m.
-        gain_spread: standard deviation of the relative gains (cut at three of them).
+        gain_spread: of the relative gains.
         law, hysteresis: see :class:`dm_simulation.mirror.hysteresis.Hysteresis`.
+        hysteresis_spread: of the relative openings of the loops.
         creep: growth of a displacement step per decade of time, as a fraction of the step.
+        creep_spread: of the relative creep.
+        creep_times: time constants of the elements, s.
+        spectrum_spread: unevenness of creep over them: logarithm of the ratio of neighbouring elements.
+        creep_position: relative change of creep from mid range to signal 1.
+        rate_dependence: share by which the loop widens with each decade of speed.
+        stiffening: share of half the stroke that is lost at signals -1 and +1, in squares.
+        drift: of the bases over a day, m.
     """
 
     stroke: float = 8e-6
     gain_spread: float = 0.03
     law: str = "prandtl_ishlinskii"
     hysteresis: float = 0.10
+    hysteresis_spread: float = 0.0
     creep: float = 0.01
+    creep_spread: float = 0.0
+    creep_times: tuple[float, ...] = CREEP_TIMES_S
+    spectrum_spread: float = 0.0
+    creep_position: float = 0.0
+    rate_dependence: float = 0.0
+    stiffening: float = 0.0
+    drift: float = 0.0
 
 
 class PiezoActuators:
     """States of all stacks. Time is passed in (s, any origin) and never read from a clock.
 
     They start demagnetised at signal 0, driven to `initial` and rested there until all creep has died away.
+
+    Attributes:
+        gain: (N,) relative gains.
+        stuck: (N,) bool, actuators that no longer follow.
+        signals: (N,) that they follow.
     """
 
     def __init__(
@@ -48,33 +77,51 @@ class PiezoActuators:
         time: float = 0.0,
     ) -> None:
         count = len(initial)
+
+        def spread(share: float) -> Array:
+            return 1 + share * np.clip(rng.standard_normal(count), -3, 3)
+
         self.config = config
-        self.gain = 1 + config.gain_spread * np.clip(rng.standard_normal(count), -3, 3)
-        self._hysteresis = Hysteresis(config.law, config.hysteresis, count)
-        decades = np.log10(CREEP_SLOWEST_S / CREEP_FASTEST_S)
-        self._tau = np.geomspace(CREEP_FASTEST_S, CREEP_SLOWEST_S, round(decades * CREEP_PER_DECADE) + 1)
+        self.gain = spread(config.gain_spread)
+        opening = config.hysteresis * spread(config.hysteresis_spread)
+        self._creep_times = np.array(config.creep_times)
+        per_decade = (len(self._creep_times) - 1) / np.log10(self._creep_times[-1] / self._creep_times[0])
+        spectrum = np.exp(config.spectrum_spread * rng.standard_normal(len(self._creep_times)))
+        self._creep = config.creep / per_decade * spectrum * spread(config.creep_spread)[:, None]
+        self._drift = config.drift * rng.standard_normal((count, len(DRIFT_PERIODS_S))) * (1.0, 0.3, 0.1)
+        self._drift_phase = rng.uniform(0, 2 * np.pi, (count, len(DRIFT_PERIODS_S)))
+        self._hysteresis = Hysteresis(config.law, opening, count, rng)
+        self.stuck = np.zeros(count, bool)
         self.signals = np.array(initial, float)
         self._position = self._hysteresis.move(self.signals)
-        self._crept = np.repeat(self._position[:, None], len(self._tau), axis=1)
+        self._crept = np.repeat(self._position[:, None], len(self._creep_times), axis=1)
+        self._lagged = np.repeat((self._position - self.signals)[:, None], len(LAG_TIMES_S), axis=1)
         self._time = time
 
     def advance(self, time: float) -> None:
         """Let creep go on until `time`. A clock that jumps back only moves the origin of time."""
         elapsed = time - self._time
         self._time = time
-        if elapsed > 0 and self.config.creep:
+        if elapsed > 0:
             # Exact for a constant position, hence independent of how the time is cut into steps.
-            rest = np.exp(-elapsed / self._tau)
-            self._crept += (self._position[:, None] - self._crept) * (1 - rest)
+            self._crept += (self._position[:, None] - self._crept) * -np.expm1(-elapsed / self._creep_times)
+            if self.config.rate_dependence:
+                loop = (self._position - self.signals)[:, None]
+                self._lagged += (loop - self._lagged) * -np.expm1(-elapsed / LAG_TIMES_S)
 
     def apply(self, signals: Array, time: float) -> None:
         """Take new signals (N,) at `time`."""
         self.advance(time)
-        self.signals = np.array(signals, float)
+        self.signals = np.where(self.stuck, self.signals, signals)
         self._position = self._hysteresis.move(self.signals)
 
     @property
     def displacement(self) -> Array:
         """Base displacements (N,), m, at the time last given."""
-        creep = self.config.creep / CREEP_PER_DECADE * (self._crept.sum(axis=1))
-        return self.config.stroke / 2 * self.gain * (self._position + creep)
+        config, position = self.config, self._position
+        creep = (1 + config.creep_position * position) * np.einsum("nk,nk->n", self._creep, self._crept)
+        lag = (position - self.signals)[:, None] - self._lagged
+        moved = position + creep + config.rate_dependence / CREEP_PER_DECADE * lag.sum(axis=1)
+        moved = moved - config.stiffening * moved * np.abs(moved)
+        turns = np.sin(2 * np.pi * self._time / DRIFT_PERIODS_S + self._drift_phase)
+        return np.asarray(config.stroke / 2 * self.gain * moved + (self._drift * turns).sum(axis=1))

@@ -1,0 +1,73 @@
+"""A simulation that is driven as the suite drives a mirror: moves, holds against creep, follows what is reported."""
+
+from __future__ import annotations
+
+from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.recipes import NO_RECIPES, RecipeBook
+from dm_controller.creep_hold import PERIOD_S
+from dm_controller.planning.planner import SETTLE_S, Move, Planner
+from dm_controller.planning.recipes import find
+from dm_controller.planning.target import FocusTarget
+from studies.comparison.simulated_bench import SimulatedBench
+
+#: Share of the time since the move that the next correction of a held shape waits: creep slows down like that, and an
+#: experiment need not correct more often than it matters. The first ones come as the controller's do.
+CORRECTION_GROWTH = 0.07
+
+
+class DrivenMirror:
+    """A simulation under one model of it.
+
+    Args:
+        holds: whether shapes are corrected while they are held.
+        book: recipes to go by; each of their moves begins with a degauss.
+        seen: reports of the bench that the suite, started only later, has missed.
+    """
+
+    def __init__(
+        self, bench: SimulatedBench, planner: Planner, holds: bool = True, book: RecipeBook = NO_RECIPES, seen: int = 0
+    ) -> None:
+        self.bench = bench
+        self._planner, self._holds, self._book = planner, holds, book
+        self._tracker = HysteresisTracker(planner.law)
+        self._seen = seen
+        self._follow()
+
+    def _follow(self) -> None:
+        for report in self.bench.reports[self._seen :]:
+            self._tracker.observe(report)
+        self._seen = len(self.bench.reports)
+
+    def plan(self, target: FocusTarget) -> Move:
+        """The move to `target` from where the mirror stands, or by a recipe after a degauss, which is carried out."""
+        effective, error = None, None
+        if self._book.recipes:
+            found = find(self._book, target)
+            effective, error = found.effective, found.error
+            self.bench.degauss()
+        self._follow()
+        tracker = self._tracker
+        return self._planner.plan(target, tracker.state, self.bench.time, tracker.known, effective, SETTLE_S, error)
+
+    def go(self, move: Move) -> Move:
+        """Carry out `move`, whose prediction is made beforehand.
+
+        Raises:
+            Refusal: the driver refuses it.
+        """
+        self.bench.apply(move.plan.signals)
+        return move
+
+    def hold(self, move: Move, dwell: float) -> None:
+        """Let `dwell` s pass since the move, correcting what creep does."""
+        began = self.bench.time
+        passed = PERIOD_S
+        while self._holds and passed < dwell:
+            self.bench.time = began + passed
+            self._follow()
+            wait = min(max(PERIOD_S, CORRECTION_GROWTH * passed), dwell - passed)
+            state = self._tracker.state
+            assert state is not None
+            self.bench.apply(self._planner.hold(state, self.bench.time, move.effective, 0.5 * wait))
+            passed += wait
+        self.bench.time = began + dwell

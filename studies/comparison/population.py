@@ -1,0 +1,214 @@
+"""How good the open loop is on mirrors drawn at random, and whether the bound told beforehand holds on each.
+
+Every mirror is calibrated by the plan HYSTERESIS at the limits that ship, and then goes through random requests inside
+the range that it tells; the true surface is judged when each request's dwell ends. The requests reach the same planner
+as on the bench, with the calibration as the message says it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_common.errors import Refusal
+from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.recipes import NO_RECIPES, RecipeBook
+from dm_controller.converge.goals import UnreachableError
+from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.target import FocusTarget
+from studies.comparison.drawn_mirrors import DIES, GAIN_STEP, GAIN_STEP_SHARE, DrawnMirror, draw_mirror
+from studies.comparison.driven_mirror import DrivenMirror
+from studies.comparison.random_requests import (
+    CURVATURE_MAX,
+    REACHABLE_TOLERANCE,
+    Requests,
+    active_of,
+    draw_targets,
+    judge_requests,
+)
+from studies.comparison.simulated_bench import Floats, SimulatedBench
+from studies.comparison.true_surface import TrueSurface
+
+#: Times that shapes are held, s.
+DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
+#: A shape is held for so long before the electronics are switched off, for so long, s.
+HELD_S, OFF_S = 86400.0, 600.0
+#: Requests after a restart, and requests by recipes for each recipe.
+FIRST_REQUESTS, PER_RECIPE = 6, 2
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class PopulationOptions:
+    """What to run.
+
+    Attributes:
+        requests: of each mirror, in any order.
+        maps: of each calibration.
+        recipes: built for each mirror; 0 = none.
+        pixels: of the camera.
+    """
+
+    requests: int = 40
+    maps: int = 300
+    recipes: int = 5
+    pixels: int = 236
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one mirror did.
+
+    Attributes:
+        law: what the calibration found.
+        held_out: m, 95th percentile of the largest coefficient error that it told.
+        curvatures: 1/m, range of spheres that was told.
+        groups: requests by what preceded them: `any order`, `recipes`, `restarted`, `power cut`.
+        failure: the reason why it could not be judged; "" = it was.
+        seconds: wall time, of the calibration, and of everything.
+    """
+
+    mirror: DrawnMirror
+    law: str = ""
+    held_out: float = float("nan")
+    curvatures: tuple[float, float] = (float("nan"), float("nan"))
+    groups: dict[str, Requests] = field(default_factory=dict)
+    failure: str = ""
+    seconds: tuple[float, float] = (0.0, 0.0)
+
+
+ANY_ORDER, RECIPES, RESTARTED, POWER_CUT = "any order", "recipes", "restarted", "power cut"
+
+
+def _recipes(bench: SimulatedBench, active: ActiveCalibration, curvatures: Floats) -> tuple[RecipeBook, int]:
+    """Recipes of these curvatures, and how many of them could not be built."""
+    tracker = HysteresisTracker(active.planner.law)
+    for report in bench.reports:
+        tracker.observe(report)
+    options = BuildOptions(settle_time=bench.config.settle_time)
+    builder = RecipeBuilder(active.planner, bench, lambda: bench.time, options, state=tracker.state)
+    recipes = []
+    for curvature in curvatures:
+        try:
+            recipes.append(builder.build(FocusTarget(float(curvature))))
+        except UnreachableError:  # counted: the told range said otherwise
+            continue
+    if not recipes:
+        return NO_RECIPES, len(curvatures)
+    book = recipe_book(recipes, active.planner, bench.config.degauss_steps, round(1e9 * bench.time))
+    return book, len(curvatures) - len(recipes)
+
+
+def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -> None:
+    """What happens to the mirror after its calibration."""
+    if mirror.event == GAIN_STEP:
+        bench.piezo.gain *= 1 + GAIN_STEP_SHARE
+    elif mirror.event == DIES:
+        bench.piezo.stuck[rng.integers(bench.mirror.actuators)] = True
+
+
+def _restarted(bench: SimulatedBench, active: ActiveCalibration, off: float) -> DrivenMirror:
+    """Electronics off for `off` s, the suite started anew, and a degauss."""
+    bench.power_cycle(off)
+    seen = len(bench.reports) - 1
+    bench.degauss()
+    bench.settle()
+    return DrivenMirror(bench, active.planner, seen=seen)
+
+
+def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lambda step: None) -> Outcome:
+    """Draw, calibrate and judge one mirror."""
+    began = time.monotonic()
+    mirror = draw_mirror(seed, options.pixels)
+    rng = np.random.default_rng([seed, 15])
+    bench = SimulatedBench(mirror.simulation)
+    if mirror.held_before:
+        bench.apply(rng.uniform(-0.5, 0.5) + rng.uniform(-0.4, 0.4, bench.mirror.actuators))
+        bench.time += HELD_S
+        bench.power_cycle(OFF_S)
+    progress(f"seed {seed}: calibration")
+    try:
+        calibration = bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps))
+        active = active_of(bench, calibration)
+    except (Refusal, ValueError) as error:
+        return Outcome(mirror, failure=str(error))
+    calibrated = time.monotonic() - began
+    hysteresis = calibration.hysteresis
+    assert hysteresis is not None
+    surface = TrueSurface(bench)
+    low, high = active.reachable_range(FocusTarget(0.0), REACHABLE_TOLERANCE)
+    groups: dict[str, Requests] = {}
+    book, unreachable = NO_RECIPES, 0
+    if options.recipes:
+        progress(f"seed {seed}: recipes")
+        curvatures = np.linspace(max(low, -CURVATURE_MAX), min(high, CURVATURE_MAX), options.recipes)
+        book, unreachable = _recipes(bench, active, curvatures)
+    _age(bench, mirror, rng)
+
+    progress(f"seed {seed}: any order")
+    dwells = rng.permutation(np.resize(DWELLS, options.requests))
+    other = bench.fork()
+    groups[ANY_ORDER] = judge_requests(
+        DrivenMirror(other, active.planner), active, surface, draw_targets(active, options.requests, rng), dwells
+    )
+    # From there a move that a power cut ends.
+    progress(f"seed {seed}: power cut")
+    first = draw_targets(active, FIRST_REQUESTS + 1, rng)
+    short = np.resize(DWELLS[:4], FIRST_REQUESTS)
+    other.power_cut(DrivenMirror(other, active.planner).plan(first[0]).signals, float(rng.uniform(0.1, 0.9)))
+    driven = _restarted(other, active, float(10.0 ** rng.uniform(0, 3.5)))
+    groups[POWER_CUT] = judge_requests(driven, active, surface, first[1:], short)
+
+    progress(f"seed {seed}: restart")
+    other = bench.fork()
+    first = draw_targets(active, FIRST_REQUESTS + 1, rng)
+    driven = DrivenMirror(other, active.planner)
+    driven.hold(driven.go(driven.plan(first[0])), HELD_S)
+    driven = _restarted(other, active, OFF_S)
+    groups[RESTARTED] = judge_requests(driven, active, surface, first[1:], short)
+
+    groups[RECIPES] = Requests(np.empty(0), np.empty(0), np.empty(0), unreachable)
+    if book.recipes:
+        progress(f"seed {seed}: by recipes")
+        asked = [recipe.curvature for recipe in book.recipes]
+        asked += rng.uniform(asked[0], asked[-1], (PER_RECIPE - 1) * len(asked)).tolist()
+        targets = [FocusTarget(float(curvature)) for curvature in rng.permutation(asked)]
+        driven = DrivenMirror(bench.fork(), active.planner, book=book)
+        judged = judge_requests(driven, active, surface, targets, np.resize(DWELLS[:4], len(targets)))
+        groups[RECIPES] = replace(judged, refused=judged.refused + unreachable)
+    return Outcome(
+        mirror,
+        hysteresis.name,
+        hysteresis.held_out_max_zernike,
+        (low, high),
+        groups,
+        seconds=(calibrated, time.monotonic() - began),
+    )
+
+
+def judge_population(
+    seeds: Sequence[int], options: PopulationOptions, workers: int = 1, progress: Progress = lambda step: None
+) -> Iterator[Outcome]:
+    """Judge the mirrors of `seeds`, yielding each when it is done, in order.
+
+    Args:
+        workers: processes; 1 = this one.
+    """
+    if workers == 1:
+        for seed in seeds:
+            yield judge_mirror(seed, options, progress)
+        return
+    # Each mirror in a process of its own, so that what one leaves in memory ends with it.
+    with multiprocessing.get_context("spawn").Pool(workers, maxtasksperchild=1) as pool:
+        yield from pool.imap(_judge_one, [(seed, options) for seed in seeds])
+
+
+def _judge_one(job: tuple[int, PopulationOptions]) -> Outcome:
+    return judge_mirror(*job)

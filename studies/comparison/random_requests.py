@@ -1,0 +1,124 @@
+"""Random requests to a calibrated simulation, and how near the true surface comes to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from dm_msgs.msg import MirrorInfo
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_messages import calibration_message
+from dm_common.errors import Refusal
+from dm_common.messages import doubles
+from dm_common.mirror import APERTURE_TOLERANCE
+from dm_common.optics.zernike import PISTON_TILT, TERMS
+from dm_common.recipes import RecipeError
+from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
+from dm_controller.planning.choice import check_reachable
+from dm_controller.planning.target import FocusTarget
+from studies.comparison.driven_mirror import DrivenMirror
+from studies.comparison.simulated_bench import Floats, SimulatedBench
+from studies.comparison.true_surface import TrueSurface
+
+#: Parameter reachable_tolerance as shipped, m.
+REACHABLE_TOLERANCE = 2e-8
+#: Largest curvature asked for, 1/m, and largest sum of added terms, m.
+CURVATURE_MAX, ADDED_MAX = 0.05, 3e-7
+#: Terms of a request with added ones.
+ADDED_TERMS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Requests:
+    """R requests of one kind.
+
+    Attributes:
+        error, upper: (R,) m, largest coefficient error of the true surface, and its bound told beforehand.
+        dwell: (R,) s.
+        refused: requests inside the told range that controller or driver refused.
+    """
+
+    error: Floats
+    upper: Floats
+    dwell: Floats
+    refused: int
+
+    @property
+    def coverage(self) -> float:
+        """Share inside the bound; NaN without requests."""
+        return float(np.mean(self.error <= self.upper)) if len(self.error) else float("nan")
+
+    def quantile(self, share: float) -> float:
+        """Quantile of the errors, m; NaN without requests."""
+        return float(np.quantile(self.error, share)) if len(self.error) else float("nan")
+
+
+def active_of(bench: SimulatedBench, calibration: Calibration) -> ActiveCalibration:
+    """The calibration as the focus controller takes it from the messages on `calibration` and `mirror_info`."""
+    mirror, limits = bench.mirror, bench.limits
+    info = MirrorInfo(
+        name=mirror.name,
+        serial=mirror.serial,
+        actuators=mirror.actuators,
+        actuator_x=doubles(mirror.x),
+        actuator_y=doubles(mirror.y),
+        working_aperture_diameter=2 * mirror.working_radius,
+        signal_min=limits.low,
+        signal_max=limits.high,
+        neighbour_a=limits.pairs[:, 0].tolist(),
+        neighbour_b=limits.pairs[:, 1].tolist(),
+        neighbour_difference_max=limits.neighbour_difference,
+        slew_rate_max=bench.slew_rate,
+    )
+    return active_calibration(calibration_message(calibration, None, "mirror", 1.0), info, APERTURE_TOLERANCE)
+
+
+def draw_targets(active: ActiveCalibration, count: int, rng: np.random.Generator) -> list[FocusTarget]:
+    """Spheres, and every other one with terms of orders 2 to 5 on top, inside the range that the calibration tells."""
+    targets = []
+    for number in range(count):
+        added = np.zeros(len(TERMS))
+        if number % 2:
+            which = rng.choice(np.arange(PISTON_TILT, len(TERMS)), ADDED_TERMS, replace=False)
+            added[which] = rng.uniform(-1, 1, ADDED_TERMS) * rng.uniform(0.1, 1.0) * ADDED_MAX / ADDED_TERMS
+        while True:
+            plain = FocusTarget(0.0, zernike=tuple(added.tolist()) if added.any() else ())
+            low, high = active.reachable_range(plain, REACHABLE_TOLERANCE)
+            if low <= high:
+                break
+            added = np.where(np.abs(added) > 1e-9, 0.5 * added, 0.0)
+            if not added.any() and not plain.zernike:
+                raise ValueError("no curvature is reachable")
+        curvature = rng.uniform(max(low, -CURVATURE_MAX), min(high, CURVATURE_MAX))
+        targets.append(plain.with_curvature(float(curvature)))
+    return targets
+
+
+def judge_requests(
+    driven: DrivenMirror,
+    active: ActiveCalibration,
+    surface: TrueSurface,
+    targets: Sequence[FocusTarget],
+    dwells: Floats,
+) -> Requests:
+    """Carry the requests out in order."""
+    served, kept, upper, stands, refused = [], [], [], [], 0
+    for target, dwell in zip(targets, dwells, strict=True):
+        try:
+            move = driven.plan(target)
+            check_reachable(move, active, REACHABLE_TOLERANCE)
+            driven.go(move)
+            driven.hold(move, float(dwell))
+        except (Refusal, RecipeError):
+            refused += 1
+            continue
+        served.append(target)
+        kept.append(dwell)
+        upper.append(move.plan.max_zernike_upper)
+        stands.append(driven.bench.true_displacement)
+    if not served:
+        return Requests(np.empty(0), np.empty(0), np.empty(0), refused)
+    errors, _ = surface.errors(np.array(stands), served)
+    return Requests(np.abs(errors).max(axis=1), np.array(upper), np.array(kept), refused)

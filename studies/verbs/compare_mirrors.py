@@ -1,0 +1,177 @@
+"""The population of `dm compare --mirrors`: a table of mirrors drawn at random, and the figures over all of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dm_tools.output import as_wavelengths, console, nanometres, progress_bar
+
+#: Processes at most: a mirror takes a core and some 300 MB.
+WORKERS_MAX = 2
+
+
+def run(seeds: Sequence[int], quick: bool) -> list[Any]:
+    """Judge the mirrors of `seeds`, printing a line of each when it is done."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")  # of the processes to come: one core each
+    from studies.comparison.population import PopulationOptions, judge_population
+
+    options = PopulationOptions(requests=10, maps=150, recipes=0, pixels=120) if quick else PopulationOptions()
+    workers = min(WORKERS_MAX, os.cpu_count() or 1, len(seeds))
+    outcomes = []
+    with progress_bar() as bar:
+        task = bar.add_task("mirrors", total=len(seeds))
+        for outcome in judge_population(seeds, options, workers):
+            outcomes.append(outcome)
+            bar.update(task, advance=1, description=f"mirrors: seed {outcome.mirror.simulation.seed}")
+            bar.console.print(f"seed {outcome.mirror.simulation.seed}: {outcome.mirror.description()}", highlight=False)
+    return outcomes
+
+
+def row_of(outcome: Any) -> dict[str, Any]:
+    """A mirror's figures for JSON; lengths in nm, null where there were no requests."""
+    mirror = outcome.mirror
+    row = {
+        "seed": mirror.simulation.seed,
+        "mirror": mirror.description(),
+        "plant": mirror.simulation.law,
+        "changes": mirror.changes,
+        "law": outcome.law,
+        "held_out_max_zernike_nm": _number(nanometres(outcome.held_out)),
+        "curvature_range": [_number(curvature) for curvature in outcome.curvatures],
+        "failure": outcome.failure,
+        "calibration_s": outcome.seconds[0],
+        "seconds": outcome.seconds[1],
+    }
+    for name, requests in outcome.groups.items():
+        row[name.replace(" ", "_")] = {
+            "requests": len(requests.error),
+            "p50_nm": _number(nanometres(requests.quantile(0.5))),
+            "p90_nm": _number(nanometres(requests.quantile(0.9))),
+            "max_nm": _number(nanometres(requests.quantile(1.0))),
+            "bound_p50_nm": _number(nanometres(float(np.median(requests.upper)))) if len(requests.upper) else None,
+            "bound_coverage": _number(requests.coverage),
+            "refused": requests.refused,
+        }
+    return row
+
+
+def _number(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
+def figures_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Figures over all mirrors that stay as they were calibrated; `worst_in_ten` is the 90 % quantile over mirrors."""
+    kept = [row for row in rows if "any_order" in row and not row["changes"]]
+    if not kept:
+        return {}
+
+    def over(group: str, name: str, share: float) -> float | None:
+        values = [row[group][name] for row in kept if group in row and row[group][name] is not None]
+        return float(np.quantile(values, share)) if values else None
+
+    def inside(group: str) -> float | None:
+        values = [row[group]["bound_coverage"] for row in kept if row.get(group, {}).get("bound_coverage") is not None]
+        return min(values) if values else None
+
+    worst = max(kept, key=lambda row: row["any_order"]["p90_nm"] or 0.0)
+    return {
+        "mirrors": len(kept),
+        "median_mirror": {name: over("any_order", name, 0.5) for name in ("p50_nm", "p90_nm", "max_nm")},
+        "worst_in_ten": {name: over("any_order", name, 0.9) for name in ("p50_nm", "p90_nm", "max_nm")},
+        "recipes_p90_nm": {
+            "median_mirror": over("recipes", "p90_nm", 0.5),
+            "worst_in_ten": over("recipes", "p90_nm", 0.9),
+        },
+        "lowest_coverage": {group: inside(group) for group in ("any_order", "recipes", "restarted", "power_cut")},
+        "covered_90_to_100": float(np.mean([(row["any_order"]["bound_coverage"] or 0.0) >= 0.9 for row in kept])),
+        "refused": sum(row["any_order"]["refused"] for row in kept),
+        "worst_seed": worst["seed"],
+        "seconds_per_mirror": float(np.median([row["seconds"] for row in kept])),
+    }
+
+
+def show(rows: Sequence[dict[str, Any]]) -> None:
+    """Print the table and the figures over all."""
+    from rich.table import Table
+
+    table = Table(title="largest coefficient error of the true surface, nm; any order, dwell 0.1 s to 10 min")
+    table.add_column("seed", justify="right")
+    table.add_column("mirror")
+    for heading in (
+        "p50",
+        "",
+        "p90",
+        "",
+        "max",
+        "bound",
+        "in bound",
+        "refused",
+        "recipes p90",
+        "restart",
+        "power cut",
+        "s",
+    ):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        what = row["plant"].removeprefix("drawn_") + (" *" if row["changes"] else "")
+        if row["failure"]:
+            table.add_row(str(row["seed"]), what, *[""] * 11, f"{row['seconds']:.0f}")
+            continue
+        order = row["any_order"]
+        table.add_row(
+            str(row["seed"]),
+            what,
+            *_length(order["p50_nm"]),
+            *_length(order["p90_nm"]),
+            _text(order["max_nm"], ".1f"),
+            _text(order["bound_p50_nm"], ".1f"),
+            _text(order["bound_coverage"], ".0%"),
+            str(order["refused"]),
+            _text(row.get("recipes", {}).get("p90_nm"), ".2f"),
+            *(
+                f"{_text(row[group]['max_nm'], '.1f')} / {_text(row[group]['bound_coverage'], '.0%')}"
+                for group in ("restarted", "power_cut")
+            ),
+            f"{row['seconds']:.0f}",
+        )
+    console.print(table)
+    console.print("restart, power cut: largest error of the first requests, and how many of them are inside the bound")
+    for row in rows:
+        if row["failure"]:
+            console.print(f"seed {row['seed']}: {row['failure']}")
+    if any(row["changes"] for row in rows):
+        console.print("* changes after its calibration, and does not count below")
+    _show_population(figures_of(rows))
+
+
+def _show_population(figures: dict[str, Any]) -> None:
+    if not figures:
+        return
+    for name, text in (("median_mirror", "median mirror"), ("worst_in_ten", "worst mirror in ten")):
+        p50, p90 = figures[name]["p50_nm"], figures[name]["p90_nm"]
+        console.print(
+            f"{text}: p50 {_text(p50, '.2f')} nm ({as_wavelengths(1e-9 * p50)}), p90 {_text(p90, '.2f')} nm "
+            f"({as_wavelengths(1e-9 * p90)}), recipes p90 {_text(figures['recipes_p90_nm'][name], '.2f')} nm"
+        )
+    lowest = ", ".join(
+        f"{group.replace('_', ' ')} {_text(value, '.0%')}" for group, value in figures["lowest_coverage"].items()
+    )
+    console.print(
+        f"{figures['mirrors']} mirrors; bound holds for 90 % or more of the requests on "
+        f"{figures['covered_90_to_100']:.0%} of them; lowest coverage: {lowest}; refused inside the told range: "
+        f"{figures['refused']}; worst mirror: seed {figures['worst_seed']}; "
+        f"{figures['seconds_per_mirror']:.0f} s a mirror"
+    )
+
+
+def _length(value: float | None) -> tuple[str, str]:
+    return (_text(value, ".2f"), as_wavelengths(1e-9 * value)) if value is not None else ("", "")
+
+
+def _text(value: float | None, form: str) -> str:
+    return "" if value is None else format(value, form)

@@ -1,0 +1,56 @@
+"""`./dm compare --mirrors`: mirrors drawn at random, and what is told of them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from dm_simulation.mirror.hysteresis import LAWS
+from studies.comparison import drawn_mirrors
+from studies.comparison.drawn_mirrors import draw_mirror
+from studies.comparison.population import ANY_ORDER, POWER_CUT, RECIPES, RESTARTED, PopulationOptions, judge_population
+from studies.verbs.compare import compare as command
+from studies.verbs.compare_mirrors import figures_of, row_of
+
+
+def test_a_seed_is_always_the_same_mirror_and_seeds_differ() -> None:
+    assert draw_mirror(7) == draw_mirror(7)
+    mirrors = [draw_mirror(seed) for seed in range(200)]
+    laws = [mirror.simulation.law for mirror in mirrors]
+    assert set(laws) == set(drawn_mirrors.LAWS) <= set(LAWS)
+    assert {mirror.event for mirror in mirrors} == set(drawn_mirrors.EVENTS)
+    assert len({mirror.simulation.hysteresis for mirror in mirrors}) == len(mirrors)
+    assert all(mirror.simulation.neighbour_difference == 1.0 for mirror in mirrors)
+    figures = np.array([mirror.simulation.instrument.figure_rms for mirror in mirrors])
+    assert 40e-9 <= figures.min() < figures.max() <= 500e-9
+
+
+def test_a_mirror_is_judged_and_its_figures_are_told() -> None:
+    options = PopulationOptions(requests=5, maps=90, recipes=2, pixels=100)
+    (outcome,) = judge_population([3], options)
+    assert not outcome.failure
+    assert outcome.groups.keys() == {ANY_ORDER, RECIPES, RESTARTED, POWER_CUT}
+    low, high = outcome.curvatures
+    assert low < 0 < high
+    asked = outcome.groups[ANY_ORDER]
+    assert len(asked.error) + asked.refused == options.requests
+    assert np.all(asked.error < 1e-7)
+    row = json.loads(json.dumps(row_of(outcome), allow_nan=False))
+    assert row["seed"] == 3
+    assert row["mirror"].startswith("preisach, loop 11% ± 15%")
+    figures = figures_of([row])
+    assert figures["mirrors"] == 1
+    assert figures["worst_seed"] == 3
+    assert figures["median_mirror"]["p90_nm"] == pytest.approx(1e9 * asked.quantile(0.9))
+
+
+def test_mirrors_need_one_first_seed() -> None:
+    app = typer.Typer()
+    app.command()(command)
+    result = CliRunner().invoke(app, ["--mirrors", "2", "--seed", "1", "--seed", "2"])
+    assert result.exit_code == 2
+    assert "--seed" in result.output
