@@ -23,7 +23,7 @@ from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
 from sensor_msgs.msg import Image
 
-from dm_autofocus.optics import FocusOptics
+from dm_autofocus.optics import FocusOptics, distance_of
 from dm_common.ros import qos
 from support import NodeProcess, Observer, wait_until
 
@@ -140,7 +140,7 @@ def test_the_sharpest_focus_is_found_and_told_as_distance(bench: Bench, observer
     found = result.result().result
     assert found.error_code == ErrorCode.OK, found.message
     assert found.curvature == pytest.approx(0.0173, abs=0.0012)
-    assert found.distance == pytest.approx(OPTICS.distance_for(found.curvature))
+    assert found.distance == pytest.approx(distance_of(OPTICS.dioptre_for(found.curvature)))
     assert found.images == len(feedback)
     assert bench.requests[-1].curvature == found.curvature
     assert {item.phase for item in feedback} == {AutofocusState.PHASE_COARSE, AutofocusState.PHASE_FINE}
@@ -246,4 +246,4 @@ def test_the_example_of_the_documentation_runs(bench: Bench, domain: int) -> Non
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert f"sharpest at {OPTICS.distance_for(0.0173):.1f}" in done.stdout
+    assert f"sharpest at {distance_of(OPTICS.dioptre_for(0.0173)):.1f}" in done.stdout

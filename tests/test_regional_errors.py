@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from dm_calibration.optics.aperture import Aperture
-from dm_common.optics.sample_regions import EmptyRegionError, regional_rms
+from dm_common.optics.piston_tilt import remove_piston_tilt
+from dm_common.optics.sample_regions import EmptyRegionError, disc_shares, regional_rms
 from dm_common.optics.sampling import edge_clustered_points, sample_map
-from studies.paper.regions import ConcentricRegions, figure_5, region_statistics
+from dm_common.optics.zernike import basis
+from studies.paper.regions import ConcentricRegions, figure_5, levelled_rms, region_statistics
 
 SIZE = 301
 APERTURE = Aperture(150.0, 150.0, 150.0)
@@ -34,6 +36,26 @@ def test_points_tell_the_regional_errors_of_the_map() -> None:
     assert on_points == pytest.approx(on_pixels, rel=0.12)
     assert on_points[:, -1] == pytest.approx(on_pixels[:, -1], rel=0.02)
     assert np.sqrt(np.square(sag) @ points.weight) == pytest.approx(on_points[:, -1])
+
+
+def test_levelled_regions() -> None:
+    points = edge_clustered_points(500)
+    sag = np.random.default_rng(7).standard_normal((2, 21)) @ basis(points.x, points.y).T
+    sag[0, :40] = np.nan
+    found = levelled_rms(sag, points)
+    plane = np.column_stack((np.ones(500), points.x, points.y))
+    shares = points.weight[:, None] * disc_shares(points)
+    for m, r in ((0, 4), (1, 0), (1, 9)):
+        weight = np.where(np.isfinite(sag[m]), shares[:, r], 0.0)
+        root = np.sqrt(weight)
+        z = np.nan_to_num(sag[m])
+        fit = np.linalg.lstsq(root[:, None] * plane, root * z, rcond=None)[0]
+        assert found[m, r] == pytest.approx(np.sqrt(weight @ (z - plane @ fit) ** 2 / weight.sum()), rel=1e-6)
+    tilted = sag + 3.0 - 2.0 * points.x + points.y
+    assert levelled_rms(tilted, points) == pytest.approx(found, rel=1e-6)
+    levelled = remove_piston_tilt(sag, points)
+    assert (found <= regional_rms(levelled, points) * (1 + 1e-9)).all()
+    assert found[:, -1] == pytest.approx(regional_rms(levelled, points)[:, -1])
 
 
 def test_a_region_without_data_is_named() -> None:

@@ -9,14 +9,37 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dm_calibration.optics.aperture import Aperture
-from dm_common.optics.sample_regions import AREA_FRACTIONS, check_regions, checked_fractions
+from dm_common.optics.piston_tilt import weighted_fit
+from dm_common.optics.sample_regions import AREA_FRACTIONS, check_regions, disc_shares
+from dm_common.optics.sampling import SamplePoints
 
 #: Surfaces that are left out of the mean of Fig. 5(b) in [1]: Z_2^0 and Z_2^2.
 OUTSIDE_MEAN = ("pz02", "pz03")
-
-
 #: Pixels of the blocks in which a map is worked through: 0.5 MB.
 _BLOCK_PIXELS = 2**16
+
+
+def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:
+    """(R,) shares of the area as an array; ValueError unless they rise above 0 and up to 1 at most."""
+    fractions = np.asarray(area_fractions, dtype=float)
+    if not (fractions.size and (np.diff(fractions) > 0).all() and fractions[0] > 0 and fractions[-1] <= 1):
+        raise ValueError(f"area_fractions = {fractions.tolist()}: must rise within 0 to 1")
+    return fractions
+
+
+def levelled_rms(sag: NDArray[np.float64], points: SamplePoints) -> NDArray[np.float64]:
+    """(M, R) rms of samples (M, P) inside each concentric disc about its own best plane.
+
+    [1] does not say whether a partial aperture is levelled on its own, as an interferometer with that aperture would
+    show it; `dm_common.optics.sample_regions.regional_rms` is the other reading.
+    """
+    plane = np.column_stack((np.ones_like(points.x), points.x, points.y))
+    seen = np.isfinite(sag)
+    levelled = []
+    for share in (points.weight[:, np.newaxis] * disc_shares(points)).T:
+        rest = np.where(seen, np.square(sag - weighted_fit(sag, plane, share) @ plane.T), 0.0)
+        levelled.append(np.sqrt(rest @ share / (seen @ share)))
+    return np.column_stack(levelled)
 
 
 class ConcentricRegions:

@@ -23,7 +23,7 @@ from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sample_regions import regional_rms
 from dm_common.optics.zernike import PISTON_TILT
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
-from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5
+from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5, levelled_rms
 from studies.paper.weights_cancel import weights_cancel_max_abs
 
 Floats = NDArray[np.float64]
@@ -142,7 +142,7 @@ def measure_samples(
     error = surface_control_error(chosen.sag, chosen.applied, influence, chosen.points)
     regional = regional_rms(error, chosen.points, labels=chosen.label)
     panel_a, panel_b = figure_5(regional, chosen.label)
-    levelled = regional_rms(error, chosen.points, labels=chosen.label, level_each=True)
+    levelled = levelled_rms(error, chosen.points)
     readings = {POINTS: panel_a, LEVELLED: figure_5(levelled, chosen.label)[0]}
     if isinstance(bench, _MapKeepingBench):
         readings[PIXELS] = figure_5(_on_every_pixel(bench, chosen, influence), chosen.label)[0]

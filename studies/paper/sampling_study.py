@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from dm_calibration.optics.aperture import Aperture
 from dm_calibration.optics.map_fit import MapFitter
-from dm_common.optics.sampling import SamplePoints, edge_clustered_points, sample_map, uniform_points
-from dm_common.optics.zernike import TERMS, basis, rms_of
+from dm_common.optics.sampling import GOLDEN_ANGLE, SamplePoints, edge_clustered_points, sample_map
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from studies.paper.samples import Samples
 
@@ -38,6 +38,18 @@ STRIDE = 6
 DRAWS = 10
 #: The rim is the outermost share of the aperture's area.
 RIM_SHARE = 0.1
+
+
+def uniform_points(count: int) -> SamplePoints:
+    """Points of equal area (a sunflower spiral), to compare with the edge-clustered ones."""
+    k = np.arange(count)
+    radius, angle = np.sqrt((k + 0.5) / count), GOLDEN_ANGLE * k
+    return SamplePoints(radius * np.cos(angle), radius * np.sin(angle), np.full(count, 1 / count))
+
+
+def rms_of(coefficients: Floats) -> Floats:
+    """(...) rms sag over the disc, piston and tilt left out, of Born & Wolf coefficients (..., 21)."""
+    return np.asarray(np.linalg.norm((coefficients * TERM_RMS)[..., PISTON_TILT:], axis=-1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,18 +98,6 @@ class FocusOptics:
         rest = 1 - at_pupil * self.pupil_offset
         return at_pupil / rest if rest > 0 else math.nan
 
-    def curvature_for_distance(self, distance: float) -> float:
-        """Curvature [1/m] that focuses on an object at `distance` (m, 0 or inf = infinity).
-
-        Raises:
-            OpticsError: negative or NaN distance, or an object inside the camera.
-        """
-        return self.curvature_for(dioptre_of(distance))
-
-    def distance_for(self, curvature: float) -> float:
-        """Distance [m] in focus at a curvature [1/m]; inf = infinity or beyond, NaN as in `dioptre_for`."""
-        return distance_of(self.dioptre_for(curvature))
-
     @property
     def _oblique(self) -> float:
         return (1 / math.cos(self.incidence) + math.cos(self.incidence)) / 2

@@ -47,7 +47,7 @@ def test_the_ray_matrix_images_the_object_onto_the_sensor(
     if mirror_distance * (1 / focal - 1 / sensor) > 0.5:
         return
     optics = FocusOptics(rest_dioptre_of_lens(focal, sensor, mirror_distance), relay)
-    curvature = optics.curvature_for_distance(distance)
+    curvature = optics.curvature_for(dioptre_of(distance))
     relay_matrix = np.diag([relay, 1 / relay])
     path = (
         free(sensor) @ power(1 / focal) @ free(mirror_distance) @ power(2 * curvature) @ relay_matrix @ free(distance)
@@ -66,14 +66,14 @@ def test_a_nearer_object_needs_a_more_concave_mirror(optics: FocusOptics, dioptr
 
 
 def test_mirror_power_is_twice_the_curvature_and_a_relay_squares() -> None:
-    assert FocusOptics().curvature_for_distance(10.0) == pytest.approx(0.05)
+    assert FocusOptics().curvature_for(dioptre_of(10.0)) == pytest.approx(0.05)
     assert FocusOptics(relay_magnification=2.0).dioptre_for(0.05) == pytest.approx(0.4)
 
 
 def test_the_mirror_is_flat_at_the_rest_distance() -> None:
     optics = FocusOptics.from_rest_distance(8.0, relay_magnification=1.7, incidence=0.3, pupil_offset=0.25)
-    assert optics.curvature_for_distance(8.0) == pytest.approx(0.0, abs=1e-15)
-    assert optics.distance_for(0.0) == pytest.approx(8.0)
+    assert optics.curvature_for(dioptre_of(8.0)) == pytest.approx(0.0, abs=1e-15)
+    assert distance_of(optics.dioptre_for(0.0)) == pytest.approx(8.0)
 
 
 def test_oblique_incidence_has_the_mean_of_both_powers() -> None:
@@ -84,7 +84,7 @@ def test_oblique_incidence_has_the_mean_of_both_powers() -> None:
 
 def test_distances_count_from_the_reference_point() -> None:
     plain, offset = FocusOptics(), FocusOptics(pupil_offset=0.5)
-    assert offset.curvature_for_distance(9.5) == pytest.approx(plain.curvature_for_distance(10.0))
+    assert offset.curvature_for(dioptre_of(9.5)) == pytest.approx(plain.curvature_for(dioptre_of(10.0)))
     assert math.isnan(offset.dioptre_for(2.0)), "focused 0.25 m before the pupil: inside the camera"
 
 
@@ -96,12 +96,12 @@ def test_zero_and_infinity_both_mean_infinity() -> None:
 @pytest.mark.parametrize("distance", [-1.0, math.nan])
 def test_an_impossible_distance_is_named(distance: float) -> None:
     with pytest.raises(OpticsError, match=r"distance = .* m: must be above 0"):
-        FocusOptics().curvature_for_distance(distance)
+        FocusOptics().curvature_for(dioptre_of(distance))
 
 
 def test_an_object_inside_the_camera_is_refused() -> None:
     with pytest.raises(OpticsError, match="inside the camera"):
-        FocusOptics(pupil_offset=-0.5).curvature_for_distance(0.4)
+        FocusOptics(pupil_offset=-0.5).curvature_for(dioptre_of(0.4))
 
 
 @pytest.mark.parametrize(

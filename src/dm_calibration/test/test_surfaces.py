@@ -8,7 +8,7 @@ import pytest
 from dm_calibration.influence import surfaces
 from dm_common.mirror import Mirror
 from dm_common.names import UnknownNameError
-from dm_common.optics.zernike import TERMS, index_of
+from dm_common.optics.zernike import NAMES, TERMS
 from linear_mirror import LinearMirror, make_mirror
 
 
@@ -87,7 +87,7 @@ def test_spheres_have_their_curvature(name: str, radius: float, mirror: Mirror, 
     surface = surfaces.model_surface(name, model, mirror)
     assert surface.nominal is not None
     # Sag r^2 / 2R of a shallow sphere is a defocus of r^2 / 4R in peak-normalised terms.
-    assert surface.nominal[index_of(2, 0)] == pytest.approx(mirror.working_radius**2 / (4.0 * radius), rel=1e-4)
+    assert surface.nominal[NAMES.index("Z_2^0")] == pytest.approx(mirror.working_radius**2 / (4.0 * radius), rel=1e-4)
     reached = plant.fit_terms(model.influence_sag @ surface.signals + model.sag_offset)
     assert reached[3:] == pytest.approx(surface.nominal[3:], abs=20e-9)
     assert mirror.limits.allow(surface.signals)
@@ -136,7 +136,7 @@ def test_limited_spheres_record_what_they_became(plant: LinearMirror) -> None:
 def test_bounded_solve_beats_clipping(mirror: Mirror, plant: LinearMirror) -> None:
     model = Model(plant, flat=True)
     coefficients = np.zeros(21)
-    coefficients[index_of(2, 2, "cos")] = 9e-6
+    coefficients[NAMES.index("Z_2^2 cos")] = 9e-6
     target = plant.modes @ coefficients
     signals, left = surfaces.solve_shape(target, model, mirror)
     assert np.abs(signals).max() <= 1.0

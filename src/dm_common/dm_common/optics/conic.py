@@ -1,4 +1,4 @@
-"""Conic surfaces, Eq. (2) in [1], and their Zernike coefficients."""
+"""Conic surfaces about the axis, Eq. (2) in [1], and their Zernike coefficients."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ _RADIAL_NODES = 24
 _ANGLES = 48
 
 
-def conic_sag(
-    x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: float = 0.0, shift: float = 0.0
-) -> NDArray[np.float64]:
+def conic_sag(x: ArrayLike, y: ArrayLike, curvature: float, conic_constant: float = 0.0) -> NDArray[np.float64]:
     """Sag of a conic, Eq. (2); positive curvature is concave (the rim stands above the vertex).
 
     The equation's form with the root in the denominator loses no digits for weak curvatures.
@@ -25,7 +23,6 @@ def conic_sag(
         x, y: m, of any one shape.
         curvature: axial curvature, 1/m.
         conic_constant: 0 = sphere, -1 = paraboloid.
-        shift: m, displacement s of the vertex in Eq. (2): the vertex lies at x = -shift.
 
     Returns:
         Sag in m, of the shape of x.
@@ -33,7 +30,7 @@ def conic_sag(
     Raises:
         ValueError: a number that is not finite, or a point beyond the equator, where the conic has no sag.
     """
-    r2 = (np.asarray(x, dtype=float) + shift) ** 2 + np.asarray(y, dtype=float) ** 2
+    r2 = np.asarray(x, dtype=float) ** 2 + np.asarray(y, dtype=float) ** 2
     root = 1 - (1 + conic_constant) * curvature**2 * r2
     if not np.isfinite(root).all():
         raise ValueError(f"curvature = {curvature} 1/m, conic_constant = {conic_constant}: must be finite")
@@ -45,9 +42,7 @@ def conic_sag(
     return np.asarray(curvature * r2 / (1 + np.sqrt(root)))
 
 
-def conic_coefficients(
-    curvature: float, conic_constant: float, radius: float, shift: float = 0.0
-) -> NDArray[np.float64]:
+def conic_coefficients(curvature: float, conic_constant: float, radius: float) -> NDArray[np.float64]:
     """Born & Wolf coefficients of a conic over a circular aperture, by least squares over the full disc.
 
     The terms are orthogonal on the disc, so each coefficient is a projection; the integrals are Gauss-Legendre in r^2
@@ -57,7 +52,6 @@ def conic_coefficients(
         curvature: 1/m; positive = concave.
         conic_constant: 0 = sphere, -1 = paraboloid.
         radius: of the aperture, m.
-        shift: as in :func:`conic_sag`, m.
 
     Returns:
         (21,) in m.
@@ -67,7 +61,7 @@ def conic_coefficients(
     """
     if not (np.isfinite(radius) and radius > 0):
         raise ValueError(f"radius = {radius} m: must be positive")
-    return disc_coefficients(lambda x, y: conic_sag(radius * x, radius * y, curvature, conic_constant, shift))
+    return disc_coefficients(lambda x, y: conic_sag(radius * x, radius * y, curvature, conic_constant))
 
 
 def disc_coefficients(

@@ -32,15 +32,7 @@ class EmptyRegionError(ValueError):
     error_code = ErrorCode.MAP_INSUFFICIENT
 
 
-def checked_fractions(area_fractions: ArrayLike) -> NDArray[np.float64]:
-    """(R,) shares of the area as an array; ValueError unless they rise above 0 and up to 1 at most."""
-    fractions = np.asarray(area_fractions, dtype=float)
-    if not (fractions.size and (np.diff(fractions) > 0).all() and fractions[0] > 0 and fractions[-1] <= 1):
-        raise ValueError(f"area_fractions = {fractions.tolist()}: must rise within 0 to 1")
-    return fractions
-
-
-def check_regions(rms: NDArray[np.float64], area_fractions: NDArray[np.float64], labels: Sequence[str]) -> None:
+def check_regions(rms: Floats, area_fractions: Sequence[float] | Floats, labels: Sequence[str]) -> None:
     """Raise EmptyRegionError for the first NaN in `rms` (M, R)."""
     empty = np.argwhere(~np.isfinite(rms))
     if len(empty):
@@ -51,13 +43,12 @@ def check_regions(rms: NDArray[np.float64], area_fractions: NDArray[np.float64],
         )
 
 
-def disc_shares(points: SamplePoints, area_fractions: ArrayLike = AREA_FRACTIONS) -> Floats:
+def disc_shares(points: SamplePoints) -> Floats:
     """(P, R): part of each point's own area, 0..1, that lies inside each concentric disc.
 
     Raises:
-        ValueError: weights that are not positive or do not sum to 1, or fractions out of order.
+        ValueError: weights that are not positive or do not sum to 1.
     """
-    fractions = checked_fractions(area_fractions)
     weight = points.weight
     if not (weight > 0).all() or abs(weight.sum() - 1.0) > 1e-6:
         raise ValueError(
@@ -70,29 +61,18 @@ def disc_shares(points: SamplePoints, area_fractions: ArrayLike = AREA_FRACTIONS
     inner = outer - area
     # The last ring ends at 1 but for rounding, and the whole aperture must hold it whole.
     outer[-1] = 1.0
-    inside = (fractions - inner[:, np.newaxis]) / (outer - inner)[:, np.newaxis]
+    inside = (np.array(AREA_FRACTIONS) - inner[:, np.newaxis]) / (outer - inner)[:, np.newaxis]
     return np.asarray(np.clip(inside, 0.0, 1.0)[ring.ravel()])
 
 
-def regional_rms(
-    sag: Floats,
-    points: SamplePoints,
-    area_fractions: ArrayLike = AREA_FRACTIONS,
-    labels: Sequence[str] = (),
-    *,
-    level_each: bool = False,
-) -> Floats:
-    """Root mean square of sag samples inside concentric discs, area-weighted.
+def regional_rms(sag: Floats, points: SamplePoints, labels: Sequence[str] = ()) -> Floats:
+    """Root mean square about zero of sag samples inside concentric discs, area-weighted.
 
-    [1] does not say whether a partial aperture is levelled on its own. Both readings are here: about zero, with piston
-    and tilt removed once over the whole aperture by the caller; or about each region's own best plane, as an
-    interferometer with that aperture would show it.
+    Piston and tilt are removed once over the whole aperture, by the caller.
 
     Args:
         sag: (M, P) at the points, NaN = no data; the points that are left then share the region.
-        area_fractions: (R,) shares of the aperture's area.
         labels: (M,) names of the maps for messages.
-        level_each: remove piston and tilt from every region on its own.
 
     Returns:
         (M, R), in the unit of the sag; all finite.
@@ -103,27 +83,15 @@ def regional_rms(
     """
     if sag.ndim != 2 or sag.shape[1] != len(points):
         raise ValueError(f"sag has the shape {sag.shape}: must be (maps, {len(points)} sampling points)")
-    shares = points.weight[:, np.newaxis] * disc_shares(points, area_fractions)
+    shares = points.weight[:, np.newaxis] * disc_shares(points)
     seen = np.isfinite(sag)
     energy = np.where(seen, np.square(sag), 0.0) @ shares
     area = seen.astype(float) @ shares
-    if level_each:
-        energy = np.maximum(energy - _in_plane(sag, seen, points, shares), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.where(area > 0.0, np.sqrt(energy / area), np.nan)
     names = tuple(labels) or tuple(f"map {k + 1}" for k in range(len(sag)))
-    check_regions(rms, checked_fractions(area_fractions), names)
+    check_regions(rms, AREA_FRACTIONS, names)
     return np.asarray(rms)
-
-
-def _in_plane(sag: Floats, seen: NDArray[np.bool_], points: SamplePoints, shares: Floats) -> Floats:
-    """(M, R): the part of the energy in each region that its best plane holds."""
-    plane = np.column_stack((np.ones_like(points.x), points.x, points.y))
-    products = plane[:, :, np.newaxis] * plane[:, np.newaxis, :]
-    gram = np.einsum("mp,pr,pij->mrij", seen.astype(float), shares, products, optimize=True)
-    moments = np.einsum("mp,pr,pi->mri", np.where(seen, sag, 0.0), shares, plane, optimize=True)
-    # The pseudo-inverse serves regions with too few points for a plane.
-    return np.asarray(np.einsum("mri,mrij,mrj->mr", moments, np.linalg.pinv(gram, hermitian=True), moments))
 
 
 def point_weights(points: SamplePoints, weights: ArrayLike) -> Floats:

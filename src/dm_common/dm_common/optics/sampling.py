@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 #: Distance [pixels] below which a point and a pixel coincide.
 _COINCIDENT = 1e-9
@@ -52,25 +52,12 @@ def edge_clustered_points(count: int = 500) -> SamplePoints:
     ring = np.repeat(np.arange(rings), on_ring)
     place = np.concatenate([np.arange(n) for n in on_ring])
     # Successive rings are turned by the golden angle, so that their points do not line up along rays.
-    angle = 2 * np.pi * place / on_ring[ring] + _GOLDEN_ANGLE * ring
+    angle = 2 * np.pi * place / on_ring[ring] + GOLDEN_ANGLE * ring
     return SamplePoints(
         x=radius[ring] * np.cos(angle),
         y=radius[ring] * np.sin(angle),
         weight=(np.diff(edges**2) / on_ring)[ring],
     )
-
-
-def uniform_points(count: int = 500) -> SamplePoints:
-    """Points of equal area (a sunflower spiral), to compare with the edge-clustered ones.
-
-    Raises:
-        ValueError: count below 1.
-    """
-    if count < 1:
-        raise ValueError(f"count = {count}: must be at least 1")
-    k = np.arange(count)
-    radius, angle = np.sqrt((k + 0.5) / count), _GOLDEN_ANGLE * k
-    return SamplePoints(radius * np.cos(angle), radius * np.sin(angle), np.full(count, 1 / count))
 
 
 def sample_map(

@@ -8,7 +8,6 @@ have the unit of the sag they describe (m).
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -66,11 +65,6 @@ TERM_RMS: NDArray[np.float64] = np.array([term.rms for term in TERMS])
 TERM_RMS.flags.writeable = False
 
 
-def index_of(n: int, m: int, kind: str = "") -> int:
-    """Return the position of a term in TERMS; ValueError when there is none."""
-    return TERMS.index(Term(n, m, kind))
-
-
 def _radial_factor(n: int, m: int) -> list[float]:
     """Coefficients of P in R_n^m(r) = r^m P(r^2), lowest power first."""
     top = (n - m) // 2
@@ -94,21 +88,6 @@ def basis(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         radial = np.polynomial.polynomial.polyval(r2, _radial_factor(n, m))
         result[..., k] = radial * (angular[m].imag if kind == "sin" else angular[m].real)
     return result
-
-
-def rms_of(coefficients: ArrayLike, exclude: Collection[int] = range(PISTON_TILT)) -> NDArray[np.float64] | float:
-    """Root mean square over the full disc of the sag with these Born & Wolf coefficients.
-
-    Args:
-        coefficients: (..., 21).
-        exclude: indices of terms that do not count; piston and tilt unless told otherwise.
-
-    Returns:
-        (...), in the unit of the coefficients.
-    """
-    weights = TERM_RMS.copy()
-    weights[list(exclude)] = 0
-    return np.sqrt(((_checked(coefficients) * weights) ** 2).sum(axis=-1))
 
 
 def _checked(coefficients: ArrayLike) -> NDArray[np.float64]:
