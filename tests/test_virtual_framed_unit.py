@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from dm_driver.electronics.base import ElectronicsSettings
 from dm_driver.electronics.check_sums import CHECK_SUMS
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.electronics.framed_serial import FramedSerial
@@ -110,7 +111,8 @@ def link(tmp_path: Path) -> Iterator[tuple[DriveUnit, ElectronicsServer, Path]]:
 def test_the_driver_and_the_unit_on_a_terminal(link: tuple[DriveUnit, ElectronicsServer, Path]) -> None:
     unit, server, path = link
     codes = np.linspace(0, 2**14 - 1, 24).astype(np.uint16)
-    with FramedSerial(str(path), FrameFormat(**SHEET, opening="55"), timeout_s=10.0) as electronics:
+    where = ElectronicsSettings(serial_port=str(path), frame=FrameFormat(**SHEET, opening="55"), timeout_s=10.0)
+    with FramedSerial(where) as electronics:
         electronics.write(codes, np.ones(24, dtype=np.bool_))
         shares = server.run(lambda: unit.outputs[:24].copy())
     np.testing.assert_allclose(shares, codes / (2**14 - 1))
@@ -120,6 +122,7 @@ def test_the_driver_and_the_unit_on_a_terminal(link: tuple[DriveUnit, Electronic
 
 def test_what_is_no_frame_is_counted(link: tuple[DriveUnit, ElectronicsServer, Path]) -> None:
     _unit, server, path = link
-    with FramedSerial(str(path), FrameFormat(**SHEET | {"reply": "", "checksum": "crc16_xmodem"})) as electronics:
+    frame = FrameFormat(**SHEET | {"reply": "", "checksum": "crc16_xmodem"})
+    with FramedSerial(ElectronicsSettings(serial_port=str(path), frame=frame)) as electronics:
         electronics.write(np.zeros(24, dtype=np.uint16), np.ones(24, dtype=np.bool_))
         wait_until(lambda: server.malformed_count == 1)

@@ -13,7 +13,7 @@ import pytest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_driver.actuator_writer import ActuatorWriter
-from dm_driver.electronics import Edac40Tcp
+from dm_driver.electronics import Edac40Tcp, ElectronicsSettings
 from dm_driver.moves import Kind, Outcome, WriterState
 from dm_driver.output.output_stage import OutputStage
 from dm_driver.output.volts import VoltScale
@@ -40,7 +40,7 @@ def running_writer(
 ) -> Iterator[tuple[ActuatorWriter, list[tuple[WriterState, bool]]]]:
     told: list[tuple[WriterState, bool]] = []
     writer = ActuatorWriter(
-        electronics("127.0.0.1", unit.port, timeout_s=0.5),
+        electronics(ElectronicsSettings("127.0.0.1", unit.port, timeout_s=0.5)),
         OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
         SafetyLimiter(DriverLimits(-1, 1, PAIRS, 1.0, actuators=37, step=0.1, slew_rate=slew_rate)),
         np.full(37, -1.0),
@@ -74,7 +74,7 @@ def refused(action: Callable[[], Any]) -> int:
 
 def test_nothing_is_written_before_enable_and_then_the_safe_shape_first(unit: Edac40TcpUnit) -> None:
     writer = ActuatorWriter(
-        Edac40Tcp("127.0.0.1", unit.port),
+        Edac40Tcp(ElectronicsSettings("127.0.0.1", unit.port)),
         OutputStage(SCALE, wiring_table("trihex", [], 37, 40), 40),
         SafetyLimiter(DriverLimits(actuators=37)),
         shape(-0.25),

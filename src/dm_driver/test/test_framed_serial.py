@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from dm_common.ros.parameters import REQUIRED
 from dm_driver.driver_configuration import build_configuration
 from dm_driver.driver_parameters import PARAMETERS
-from dm_driver.electronics.base import LinkError
+from dm_driver.electronics.base import ElectronicsSettings, LinkError
 from dm_driver.electronics.check_sums import CHECK_SUMS
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.electronics.framed_serial import FramedSerial
@@ -153,8 +153,13 @@ FOUR = FrameFormat(channels=4, bits=8)
 CODES = np.arange(4, dtype=np.uint16)
 
 
+def of_four(line: tuple[int, str], timeout_s: float = 1.0, **format: Any) -> FramedSerial:
+    """The unit of four channels at the line, with some of its frame otherwise."""
+    return FramedSerial(ElectronicsSettings(serial_port=line[1], frame=replace(FOUR, **format), timeout_s=timeout_s))
+
+
 def test_a_missing_answer_breaks_the_link(line: tuple[int, str]) -> None:
-    with FramedSerial(line[1], replace(FOUR, reply="06"), timeout_s=0.1) as electronics:
+    with of_four(line, timeout_s=0.1, reply="06") as electronics:
         os.write(line[0], b"\x06")  # before the question: it must not count
         wait_until(lambda: electronics._link is not None and electronics._link.in_waiting)
         with pytest.raises(LinkError, match=r"answered nothing within 0\.1 s, not 06"):
@@ -168,7 +173,7 @@ def test_a_wrong_answer_breaks_the_link(line: tuple[int, str]) -> None:
         os.write(line[0], b"\x15")
 
     unit = threading.Thread(target=refuse)
-    with FramedSerial(line[1], replace(FOUR, reply="06"), timeout_s=10.0) as electronics:
+    with of_four(line, timeout_s=10.0, reply="06") as electronics:
         unit.start()
         with pytest.raises(LinkError, match="answered 15 "):
             electronics.write(CODES, ALL_ON)
@@ -176,7 +181,7 @@ def test_a_wrong_answer_breaks_the_link(line: tuple[int, str]) -> None:
 
 
 def test_the_opening_comes_once(line: tuple[int, str]) -> None:
-    with FramedSerial(line[1], replace(FOUR, opening="01 02")) as electronics:
+    with of_four(line, opening="01 02") as electronics:
         electronics.write(CODES, ALL_ON)
         electronics.write(CODES, ALL_ON)
     assert read(line[0], 10) == bytes([1, 2, 0, 1, 2, 3, 0, 1, 2, 3])
@@ -184,7 +189,7 @@ def test_the_opening_comes_once(line: tuple[int, str]) -> None:
 
 def test_frames_keep_their_distance(line: tuple[int, str]) -> None:
     """No faster than asked for; how much slower depends on the machine and is not judged."""
-    with FramedSerial(line[1], replace(FOUR, frame_rate=50.0)) as electronics:
+    with of_four(line, frame_rate=50.0) as electronics:
         begun = time.monotonic()
         for _ in range(6):
             electronics.write(CODES, ALL_ON)

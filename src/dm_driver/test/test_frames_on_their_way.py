@@ -13,7 +13,7 @@ import pytest
 
 from dm_driver.driver_configuration import build_configuration
 from dm_driver.driver_parameters import PARAMETERS
-from dm_driver.electronics.base import LinkError
+from dm_driver.electronics.base import ElectronicsSettings, LinkError
 from dm_driver.electronics.edac40 import Edac40Tcp, Edac40Udp, encode_frame
 
 WIRED = np.ones(40, dtype=np.bool_)
@@ -46,7 +46,7 @@ def until_something_waits(unit: Edac40Tcp) -> None:
 
 
 def test_a_large_change_waits_for_the_acknowledgement_and_is_not_sent_without(deaf: socket.socket) -> None:
-    with Edac40Tcp("127.0.0.1", deaf.getsockname()[1], timeout_s=0.5, doubt=DOUBT) as unit:
+    with Edac40Tcp(ElectronicsSettings("127.0.0.1", deaf.getsockname()[1], timeout_s=0.5, doubt=DOUBT)) as unit:
         connection, _ = deaf.accept()
         until_something_waits(unit)
         unit.write(codes(DOUBT // 2), WIRED)
@@ -65,7 +65,7 @@ def test_a_large_change_waits_for_the_acknowledgement_and_is_not_sent_without(de
 
 def test_a_large_change_goes_at_once_when_everything_has_arrived() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        with Edac40Tcp("127.0.0.1", listener.getsockname()[1], timeout_s=5.0, doubt=DOUBT) as unit:
+        with Edac40Tcp(ElectronicsSettings("127.0.0.1", listener.getsockname()[1], timeout_s=5.0, doubt=DOUBT)) as unit:
             connection, _ = listener.accept()
             frames = [codes(value) for value in (0, 60_000, 0, 60_000)]
             for frame in frames:
@@ -80,7 +80,7 @@ def test_the_last_datagram_is_sent_three_times_in_all() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(("127.0.0.1", 0))
         server.settimeout(0.2)
-        with Edac40Udp("127.0.0.1", server.getsockname()[1]) as unit:
+        with Edac40Udp(ElectronicsSettings("127.0.0.1", server.getsockname()[1])) as unit:
             unit.write(codes(7), WIRED)
             for _ in range(5):
                 unit.check()

@@ -27,4 +27,4 @@ def make_electronics(kind: str, settings: ElectronicsSettings) -> DriveElectroni
     """
     if kind not in BACK_ENDS:
         raise ValueError(f"electronics.kind = {kind!r}: must be one of {', '.join(BACK_ENDS)}")
-    return BACK_ENDS[kind].from_settings(settings)
+    return BACK_ENDS[kind](settings)

@@ -6,12 +6,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_driver.electronics.frame_format import FrameFormat
+
+#: `DriveElectronics.needs` of units at a serial port.
+SERIAL_PORT: Final = ("serial_port", "a device file such as /dev/ttyUSB0")
 
 
 class ElectronicsError(Exception):
@@ -61,23 +64,32 @@ class DriveElectronics(ABC):
     all that is known. One thread uses an object at a time.
 
     Hooks raise `OSError` (pySerial's exceptions are) or `LinkError` for a broken link.
+
+    Args:
+        settings: where it is.
+
+    Raises:
+        ValueError: a setting that it needs is missing.
     """
 
     #: Number of output channels at the connector.
     channels: int
     #: Code of full scale.
     max_code: int
+    #: The field of the settings without which it cannot be reached, and what that must be.
+    needs: tuple[str, str]
     #: Frames per `limits.step` of a ramp: more than one where a frame may be lost without a trace, so that the next one
     #: is no larger step.
     frames_per_step: int = 1
 
-    def __init__(self) -> None:
+    def __init__(self, settings: ElectronicsSettings) -> None:
+        name, meaning = self.needs
+        if not getattr(settings, name):
+            raise ValueError(f"electronics.{name} is empty: must be {meaning}")
+        self._settings = settings
+        self._timeout_s = settings.timeout_s
         self._open = False
-
-    @classmethod
-    @abstractmethod
-    def from_settings(cls, settings: ElectronicsSettings) -> Self:
-        """Make the unit described by `settings`; ValueError names a setting that is missing."""
+        self._link: Any = None
 
     @property
     @abstractmethod
@@ -179,7 +191,7 @@ class DriveElectronics(ABC):
 
     @abstractmethod
     def _do_open(self) -> None:
-        """Open the link."""
+        """Open the link as `_link`, which has a method `close`."""
 
     @abstractmethod
     def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
@@ -189,6 +201,8 @@ class DriveElectronics(ABC):
     def _do_check(self) -> None:
         """Raise when the link is broken."""
 
-    @abstractmethod
     def _do_close(self) -> None:
-        """Close the link; called also after a failed `_do_open`: the link may be half made or absent."""
+        """Close `_link`; called also after a failed `_do_open`: the link may be half made or absent."""
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()

@@ -12,7 +12,7 @@ import socket
 import struct
 import termios
 import time
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,24 +58,12 @@ def encode_frame(codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> bytes:
 class _Edac40(DriveElectronics):
     channels = CHANNELS
     max_code = MAX_CODE
+    needs = ("address", "the EDAC40's host name or IPv4 address")
     _protocol: str
-
-    def __init__(self, address: str, port: int = 1234, discovery_port: int = 0, timeout_s: float = 1.0) -> None:
-        super().__init__()
-        self._address = address
-        self._port = port
-        self._discovery_port = discovery_port
-        self._timeout_s = timeout_s
-
-    @classmethod
-    def from_settings(cls, settings: ElectronicsSettings) -> Self:
-        if not settings.address:
-            raise ValueError("electronics.address is empty: must be the EDAC40's host name or IPv4 address")
-        return cls(settings.address, settings.port, settings.discovery_port, settings.timeout_s)
 
     @property
     def where(self) -> str:
-        return f"EDAC40 at {self._address}:{self._port} ({self._protocol})"
+        return f"EDAC40 at {self._settings.address}:{self._settings.port} ({self._protocol})"
 
 
 class Edac40Tcp(_Edac40):
@@ -89,26 +77,15 @@ class Edac40Tcp(_Edac40):
 
     _protocol = "TCP"
 
-    def __init__(
-        self, address: str, port: int = 1234, discovery_port: int = 0, timeout_s: float = 1.0, doubt: int = 0
-    ) -> None:
-        super().__init__(address, port, discovery_port, timeout_s)
-        self._doubt = doubt
-        self._link: protocol_socket.Serial | None = None
+    def __init__(self, settings: ElectronicsSettings) -> None:
+        super().__init__(settings)
         self._arrived: NDArray[np.uint16] | None = None  # codes that the unit's TCP has acknowledged
         self._last: NDArray[np.uint16] | None = None  # codes that were sent last
 
-    @classmethod
-    def from_settings(cls, settings: ElectronicsSettings) -> Self:
-        unit = super().from_settings(settings)
-        unit._doubt = settings.doubt
-        return unit
-
     def _do_open(self) -> None:
         self._arrived = self._last = None
-        self._link = protocol_socket.Serial(
-            f"socket://{self._address}:{self._port}", timeout=0, write_timeout=self._timeout_s
-        )
+        url = f"socket://{self._settings.address}:{self._settings.port}"
+        self._link = protocol_socket.Serial(url, timeout=0, write_timeout=self._timeout_s)
         # A duplicate of the descriptor shares its options, which pySerial does not offer.
         with socket.socket(fileno=os.dup(self._link.fileno())) as options:
             # Nagle's algorithm would hold back a frame until the one before is acknowledged (up to 40 ms), then send
@@ -123,8 +100,7 @@ class Edac40Tcp(_Edac40):
 
     def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
         self._do_check()  # the first frame after the unit closed would be swallowed without an error
-        assert self._link is not None
-        if self._doubt:
+        if self._settings.doubt:
             self._await_arrival(codes)
         self._link.write(encode_frame(codes, wired))
         self._last = codes.copy()
@@ -141,7 +117,7 @@ class Edac40Tcp(_Edac40):
         while self._on_the_way():
             if self._arrived is not None:
                 away = np.abs(codes.astype(np.int64) - self._arrived).max()
-                if 2 * away <= self._doubt:
+                if 2 * away <= self._settings.doubt:
                     return
             if time.monotonic() > deadline:
                 raise LinkError(f"no acknowledgement within {self._timeout_s:g} s")
@@ -151,20 +127,13 @@ class Edac40Tcp(_Edac40):
 
     def _on_the_way(self) -> int:
         """Bytes that the unit's TCP has not acknowledged yet."""
-        assert self._link is not None
         answer = fcntl.ioctl(self._link.fileno(), termios.TIOCOUTQ, bytes(4))
         return int(struct.unpack("i", answer)[0])
 
     def _do_check(self) -> None:
         # The unit never sends: a readable link is one that has ended (read raises), or a stray byte (dropped).
-        assert self._link is not None
         while self._link.in_waiting:
             self._link.read(1)
-
-    def _do_close(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
 
 
 class Edac40Udp(_Edac40):
@@ -182,9 +151,8 @@ class Edac40Udp(_Edac40):
     _protocol = "UDP"
     frames_per_step = 3
 
-    def __init__(self, address: str, port: int = 1234, discovery_port: int = 0, timeout_s: float = 1.0) -> None:
-        super().__init__(address, port, discovery_port, timeout_s)
-        self._socket: socket.socket | None = None
+    def __init__(self, settings: ElectronicsSettings) -> None:
+        super().__init__(settings)
         self._probe: Probe | None = None
         self._unanswered_since: float | None = None
         self._frame = b""
@@ -192,32 +160,30 @@ class Edac40Udp(_Edac40):
 
     def _do_open(self) -> None:
         self._repeats = 0
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(self._timeout_s)
-        self._socket.connect((self._address, self._port))
+        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._link.settimeout(self._timeout_s)
+        self._link.connect((self._settings.address, self._settings.port))
         self._unanswered_since = None
-        if self._discovery_port:
-            self._probe = Probe(self._address, self._discovery_port)
+        if self._settings.discovery_port:
+            self._probe = Probe(self._settings.address, self._settings.discovery_port)
             self._probe.ask()
             if not self._probe.answered(self._timeout_s):
                 raise LinkError(
-                    f"no answer to discovery on UDP port {self._discovery_port} within {self._timeout_s:g} s"
+                    f"no answer to discovery on UDP port {self._settings.discovery_port} within {self._timeout_s:g} s"
                 )
 
     def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
-        assert self._socket is not None
         self._frame = encode_frame(codes, wired)
         self._repeats = _REPEATS
-        self._socket.send(self._frame)
+        self._link.send(self._frame)
 
     def _do_check(self) -> None:
-        assert self._socket is not None
-        pending = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        pending = self._link.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if pending:
             raise OSError(pending, os.strerror(pending))
         if self._repeats:
             self._repeats -= 1
-            self._socket.send(self._frame)
+            self._link.send(self._frame)
         if self._probe is None:
             return
         # The answer to one question is looked for at the next check, so that a frame never waits for the network.
@@ -231,9 +197,7 @@ class Edac40Udp(_Edac40):
         self._probe.ask()
 
     def _do_close(self) -> None:
-        link, self._socket = self._socket, None
+        super()._do_close()
         probe, self._probe = self._probe, None
-        if link is not None:
-            link.close()
         if probe is not None:
             probe.close()

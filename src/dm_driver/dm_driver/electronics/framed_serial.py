@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import time
-from typing import Self
 
 import numpy as np
 import serial
 from numpy.typing import NDArray
 
-from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings, LinkError
-from dm_driver.electronics.frame_format import FrameFormat
+from dm_driver.electronics.base import SERIAL_PORT, DriveElectronics, ElectronicsSettings, LinkError
 
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 
@@ -22,33 +20,26 @@ class FramedSerial(DriveElectronics):
     a broken link, for the outputs are then unknown.
     """
 
-    def __init__(self, serial_port: str, frame: FrameFormat, timeout_s: float = 1.0) -> None:
-        super().__init__()
+    needs = SERIAL_PORT
+
+    def __init__(self, settings: ElectronicsSettings) -> None:
+        super().__init__(settings)
+        frame = self._frame = settings.frame
         self.channels = frame.channels
         self.max_code = frame.max_code
-        self._serial_port = serial_port
-        self._frame = frame
         self._reply = bytes.fromhex(frame.reply)
-        self._timeout_s = timeout_s
         # Frames that the line cannot carry would queue in the system, and the mirror lag behind its commands.
         self._period_s = 1.0 / (frame.frame_rate or frame.line_rate)
         self._free_at = 0.0
-        self._link: serial.Serial | None = None
-
-    @classmethod
-    def from_settings(cls, settings: ElectronicsSettings) -> Self:
-        if not settings.serial_port:
-            raise ValueError("electronics.serial_port is empty: must be a device file such as /dev/ttyUSB0")
-        return cls(settings.serial_port, settings.frame, settings.timeout_s)
 
     @property
     def where(self) -> str:
-        return f"framed serial unit at {self._serial_port}"
+        return f"framed serial unit at {self._settings.serial_port}"
 
     def _do_open(self) -> None:
         # Exclusive: two writers on one unit would tear each other's frames.
         self._link = serial.Serial(
-            self._serial_port,
+            self._settings.serial_port,
             self._frame.baud_rate,
             parity=_PARITY[self._frame.parity],
             stopbits=self._frame.stop_bits,
@@ -61,7 +52,6 @@ class FramedSerial(DriveElectronics):
             self._link.write(opening)
 
     def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
-        assert self._link is not None
         pause = self._free_at - time.monotonic()
         if pause > 0.0:
             time.sleep(pause)
@@ -82,12 +72,6 @@ class FramedSerial(DriveElectronics):
 
     def _drop_received(self) -> None:
         """Empty the system's buffer; fails on a device that has been unplugged."""
-        assert self._link is not None
         waiting = self._link.in_waiting
         if waiting:
             self._link.read(waiting)
-
-    def _do_close(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 import serial
 from numpy.typing import NDArray
 
-from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
+from dm_driver.electronics.base import SERIAL_PORT, DriveElectronics
 
 CHANNELS: Final = 40
 MAX_CODE: Final = 0xFFF
@@ -61,37 +61,19 @@ class UsbDac40(DriveElectronics):
 
     channels = CHANNELS
     max_code = MAX_CODE
-
-    def __init__(self, serial_port: str, timeout_s: float = 1.0) -> None:
-        super().__init__()
-        self._serial_port = serial_port
-        self._timeout_s = timeout_s
-        self._link: serial.Serial | None = None
-
-    @classmethod
-    def from_settings(cls, settings: ElectronicsSettings) -> Self:
-        if not settings.serial_port:
-            raise ValueError("electronics.serial_port is empty: must be a device file such as /dev/ttyUSB0")
-        return cls(settings.serial_port, settings.timeout_s)
+    needs = SERIAL_PORT
 
     @property
     def where(self) -> str:
-        return f"USB DAC-40 at {self._serial_port}"
+        return f"USB DAC-40 at {self._settings.serial_port}"
 
     def _do_open(self) -> None:
         # Exclusive: two writers on one unit would tear each other's frames.
-        self._link = serial.Serial(self._serial_port, timeout=0, write_timeout=self._timeout_s, exclusive=True)
+        self._link = serial.Serial(self._settings.serial_port, timeout=0, write_timeout=self._timeout_s, exclusive=True)
         self._link.write(bytes(FRAME_LENGTH))  # ends any frame that an earlier program left half sent
 
     def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
-        assert self._link is not None
         self._link.write(encode_frame(codes))
 
     def _do_check(self) -> None:
-        assert self._link is not None
         _ = self._link.in_waiting  # fails on a device that has been unplugged
-
-    def _do_close(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.close()
