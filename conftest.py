@@ -1,4 +1,4 @@
-"""Which tests start processes, in what order the workers get the modules, and what skipped tests need.
+"""Which tests start processes, in what order and portions the workers get them, and what skipped tests need.
 
 The fixtures of the tests across packages are in tests/conftest.py.
 """
@@ -6,8 +6,11 @@ The fixtures of the tests across packages are in tests/conftest.py.
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 #: Fixtures of tests/conftest.py that start nodes or take a ROS domain.
 PROCESS_FIXTURES = {"domain", "observer", "start"}
@@ -37,6 +40,22 @@ LONGEST = (
     "test_report_command",
     "test_second_mirror",
 )
+#: Modules whose tests share nothing that takes long to make: a worker takes one test of them at a time. Of all others
+#: it takes the whole module.
+TEST_BY_TEST = frozenset(
+    {
+        "test_autofocus_node",
+        "test_calibration_faults",
+        "test_calibration_node",
+        "test_calibration_watch",
+        "test_faults_calibration",
+        "test_faults_controller",
+        "test_faults_driver",
+        "test_faults_network",
+        "test_faults_processes",
+        "test_interferometer_node",
+    }
+)
 _COMMAND = re.compile(r"\brun it with: (.+)$")
 
 
@@ -48,6 +67,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.processes)
     rank = {name: position for position, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+class _Portions(LoadFileScheduling):
+    """Modules whole, but for those of TEST_BY_TEST."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        module = super()._split_scope(nodeid)
+        return nodeid if Path(module).stem in TEST_BY_TEST else str(module)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadFileScheduling | None:
+    """What `--dist loadfile` does here."""
+    return _Portions(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -70,6 +70,7 @@ def parameters(folder: Path, **changes: Any) -> dict[str, Any]:
         "calibration_folder": str(folder),
         "settle_time": 0.01,
         "driver_timeout": 5.0,
+        "write_report": False,
         **{name.replace("__", "."): value for name, value in changes.items()},
     }
 

@@ -49,7 +49,12 @@ def node(start: Callable[..., NodeProcess], bench: StandIn, folder: Path) -> Ite
 
 
 def parameters(folder: Path, **changes: Any) -> dict[str, Any]:
-    return {"calibration_folder": str(folder), "settle_time": 0.01, "measure_retries": 1, **changes}
+    return {
+        "calibration_folder": str(folder),
+        "settle_time": 0.01,
+        "measure_retries": 1,
+        "write_report": False,
+    } | changes
 
 
 def pokes(**fields: Any) -> Calibrate.Goal:

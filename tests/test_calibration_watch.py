@@ -87,6 +87,7 @@ def begin(
             "calibration_folder": str(folder),
             "load_on_start": "newest",
             "hysteresis_allowance": 0.0,
+            "write_report": False,
             "updates.still_time": STILL_S,
             **changes,
         }

@@ -85,7 +85,7 @@ def node(start: Callable[..., NodeProcess], observer: Observer, tmp_path: Path) 
     store.save(stored("whole", *calibrated(), 2))
     for calibration in unfit():
         store.save(calibration)
-    process = start("dm_calibration", "calibration", {"calibration_folder": str(store.folder)})
+    process = start("dm_calibration", "calibration", {"calibration_folder": str(store.folder), "write_report": False})
     message = MirrorInfo(name=MIRROR.name, serial=MIRROR.serial, actuators=MIRROR.actuators)
     message.actuator_x, message.actuator_y = doubles(MIRROR.x), doubles(MIRROR.y)
     message.working_aperture_diameter = 2.0 * RADIUS

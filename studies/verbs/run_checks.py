@@ -15,9 +15,10 @@ from dm_tools.output import JsonOption, console, write_json
 
 #: What `--fast` leaves out: nodes as processes, and whole comparisons, reports and identifications.
 FAST = "not processes and not slow"
-#: Most of a node's test is waiting, so a few at once; modules stay whole for what their tests share, and conftest.py
-#: has those first that take longest.
-WORKERS = max(3, os.cpu_count() or 1)
+_CORES = os.cpu_count() or 1
+#: Most of a node's test is waiting, so several at once for each core, but not more nodes than fit into the memory of a
+#: small machine. conftest.py has those first that take longest, and says which modules stay whole.
+WORKERS = max(_CORES, min(3 * _CORES, 12))
 SCHEDULE = ("--dist", "loadfile", "--no-loadscope-reorder")
 
 
@@ -38,13 +39,14 @@ def test(
         steps["ruff check"] = ["ruff", "check", "."]
         steps["ruff format"] = ["ruff", "format", "--check", "."]
         steps["mypy"] = ["mypy"]
-    workers = os.cpu_count() or 1 if fast else 0 if chosen else WORKERS
+    workers = _CORES if fast else 0 if chosen else WORKERS
     steps["pytest"] = ["pytest", "-n", str(workers), *SCHEDULE, *(["-m", FAST] if fast else []), *context.args]
+    environment = _environment(root)
     results: dict[str, dict[str, float | int]] = {}
     for name, command in steps.items():
         console.rule(name)
         started = time.monotonic()
-        status = subprocess.run([sys.executable, "-m", *command], cwd=root, check=False).returncode
+        status = subprocess.run([sys.executable, "-m", *command], cwd=root, env=environment, check=False).returncode
         results[name] = {"status": status, "seconds": round(time.monotonic() - started, 1)}
     # pytest's own summary must stay the last thing on the screen when all is well.
     failed = [name for name, result in results.items() if result["status"] != 0]
@@ -52,3 +54,11 @@ def test(
     if failed:
         console.print(f"[bold red]failed:[/] {', '.join(failed)}")
         raise typer.Exit(1)
+
+
+def _environment(root: Path) -> dict[str, str]:
+    """This process's; where no bytecode may lie beside the sources it goes elsewhere, for hundreds of nodes start."""
+    environment = dict(os.environ)
+    if environment.pop("PYTHONDONTWRITEBYTECODE", ""):
+        environment["PYTHONPYCACHEPREFIX"] = str(root / "build" / "bytecode")
+    return environment

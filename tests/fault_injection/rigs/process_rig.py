@@ -33,6 +33,8 @@ from fault_injection.rigs.driver_rig import DriverRig, RigError, end_process
 NODES = ("interferometer", "calibration", "focus_controller")
 #: Half-swings of the controller's degauss: few, so that a conditioned move takes a second or two.
 DEGAUSS_STEPS = 10
+#: Longest wait for a map [s]: one takes a few tenths, and what was lost with its interferometer is waited for in vain.
+MAP_S = 20.0
 #: Curvature that every calibrated rig reaches [1/m].
 CURVATURE = 0.02
 _SERVICES = {
@@ -68,6 +70,8 @@ class ProcessRig(DriverRig):
                 "calibration_folder": str(self.calibrations),
                 "load_on_start": "newest",
                 "settle_time": 0.02,
+                "measure_timeout": MAP_S,
+                "write_report": False,
             },
             "focus_controller": {"condition.degauss_steps": DEGAUSS_STEPS},
         }

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
 from dm_calibration.hysteresis.reduction import Reduction
@@ -230,6 +230,6 @@ def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool])
     size = len(innovation)
     together = np.sqrt(innovation @ cho_solve(factor, innovation) / size)
     # Median of the largest of so many normal numbers.
-    largest = norm.isf(0.5 * (1.0 - 0.5 ** (1.0 / size)))
+    largest = -ndtri(0.5 * (1.0 - 0.5 ** (1.0 / size)))
     single = np.abs(innovation / np.sqrt(np.diag(expected))).max() / largest
     return float(max(together, single))

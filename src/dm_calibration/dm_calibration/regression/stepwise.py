@@ -16,9 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import statsmodels.api as sm
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from dm_calibration.regression.sample_checks import (
     CONSTANT,
@@ -122,7 +121,7 @@ class StepwiseFit:
         w = np.ones(len(x)) if weights is None else checked_weights(weights, len(x))
         mean = design @ self.parameters
         variance = 1.0 / w + np.einsum("ij,jk,ik->i", design, self.covariance, design)
-        reach = stats.t.ppf(0.5 + 0.5 * level, self.n - self.k - 1) * self.residual_sd * np.sqrt(variance)
+        reach = special.stdtrit(self.n - self.k - 1, 0.5 + 0.5 * level) * self.residual_sd * np.sqrt(variance)
         return mean, mean - reach, mean + reach
 
 
@@ -210,7 +209,7 @@ def _select(x: Floats, y: Floats, w: Floats, options: SelectionOptions) -> list[
         gain[free] = (left @ rest[:, free]) ** 2 / size[free]
         best = int(np.argmax(gain))
         remaining = max(error - gain[best], floor)
-        if stats.f.sf(gain[best] * freedom / remaining, 1, freedom) >= options.p_enter:
+        if special.fdtrc(1, freedom, gain[best] * freedom / remaining) >= options.p_enter:
             break
         selected.append(best)
         _remove(columns, target, selected, options)
@@ -227,12 +226,14 @@ def _remove(columns: Floats, target: Floats, selected: list[int], options: Selec
         inverse = linalg.solve_triangular(r, np.eye(len(selected)))
         squares = (inverse @ projected) ** 2 / np.square(inverse).sum(axis=1)
         worst = int(np.argmin(squares))
-        if error == 0.0 or stats.f.sf(squares[worst] / error, 1, freedom) <= options.p_remove:
+        if error == 0.0 or special.fdtrc(1, freedom, squares[worst] / error) <= options.p_remove:
             return
         del selected[worst]
 
 
 def _fit(x: Floats, y: Floats, w: Floats, names: Sequence[str], columns: list[int], weighted: bool) -> StepwiseFit:
+    import statsmodels.api as sm  # here: with pandas and all that comes with it, it takes a third of a node's start
+
     design = np.column_stack((np.ones(len(y)), x[:, columns]))
     model = sm.WLS(y, design, weights=w) if weighted else sm.OLS(y, design)
     result = model.fit()
