@@ -6,9 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import shortest_path
-from scipy.spatial.distance import pdist
 
 #: Two actuators closer than this times the smallest distance are neighbours: on a hexagonal grid the nearest six, whose
 #: next ones are sqrt(3) away.
@@ -67,7 +64,13 @@ def hexagonal_positions(
 
 def pitch(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
     """Smallest distance between two actuators, in the unit of the positions (N,)."""
-    return float(pdist(np.column_stack((x, y))).min())
+    return float(_distances(x, y)[1].min())
+
+
+def _distances(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """The (P, 2) indices of all pairs, the smaller first, and their (P,) distances."""
+    pairs = np.column_stack(np.triu_indices(x.size, k=1))
+    return pairs, np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]] for places in (x, y)))
 
 
 def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -79,10 +82,9 @@ def neighbour_pairs(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[n
     Raises:
         ValueError: two actuators at the same place.
     """
-    pairs = np.column_stack(np.triu_indices(x.size, k=1))
+    pairs, distance = _distances(x, y)
     if len(pairs) == 0:
         return pairs
-    distance = np.hypot(*(places[pairs[:, 0]] - places[pairs[:, 1]] for places in (x, y)))
     smallest = distance.min()
     if smallest <= 0.0:
         a, b = pairs[distance.argmin()] + 1
@@ -95,8 +97,12 @@ def rings(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.int64]:
 
     Actuators that no chain of neighbours reaches get -1.
     """
-    near = np.zeros((x.size, x.size))
-    near[tuple(neighbour_pairs(x, y).T)] = 1.0
-    centre = int(np.argmin(np.hypot(x - x.mean(), y - y.mean())))
-    steps = shortest_path(csr_array(near), directed=False, unweighted=True, indices=centre)
-    return np.where(np.isfinite(steps), steps, -1).astype(np.int64)
+    near = np.zeros((x.size, x.size), dtype=bool)
+    first, second = neighbour_pairs(x, y).T
+    near[first, second] = near[second, first] = True
+    ring = np.full(x.size, -1)
+    reached = np.arange(x.size) == np.argmin(np.hypot(x - x.mean(), y - y.mean()))
+    for step in range(x.size):
+        ring[reached] = step
+        reached = near[reached].any(axis=0) & (ring < 0)
+    return ring

@@ -38,6 +38,8 @@ from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 
 ACTUATORS = 37
+#: Of the rig's mirror.
+SERIAL = "faults"
 #: Longest wait for anything that the driver promises; generous, for a busy machine [s].
 PATIENCE_S = 60.0
 #: The slew rate of the rig: slow, so that faults meet moves under way [1/s].
@@ -72,7 +74,7 @@ class DriverRig:
         self.port = int(endpoints.get("udp_port" if self._udp else "tcp_port", 1))
         self._parameters = folder / "driver.yaml"
         values = {
-            "mirror.serial": "faults",
+            "mirror.serial": SERIAL,
             "state_folder": str(folder / "state"),
             "electronics.kind": kind,
             "electronics.address": "127.0.0.1",

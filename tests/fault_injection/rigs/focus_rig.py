@@ -39,11 +39,10 @@ from dm_common.ros.worker import WorkerService, answers_arrive
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
 from fault_injection.fault import FaultRecord
-from fault_injection.rigs.driver_rig import DriverRig, RigError, end_process
+from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
 from studies.benchmarks import stand_in_mirror
 
 LAW = "Prandtl-Ishlinskii"
-SERIAL = "faults"
 #: Curvatures asked for lie within ± this, 1/m; two in a row differ by at least the other.
 REACH, LEAST_CHANGE = 0.02, 0.004
 #: A held shape is corrected for creep: signals that differ less are the same shape.

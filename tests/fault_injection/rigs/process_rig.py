@@ -5,21 +5,24 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import yaml
 from dm_msgs.action import Calibrate, MoveFocus
-from dm_msgs.msg import ErrorCode, FocusRequest
+from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import IngestFile, ListCalibrations, Measure, SetFocus
 
 from dm_bringup.nodes import MODULES
+from dm_calibration.calibration import Calibration
+from dm_calibration.procedure.plan import PlanKind
+from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.ros import qos
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.worker import answers_arrive
@@ -28,9 +31,12 @@ from dm_simulation.electronics.monitor import MonitorConfig
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer import trigger
 from dm_simulation.interferometer.interferometer import InterferometerConfig
-from fault_injection.rigs.driver_rig import DriverRig, RigError, end_process
+from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
+from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 NODES = ("interferometer", "calibration", "focus_controller")
+#: Of the simulated interferometer.
+PIXELS = 128
 #: Half-swings of the controller's degauss: few, so that a conditioned move takes a second or two.
 DEGAUSS_STEPS = 10
 #: Longest wait for a map [s]: one takes a few tenths, and what was lost with its interferometer is waited for in vain.
@@ -43,9 +49,6 @@ _SERVICES = {
     ListCalibrations: "list_calibrations",
     SetFocus: "set_focus",
 }
-#: The calibration of the rig's simulation by its file's name, measured once per process: all rigs have the same.
-_CALIBRATION: dict[str, bytes] = {}
-_CALIBRATING = threading.Lock()
 
 
 class ProcessRig(DriverRig):
@@ -81,7 +84,7 @@ class ProcessRig(DriverRig):
 
     def _bench_config(self, serial: str) -> BenchConfig:
         return BenchConfig(
-            interferometer=InterferometerConfig(pixels=128),
+            interferometer=InterferometerConfig(pixels=PIXELS),
             ports=PortsConfig(0, OFF, OFF, serial),
             monitor=MonitorConfig(jump=0.1, neighbour_difference=1.0),
             files=FilesConfig(folder=self.folder / "maps", format="dat"),
@@ -165,25 +168,15 @@ class ProcessRig(DriverRig):
 @contextmanager
 def calibrated_rig(folder: Path, domain: int) -> Iterator[ProcessRig]:
     """A rig of all nodes with a calibration in use."""
-    with _CALIBRATING:
-        if not _CALIBRATION:
-            _CALIBRATION.update(_measure_calibration(folder / "calibrating", domain))
     rig = ProcessRig(folder, domain)
-    rig.calibrations.mkdir(parents=True, exist_ok=True)
-    for name, content in _CALIBRATION.items():
-        (rig.calibrations / name).write_bytes(content)
+    CalibrationStore(rig.calibrations).save(_calibration())
     with rig:
         rig.all_works()
         yield rig
 
 
-def _measure_calibration(folder: Path, domain: int) -> dict[str, bytes]:
-    nodes = ("interferometer", "calibration")
-    with ProcessRig(folder, domain, nodes, limits__slew_rate=40.0) as rig:
-        rig.all_works()
-        result = rig.goal(Calibrate, Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True))
-        rig.wait(result.done, "the end of a calibration", 300.0)
-        answer = result.result().result
-        if answer.error_code != ErrorCode.OK:
-            raise RigError(f"calibration: {answer.message}")
-        return {path.name: path.read_bytes() for path in rig.calibrations.glob("*.h5")}
+@cache
+def _calibration() -> Calibration:
+    """Measured on a simulation without processes: of the same seed and actuators as every rig's."""
+    simulation = SimulatedBench(SimulationConfig(seed=BenchConfig.seed, pixels=PIXELS))
+    return replace(simulation.calibrate(PlanKind.POKES), id="rig", mirror_serial=SERIAL, created_ns=time.time_ns())
