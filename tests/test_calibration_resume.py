@@ -251,7 +251,7 @@ def interrupted(
 
 def test_an_interrupted_hysteresis_run_knows_the_law_as_well(tmp_path: Path) -> None:
     config = SimulationConfig(seed=90125)
-    laws = CANDIDATES[1:2]
+    laws = [candidate for candidate in CANDIDATES if candidate.name in ("linear", "Prandtl-Ishlinskii")]
     whole = fit_hysteresis(interrupted(PlanKind.HYSTERESIS, config, tmp_path / "whole", ()), candidates=laws)
     maps = interrupted(PlanKind.HYSTERESIS, config, tmp_path / "parts", (30, 70))
     assert np.unique(maps.segment).size == 3

@@ -13,12 +13,14 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.identify import ExcitationError, Identification, identify
 from dm_calibration.hysteresis.responses import Responses
+from dm_common.hysteresis.inverse import invert
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from linear_mirror import make_mirror
 
 pytestmark = pytest.mark.slow
 
 LINEAR = CANDIDATES[0]
+PLAYS = next(candidate for candidate in CANDIDATES if candidate.name == "Prandtl-Ishlinskii")
 
 
 def simulated_run(
@@ -64,7 +66,7 @@ def test_held_out_moves_are_predicted_much_better_than_by_a_linear_law(law: str,
 def test_the_creep_rate_is_found() -> None:
     run, check = simulated_run("prandtl_ishlinskii", creep=0.015)
     # Rates are per unit of the settled step; the simulation's are too.
-    assert identify(run, check, CANDIDATES[:2]).fit.law.creep_rate == pytest.approx(0.015, rel=0.05)
+    assert identify(run, check, (LINEAR, PLAYS)).fit.law.creep_rate == pytest.approx(0.015, rel=0.05)
 
 
 def test_a_mirror_without_hysteresis_is_found_linear() -> None:
@@ -74,13 +76,34 @@ def test_a_mirror_without_hysteresis_is_found_linear() -> None:
     assert held_out_rms(found) < 5e-10
 
 
+@pytest.mark.parametrize(("spread", "name"), [(0.0, "static"), (0.03, "static, each actuator its own")])
+def test_a_curved_response_is_found_and_inverted_without_hysteresis(spread: float, name: str) -> None:
+    """Electrodes that pull with the square of what nearly is the signal: no history, so none is asked for."""
+    run, check = simulated_run("none", creep=0.0)
+    rng = np.random.default_rng(11)
+    square, cube = rng.normal([0.25, -0.05], spread * np.array([1.0, 0.3]), (7, 2)).T
+    position = run.signals + square * run.signals**2 + cube * run.signals**3
+    mixing = 1e-6 * rng.standard_normal((7, 12))
+    measured = position @ mixing + 2e-10 * rng.standard_normal((len(position), 12))
+    found = identify(replace(run, responses=replace(run.responses, values=measured)), check)
+    assert found.fit.candidate.name == name
+    assert held_out_rms(found) < 4e-10
+    law = found.fit.law
+    assert not law.remembers and not law.is_identity
+    state = law.demagnetised(7, 0.0)
+    wanted = rng.uniform(-0.6, 0.6, 7)
+    inverted = invert(law, state, law.position_at(state, wanted), -1.0, 1.0)
+    np.testing.assert_allclose(inverted.signals, wanted, atol=1e-6)
+    np.testing.assert_array_equal(inverted.missed, 0.0)
+
+
 def test_maps_without_data_change_little() -> None:
     run, check = simulated_run("prandtl_ishlinskii")
     usable = np.ones(len(run.time), dtype=bool)
     usable[10:14] = False
     values = np.where(usable[:, None], run.responses.values, 0.0)
     spoilt = replace(run, responses=Responses(values, run.responses.coefficients, usable))
-    plays = CANDIDATES[:2]
+    plays = (LINEAR, PLAYS)
     assert held_out_rms(identify(spoilt, check, plays)) < 2.0 * held_out_rms(identify(run, check, plays))
 
 

@@ -11,7 +11,8 @@ from dm_common.hysteresis.inverse import TOLERANCE, invert
 from dm_common.hysteresis.model import HysteresisModel
 from example_hysteresis import plays, rich
 
-LAWS = [plays(), rich()]
+STATIC = HysteresisModel(np.zeros(1), np.array([[1.0, 0.2, 0.05]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
+LAWS = [plays(), rich(), STATIC]
 signal = st.floats(-1.0, 1.0)
 
 

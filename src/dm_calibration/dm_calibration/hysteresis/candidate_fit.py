@@ -27,6 +27,8 @@ Rows = NDArray[np.bool_]
 RIDGE = 1e-6
 #: Rounds of alternating solutions.
 ROUNDS = 6
+#: Creep that explains less than this many squared standard deviations of the maps is none.
+CREEP_SHOWN = 10.0
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,20 @@ class Candidate:
     slopes: int
     own: bool = False
 
+    @property
+    def hysteretic(self) -> bool:
+        """Whether it has more than a static response to the signal."""
+        return bool(self.plays or self.slopes)
+
 
 CANDIDATES = (
     Candidate("linear", 0, 1, 0),
+    Candidate("static", 0, 3, 0),
     Candidate("Prandtl-Ishlinskii", 20, 1, 0),
     Candidate("Preisach", 20, 3, 0),
     Candidate("Duhem", 0, 3, 4),
     Candidate("Preisach and Duhem", 20, 3, 4),
+    Candidate("static, each actuator its own", 0, 5, 0, own=True),
     Candidate("Preisach, each actuator its own", 30, 5, 0, own=True),
 )
 
@@ -163,9 +172,11 @@ class CandidateProblem:
             xtol=1e-5,
             ftol=1e-6,
         )
-        features = self._features(found.x)
-        solved, left = self._solve(features, keep, weights[0])
-        return LawFit(self.candidate, self._law(solved, found.x), left * self._scatter)
+        nonlinear, still = found.x, np.append(found.x[:-1], 0.0)
+        if np.square(residual(still)).sum() - 2.0 * found.cost < CREEP_SHOWN:
+            nonlinear = still
+        solved, left = self._solve(self._features(nonlinear), keep, weights[0])
+        return LawFit(self.candidate, self._law(solved, nonlinear), left * self._scatter)
 
     def _features(self, nonlinear: Floats) -> Floats:
         rate, slope = nonlinear[-1], nonlinear[:-1]

@@ -60,7 +60,8 @@ def identify(
 
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
-        candidates: in this order; the first has no hysteresis to invert, an own one follows common ones.
+        candidates: in this order; the first has no hysteresis to invert, an own one follows common ones and counts
+            only where the best of them has hysteresis as it has.
         folds: contiguous parts of the run that are predicted from the others.
 
     Raises:
@@ -77,13 +78,14 @@ def identify(
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
+    reach = float(run.signals.min()), float(run.signals.max())
 
     def consider(problem: CandidateProblem | OwnLaws) -> None:
         nonlocal best
         name = problem.candidate.name
         progress(name)
         whole = problem.fit(train)
-        slope = whole.law.slope_min()
+        slope = whole.law.slope_min(*reach)
         if slope < SLOPE_MIN:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
             return
@@ -98,7 +100,7 @@ def identify(
     for candidate in candidates:
         if not candidate.own:
             consider(CandidateProblem(run, candidate, scatter))
-        elif best is not None and best[2].law.remembers:
+        elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
             consider(OwnLaws(run, candidate, best[2].law, scatter))
     assert best is not None  # the linear candidate can always be inverted
     score, problem, fitted, held_out = best

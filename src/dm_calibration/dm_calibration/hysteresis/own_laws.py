@@ -99,6 +99,7 @@ class OwnLaws:
         count = signals.shape[1]
         self._between = np.asarray(np.linalg.inv(np.ones((count, count)) + SPREAD**2 * np.eye(count)), dtype=np.float64)
         self._prior = np.asarray(np.diag(1.0 / prior), dtype=np.float64)
+        self._creeps = common.creep_rate > 0.0
         self._creep = max(common.creep_rate, CREEP_RATE_MIN) * PER_ELEMENT
         apart = np.abs(np.subtract.outer(np.arange(len(CREEP_TIMES)), np.arange(len(CREEP_TIMES))))
         self._creep_prior = np.asarray(
@@ -117,7 +118,9 @@ class OwnLaws:
             features, actuators = self._features.shape[1:]
             patterns = np.zeros((features, actuators))
             patterns[0] = 1.0
-            creep, scatter = np.full((len(CREEP_TIMES), actuators), self._creep), self._scatter
+            # Where the maps show no common creep, no actuator has any.
+            creep = np.full((len(CREEP_TIMES), actuators), self._creep if self._creeps else 0.0)
+            scatter = self._scatter
         free = basis_of(self._figure[keep])
         crept = self._with_creep(creep)
         gains, residual = self._gains(crept, patterns, keep)
@@ -125,9 +128,10 @@ class OwnLaws:
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
             patterns = self._patterns(crept[keep], gains / scatter, measured, free)
-            position = np.einsum("mfn,fn->mn", self._features, patterns)
-            creep = self._spectra(position, gains / scatter, measured, keep, free)
-            crept = self._with_creep(creep)
+            if self._creeps:
+                position = np.einsum("mfn,fn->mn", self._features, patterns)
+                creep = self._spectra(position, gains / scatter, measured, keep, free)
+                crept = self._with_creep(creep)
             gains, residual = self._gains(crept, patterns, keep)
         return OwnFit(self.candidate, self._law(patterns, creep), residual, patterns, creep, scatter)
 

@@ -66,7 +66,7 @@ def invert(
     """
     if effective.shape != state.signals.shape or not np.isfinite(effective).all():
         raise ValueError(f"effective signals: must be {len(state.signals)} finite numbers")
-    if not law.remembers:
+    if law.is_identity:
         signals = np.clip(effective, low, high)
         return Inverted(signals, effective - signals)
     wanted = law.position_for(state, effective, ahead)

@@ -115,7 +115,12 @@ class HysteresisModel:
     @property
     def remembers(self) -> bool:
         """Whether the effective signal depends on anything but the signal."""
-        return len(self.play_radius) > 1 or bool(self.duhem_slope.size) or self.creep_rate > 0.0
+        return bool((self.play_radius > 0.0).any()) or bool(self.duhem_slope.size) or self.creep_rate > 0.0
+
+    @cached_property
+    def is_identity(self) -> bool:
+        """Whether the effective signal is the signal."""
+        return not self.remembers and self.play_weight.shape[-1] == 1 and bool((self.play_weight == 1.0).all())
 
     def same_as(self, other: HysteresisModel) -> bool:
         """Whether two laws are the same, number for number."""
@@ -230,21 +235,22 @@ class HysteresisModel:
 
     # --- what can be inverted ---
 
-    def slope_min(self, span: float = 1.0) -> float:
-        """Smallest slope of the effective signal over signals of +-`span`, on any way.
+    def slope_min(self, low: float = -1.0, high: float = 1.0) -> float:
+        """Smallest slope of the effective signal over signals of `low` .. `high`, on any way.
 
         After a turn the operators set in one by one, narrow ones first; what has set in follows the signal at a
         distance of its half-width. Those of half-width r have set in only where the turn can lie 2 r behind.
         """
         order = np.argsort(self.play_radius)
         radius, weight = self.play_radius[order], self.play_weight[..., order, :]
-        signal, way = np.linspace(-span, span, 201)[:, None], np.array([1.0, -1.0])[:, None, None]
+        signal, way = np.linspace(low, high, 201)[:, None], np.array([1.0, -1.0])[:, None, None]
+        behind = np.where(way > 0.0, signal - low, high - signal)
         value = signal - way * radius
         weight = weight[..., None, None, :, :]  # a row for each way and signal
         slope = np.zeros(np.broadcast_shapes(value.shape, weight.shape[:-1]))
         for power in range(weight.shape[-1], 0, -1):
             slope = slope * value + power * weight[..., power - 1]
-        slope = np.where(2.0 * radius <= span + way * signal, slope, 0.0)
+        slope = np.where(2.0 * radius <= behind, slope, 0.0)
         smallest = np.cumsum(slope, axis=-1).min(axis=(-3, -2, -1))
         if self._duhem is not None:
             low, high = self._duhem.slope_range

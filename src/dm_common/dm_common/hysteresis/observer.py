@@ -251,9 +251,10 @@ class HysteresisObserver:
         tracker = self._tracker
         if tracker.state is None or latest is None:
             return tracker.unknown
-        if not latest.history_known:
-            return tracker.unknown or "writes were lost, or a degauss is under way"
-        return tracker.unknown if self.law.remembers else ""
+        if not self.law.remembers:
+            return ""
+        lost = "" if latest.history_known else "writes were lost, or a degauss is under way"
+        return tracker.unknown or lost
 
     def estimate(self, now: float, slew_rate: float = np.inf) -> ActuatorEstimate:
         """The actuators at `now` (s, of the clock that reports are stamped with).

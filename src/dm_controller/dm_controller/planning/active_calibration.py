@@ -115,9 +115,9 @@ def active_calibration(
         recipes = recipe_book_from(calibration.recipes)
         if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
-        planner = Planner(calibrated, hysteresis_figures_of(calibration), slew_rate)
+        planner = Planner(calibrated, hysteresis_figures_of(calibration, limits), slew_rate)
         certain = calibrated
-        if planner.law.remembers:
+        if not planner.law.is_identity:
             reach = certain_reach(planner.law, limits.low, limits.high)
             share = (reach[1] - reach[0]) / (limits.high - limits.low)
             certain = CalibratedMirror(
@@ -160,8 +160,8 @@ def model_of(calibration: Any) -> InfluenceModel:
     )
 
 
-def hysteresis_figures_of(calibration: Any) -> HysteresisFigures | None:
-    """The memory of a dm_msgs/Calibration; None when none was identified.
+def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures | None:
+    """The hysteresis model of a dm_msgs/Calibration for signals inside `limits`; None when none was identified.
 
     Raises:
         ValueError: a field that makes no sense, or a law that has no inverse, naming it.
@@ -173,7 +173,7 @@ def hysteresis_figures_of(calibration: Any) -> HysteresisFigures | None:
         raise ValueError(f"hysteresis: {str(error).removeprefix('hysteresis: ')}") from error
     if law is None:
         return None
-    slope = law.slope_min()
+    slope = law.slope_min(limits.low, limits.high)
     if not slope > 0.0:
         raise ValueError(
             f"hysteresis: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"
