@@ -14,6 +14,7 @@ from dm_common.errors import Refusal
 from dm_simulation.bench import BenchConfig, VirtualBench
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.zygo_files import encode_dat
+from dm_simulation.mirror.piezo import PiezoActuators
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model, plan_steps
 
 SMALL = SimulationConfig(seed=7, pixels=120, degauss_steps=20)
@@ -48,7 +49,8 @@ def test_a_seed_is_the_same_mirror_as_behind_the_sockets(bench: SimulatedBench) 
     ports = PortsConfig(OFF, OFF, OFF, "")
     served = VirtualBench(BenchConfig(seed=SMALL.seed, ports=ports, trigger_port=OFF))
     try:
-        np.testing.assert_array_equal(0.5 * served.piezo.config.stroke * served.piezo.gain, bench.true_stroke)
+        assert isinstance(served.actuators, PiezoActuators)
+        np.testing.assert_array_equal(0.5 * served.actuators.config.stroke * served.actuators.gain, bench.true_stroke)
         figure = served.interferometer.true_sag(np.zeros(37))
         flat = bench._interferometer.true_sag(np.zeros(37))
         # Both normalise the figure on their own pixels.

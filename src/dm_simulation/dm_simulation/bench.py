@@ -18,6 +18,7 @@ from dm_simulation.electronics.server import OFF, ElectronicsServer, PortsConfig
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.trigger_server import TriggerServer
 from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx
+from dm_simulation.mirror.membrane import Membrane, MembraneConfig
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
 from dm_simulation.mirror.zernike import Array
@@ -38,11 +39,15 @@ class FilesConfig:
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """Everything the bench is made of. The seed fixes the gains, the initial figure and the noise of the n-th map."""
+    """Everything the bench is made of. The seed fixes the gains, the initial figure and the noise of the n-th map.
+
+    The mirror is the `membrane`, or where there is none the `plate` on `piezo` stacks.
+    """
 
     seed: int = 1
     plate: PlateConfig = field(default_factory=PlateConfig)
     piezo: PiezoConfig = field(default_factory=PiezoConfig)
+    membrane: MembraneConfig | None = None
     interferometer: InterferometerConfig = field(default_factory=InterferometerConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     drive: DriveConfig = field(default_factory=DriveConfig)
@@ -77,12 +82,18 @@ class VirtualBench:
         self._on_event = on_event
         seeds = np.random.SeedSequence(config.seed).spawn(5)
         gains, figure, noise, scene, shot_noise = (np.random.default_rng(seed) for seed in seeds)
-        self.plate = Plate(config.plate)
         self.unit = DriveUnit(config.drive)
+        signals = self.unit.signals()
+        self.plate: Plate | Membrane
+        self.actuators: PiezoActuators | Membrane
+        if config.membrane is None:
+            self.plate = Plate(config.plate)
+            self.actuators = PiezoActuators(config.piezo, gains, signals, now())
+        else:
+            self.plate = self.actuators = Membrane(config.membrane, gains, now())
         if len(config.drive.wiring) != len(self.plate.x):
             raise ValueError(f"wiring: {len(config.drive.wiring)} channels given, {len(self.plate.x)} are needed")
-        signals = self.unit.signals()
-        self.piezo = PiezoActuators(config.piezo, gains, signals, now())
+        self._move()
         self.interferometer = Interferometer(config.interferometer, self.plate, figure, noise)
         self.camera: SceneCamera | None = None
         if config.camera.rate > 0:
@@ -107,19 +118,22 @@ class VirtualBench:
         trigger = {} if self.trigger is None else {"trigger_port": self.trigger.port}
         return {**self.electronics.endpoints, **trigger}
 
+    def _move(self) -> None:
+        drive = self.unit.signals() if self.config.membrane is None else self.unit.actuator_volts()
+        self.actuators.apply(drive, self._now())
+
     def _on_frame(self) -> None:
-        signals = self.unit.signals()
-        self.piezo.apply(signals, self._now())
-        wrong = self.monitor.watch(signals)
+        self._move()
+        wrong = self.monitor.watch(self.unit.signals())
         if wrong:
             self._on_event(True, wrong)
 
     def displacement(self) -> Array:
-        """Base displacements (N,), m, at this moment, with all frames that have arrived."""
+        """Base displacements (N,), m, or of a membrane pressures, Pa, now, with all frames that have arrived."""
 
         def sample() -> Array:
-            self.piezo.advance(self._now())
-            return self.piezo.displacement
+            self.actuators.advance(self._now())
+            return self.actuators.displacement
 
         return self.electronics.run(sample)
 

@@ -17,11 +17,13 @@ from dm_simulation.electronics.server import PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_simulation.interferometer.zygo_files import FORMATS, UNITS
 from dm_simulation.mirror.hysteresis import LAWS
+from dm_simulation.mirror.membrane import MembraneConfig
 from dm_simulation.mirror.piezo import PiezoConfig
 from dm_simulation.mirror.plate import PlateConfig
 
 _PLATE = PlateConfig()
 _PIEZO = PiezoConfig()
+_MEMBRANE = MembraneConfig()
 _INSTRUMENT = InterferometerConfig()
 _CAMERA = CameraConfig()
 _DRIVE = DriveConfig()
@@ -29,11 +31,17 @@ _PORTS = PortsConfig()
 _MONITOR = MonitorConfig()
 _FILES = FilesConfig()
 _FRAMED = FramedConfig()
+_PLATE_ON_PIEZOS, _ELECTROSTATIC_MEMBRANE = PRINCIPLES = ("piezo", "membrane")
 _PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
 
 PARAMETERS = (
     Parameter("seed", whole(1, 0, 2**31), "Fixes gains, initial figure and noise."),
     Parameter("mirror.name", text(_FILES.part_name), "Model of the mirror, as map files name it."),
+    Parameter(
+        "mirror.principle",
+        text(_PLATE_ON_PIEZOS, choices=PRINCIPLES),
+        "A plate on piezo stacks (plate.*, piezo.*), or a membrane that electrodes pull (membrane.*).",
+    ),
     Parameter("plate.diameter", real(_PLATE.diameter, 1e-3, 1.0, "m"), "Diameter of the faceplate."),
     Parameter("plate.thickness", real(_PLATE.thickness, 1e-5, 0.1, "m"), "Thickness of the faceplate."),
     Parameter("plate.youngs_modulus", real(_PLATE.youngs_modulus, 1e6, 1e13, "Pa"), "Young's modulus."),
@@ -55,6 +63,18 @@ PARAMETERS = (
     Parameter("piezo.law", text(_PIEZO.law, choices=LAWS), "Hysteresis law."),
     Parameter("piezo.hysteresis", real(_PIEZO.hysteresis, 0.0, 0.3), "Widest loop opening over the full stroke."),
     Parameter("piezo.creep", real(_PIEZO.creep, 0.0, 0.1), "Creep of a step per decade of time."),
+    Parameter("membrane.diameter", real(_MEMBRANE.diameter, 1e-3, 1.0, "m"), "Diameter inside the frame."),
+    Parameter("membrane.tension", real(_MEMBRANE.tension, 1e-3, 1e5, "N/m"), "Tension of the membrane."),
+    Parameter("membrane.gap", real(_MEMBRANE.gap, 1e-6, 1e-2, "m"), "From the electrodes to the flat membrane."),
+    Parameter("membrane.actuators", whole(_MEMBRANE.actuators, 7, 1000), "Electrodes of the hexagonal pattern."),
+    Parameter("membrane.pitch", real(_MEMBRANE.pitch, 1e-4, 0.1, "m"), "Distance of neighbouring electrodes."),
+    Parameter(
+        "membrane.electrode_diameter", real(_MEMBRANE.electrode_diameter, 1e-4, 0.1, "m"), "Diameter of an electrode."
+    ),
+    Parameter("membrane.gain_spread", real(_MEMBRANE.gain_spread, 0.0, 0.3), "Standard deviation of relative pulls."),
+    Parameter("membrane.drift", real(_MEMBRANE.drift, 0.0, 1e-5, "m"), "Deflection that the zero drifts by."),
+    Parameter("membrane.drift_time", real(_MEMBRANE.drift_time, 1.0, 1e7, "s"), "Time of 63 % of that drift."),
+    Parameter("membrane.order", whole(_MEMBRANE.order, 12, 60), "Degree of the polynomials of the solution."),
     Parameter("interferometer.pixels", whole(_INSTRUMENT.pixels, 32, 4096, "px"), "Pixels along each side."),
     Parameter(
         "interferometer.field_diameter",
@@ -191,18 +211,21 @@ def bench_config(values: Mapping[str, Any]) -> BenchConfig:
     ports = {name: electronics.pop(name) for name in ("tcp_port", "udp_port", "discovery_port", "pty_link")}
     if ports["pty_link"]:
         ports["pty_link"] = str(Path(ports["pty_link"]).expanduser())
+    membrane = values["mirror.principle"] == _ELECTROSTATIC_MEMBRANE
     return BenchConfig(
         seed=values["seed"],
         plate=PlateConfig(
             **group("plate") | {name: tuple(values[f"plate.{name}"]) for name in ("actuator_x", "actuator_y")}
         ),
         piezo=PiezoConfig(**group("piezo")),
+        membrane=MembraneConfig(**group("membrane")) if membrane else None,
         interferometer=InterferometerConfig(**group("interferometer")),
         camera=CameraConfig(**group("camera") | {"distances": tuple(values["camera.distances"])}),
         drive=DriveConfig(
             **electronics,
             volts_min=values["volts.min"],
             volts_max=values["volts.max"],
+            squared=membrane,
             wiring=tuple(values["wiring"]),
         ),
         ports=PortsConfig(

@@ -75,6 +75,8 @@ class VirtualBenchNode(Node):
             self._camera_thread.start()
         places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
         law = f"{values['piezo.law']} {100 * values['piezo.hysteresis']:g} %, creep {100 * values['piezo.creep']:g} %"
+        if self.bench.config.membrane is not None:
+            law = "membrane"
         self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; clock speed {speed:g}")
 
     def _now(self) -> float:

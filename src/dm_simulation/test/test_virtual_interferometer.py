@@ -137,7 +137,7 @@ def test_true_sag_is_the_measurement_without_its_errors(plate: Plate) -> None:
 
 
 def test_a_field_larger_than_the_plate_is_refused(plate: Plate) -> None:
-    with pytest.raises(ValueError, match=r"field_diameter = 0.04 m: must not exceed the plate, 0.03 m"):
+    with pytest.raises(ValueError, match=r"field_diameter = 0.04 m: must not exceed the mirror, 0.03 m"):
         make(replace(QUIET, field_diameter=0.040), plate)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.inverse import certain_reach
+from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
 from dm_common.mirror import mismatch
 from dm_common.recipes import RecipeBook

@@ -31,6 +31,7 @@ class DriveConfig:
         amplifier_min, amplifier_max: where the amplifier saturates, V at the actuator.
         volts_min, volts_max: V at the actuator for signals -1 and +1.
         wiring: connector channel (0-based) that actuator 1, 2, ... is really connected to.
+        squared: whether signals count the square of the volts, as a membrane does.
         channels: at the connector; EDAC40 and USB DAC-40 have 40.
     """
 
@@ -41,6 +42,7 @@ class DriveConfig:
     amplifier_max: float = 400.0
     volts_min: float = 0.0
     volts_max: float = 300.0
+    squared: bool = False
     wiring: Sequence[int] = TRIHEX
     channels: int = frames.CHANNELS
 
@@ -117,5 +119,6 @@ class DriveUnit:
 
     def signals(self) -> Array:
         """Normalised signals (N,) that the actuators really get; beyond -1..+1 when driven too far."""
-        config = self.config
-        return 2 * (self.actuator_volts() - config.volts_min) / (config.volts_max - config.volts_min) - 1
+        config, power = self.config, 2 if self.config.squared else 1
+        low, high = config.volts_min**power, config.volts_max**power
+        return 2 * (self.actuator_volts() ** power - low) / (high - low) - 1

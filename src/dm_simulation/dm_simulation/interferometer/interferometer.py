@@ -15,6 +15,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from dm_simulation.mirror import zernike
+from dm_simulation.mirror.membrane import Membrane
 from dm_simulation.mirror.plate import Plate
 from dm_simulation.mirror.zernike import Array
 
@@ -54,7 +55,7 @@ class InterferometerConfig:
 
 
 class Interferometer:
-    """The instrument in front of one plate.
+    """The instrument in front of one mirror, whose influence on the sag is a polynomial.
 
     Args:
         figure_rng: draws the initial figure, once.
@@ -68,14 +69,14 @@ class Interferometer:
     def __init__(
         self,
         config: InterferometerConfig,
-        plate: Plate,
+        plate: Plate | Membrane,
         figure_rng: np.random.Generator,
         noise_rng: np.random.Generator,
     ) -> None:
         if config.field_diameter > plate.config.diameter:
             raise ValueError(
                 f"interferometer.field_diameter = {config.field_diameter:g} m: "
-                f"must not exceed the plate, {plate.config.diameter:g} m"
+                f"must not exceed the mirror, {plate.config.diameter:g} m"
             )
         if config.rotate_deg not in (0, 90, 180, 270):
             raise ValueError(f"interferometer.rotate_deg = {config.rotate_deg}: must be 0, 90, 180 or 270")

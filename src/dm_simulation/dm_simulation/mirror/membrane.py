@@ -1,0 +1,141 @@
+"""A membrane that electrodes behind it attract: a mirror by another principle than piezo stacks.
+
+The membrane is under tension T and clamped at its edge, so its deflection follows the Poisson equation
+``T div grad w = -p`` with w = 0 there ([30]). Electrodes press on it with ``p = epsilon V^2 / (2 g^2)``, g the gap that
+the membrane leaves where it stands: they only pull, the more the nearer it has come, until it rests on stops at a third
+of the gap. There is neither hysteresis nor creep; the zero drifts slowly after the start, as in a mount that warms up.
+
+With rho = r / a, the polynomials ``(1 - rho^2) rho^m P_k^(1,m)(2 rho^2 - 1)`` times cos or sin of m theta vanish at the
+edge, and the Laplacian multiplies what follows the first bracket by ``-4 (k + 1)(k + m + 1)``, so in this basis the
+solution is written down: P are Jacobi polynomials, orthogonal over the disc with the weight 1 - rho^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import eval_jacobi
+
+from dm_simulation.mirror import zernike
+from dm_simulation.mirror.plate import actuator_positions
+from dm_simulation.mirror.zernike import Array
+
+#: Permittivity of free space, A s / (V m).
+EPSILON = 8.8541878128e-12
+#: Points of the quadrature over an electrode, along its radius and around it: good to 1e-9 of its load.
+_RADII, _ANGLES = 6, 16
+#: Rounds in which gap and pressure settle, and the change of a gap, in its own unit, at which they have.
+_ROUNDS, _SETTLED = 100, 1e-9
+
+
+@dataclass(frozen=True)
+class MembraneConfig:
+    """Geometry and state of the mirror, SI units.
+
+    Attributes:
+        diameter: of the membrane inside its frame.
+        tension: of the membrane, N/m.
+        gap: from the electrodes to the flat membrane.
+        actuators, pitch, electrode_diameter: full rings of round electrodes on a hexagonal grid, numbered as stacks.
+        gain_spread: standard deviation of the relative pull of the electrodes (cut at three of them).
+        drift: deflection that the zero has gone after a long time.
+        drift_time: time in which it goes 63 % of that, s.
+        order: degree of the polynomials.
+    """
+
+    diameter: float = 0.015
+    tension: float = 60.0
+    gap: float = 100e-6
+    actuators: int = 37
+    pitch: float = 1.8e-3
+    electrode_diameter: float = 1.7e-3
+    gain_spread: float = 0.03
+    drift: float = 0.0
+    drift_time: float = 3600.0
+    order: int = 36
+
+
+class Membrane:
+    """The solved membrane and its electrodes. Time is passed in (s, any origin) and never read from a clock.
+
+    Args:
+        config: geometry.
+        rng: draws pull of the electrodes and pattern of the drift.
+        time: s, from which on the zero drifts.
+
+    Attributes:
+        x, y: positions of the electrodes (N,), m.
+        radius: m.
+
+    Raises:
+        ValueError: no such pattern, or one that the membrane does not cover.
+    """
+
+    def __init__(self, config: MembraneConfig, rng: np.random.Generator, time: float = 0.0) -> None:
+        self.config = config
+        self.radius = config.diameter / 2
+        self.x, self.y = actuator_positions(config.pitch, actuators=config.actuators)
+        if np.hypot(self.x, self.y).max() + config.electrode_diameter / 2 > self.radius:
+            raise ValueError(
+                f"membrane.pitch = {config.pitch:g} m: electrodes beyond the edge of the membrane,"
+                f" membrane.diameter = {config.diameter:g} m"
+            )
+        terms = zernike.terms_to_order(config.order - 2)
+        self._n, self._m, self._sine = (np.array(column) for column in zip(*terms, strict=True))
+        self._k = (self._n - self._m) // 2
+        #: (T, N): coefficients of the deflection in m per Pa on each electrode.
+        self._compliance = self._solve()
+        self._at_electrodes = -self.influence_at(self.x, self.y)
+        count = config.actuators
+        self._gain = 1 + config.gain_spread * np.clip(rng.standard_normal(count), -3, 3)
+        pattern = 1 + 0.5 * rng.standard_normal(count)
+        self._drift = config.drift / np.abs(self._at_electrodes @ pattern).max() * pattern
+        self._began = time
+        self.apply(np.zeros(count), time)
+
+    def _modes(self, x: Array, y: Array) -> Array:
+        """The polynomials at points in m: x.shape + (T,)."""
+        rotor = (np.asarray(x) + 1j * np.asarray(y))[..., None] / self.radius
+        square = np.abs(rotor) ** 2
+        angular = rotor**self._m
+        radial = (1 - square) * eval_jacobi(self._k, 1, self._m, 2 * square - 1)
+        return np.asarray(radial * np.where(self._sine, angular.imag, angular.real))
+
+    def _solve(self) -> Array:
+        nodes, weights = np.polynomial.legendre.leggauss(_RADII)
+        r = self.config.electrode_diameter / 2 * np.sqrt((nodes + 1) / 2)
+        angle = np.arange(_ANGLES) * 2 * np.pi / _ANGLES
+        x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
+        mean = np.repeat(weights / 2, _ANGLES) / _ANGLES
+        loads = np.tensordot(mean, self._modes(self.x + x[:, None], self.y + y[:, None]), 1).T
+        loads *= np.pi * (self.config.electrode_diameter / 2 / self.radius) ** 2
+        # Load over norm of the polynomial over the factor of the Laplacian.
+        around = np.where(self._m == 0, 2, 1) * np.pi
+        factor = self.radius**2 / (2 * self.config.tension) * (self._n + 2) / (around * (self._k + 1) ** 2)
+        return np.asarray(factor[:, None] * loads)
+
+    def influence_at(self, x: Array, y: Array) -> Array:
+        """Sag at points (in m) per Pa on each electrode: x.shape + (N,). What they pull, from behind, is hollow."""
+        return -self._modes(x, y) @ self._compliance
+
+    def advance(self, time: float) -> None:
+        """Let the zero drift until `time`."""
+        self._time = time
+
+    def apply(self, volts: Array, time: float) -> None:
+        """Take new volts (N,) at `time`."""
+        self.advance(time)
+        gap = self.config.gap
+        pull = self._gain * EPSILON / 2 * (volts / gap) ** 2
+        nearer = np.zeros(len(pull))  # deflections as shares of the gap: they grow from round to round
+        for _ in range(_ROUNDS):
+            self._pressure = pull / (1 - nearer) ** 2
+            before, nearer = nearer, np.minimum(self._at_electrodes @ self._pressure / gap, 1 / 3)
+            if np.abs(nearer - before).max() < _SETTLED:
+                break
+
+    @property
+    def displacement(self) -> Array:
+        """Pressures on the electrodes (N,), Pa, at the time last given; drift of the zero counts as pressure."""
+        return self._pressure - self._drift * np.expm1((self._began - self._time) / self.config.drift_time)
