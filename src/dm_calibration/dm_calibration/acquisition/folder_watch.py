@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from dm_calibration.map_files.completeness import is_complete
+from dm_calibration.map_files import is_complete
 
 
 class Signature(NamedTuple):

@@ -11,13 +11,14 @@ from dm_calibration.map_files import dat
 from dm_calibration.map_files.asc import parse_asc
 from dm_calibration.map_files.dat import is_dat, parse_dat
 from dm_calibration.map_files.datx import is_datx
+from dm_calibration.map_files.datx_structure import check_end
 from dm_calibration.map_files.surface_map import MapFileError, NoValidPixelsError, SurfaceMap
 from dm_calibration.map_files.text_header import XYZ_TITLE, is_text
 from dm_calibration.map_files.xyz import UNITS as XYZ_UNITS
 from dm_calibration.map_files.xyz import parse_xyz
 from dm_calibration.store.hdf5_sandbox import SandboxError, read_in_sandbox
 
-__all__ = ["XYZ_UNITS", "MapFileError", "NoValidPixelsError", "SurfaceMap", "read_map"]
+__all__ = ["XYZ_UNITS", "MapFileError", "NoValidPixelsError", "SurfaceMap", "is_complete", "read_map"]
 
 #: Larger files are refused before they are read; the largest map in the wordiest format stays below.
 MAX_FILE_BYTES = 2**30
@@ -51,6 +52,33 @@ def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> Su
     return dataclasses.replace(surface_map, file=str(path), content=content)
 
 
+def is_complete(path: Path) -> bool:
+    """True for a `.dat` or `.datx` file of exactly the length it tells; False for others, and for what is no file.
+
+    Formats that do not tell their length are never known to be whole.
+    """
+    try:
+        with open(path, "rb", opener=_open_without_waiting) as file:
+            return _agrees(file.read(_START_BYTES), os.fstat(file.fileno()).st_size)
+    except (OSError, MapFileError):
+        return False
+
+
+def _agrees(start: bytes, length: int) -> bool:
+    """Whether the first bytes of a file tell that it is `length` bytes long; False where its format does not tell.
+
+    Raises:
+        MapFileError: they tell another length.
+    """
+    if is_dat(start):
+        dat.check_length(dat.read_header(start), length)
+    elif is_datx(start):
+        check_end(start, length)
+    else:
+        return False
+    return True
+
+
 def _read(path: Path) -> bytes:
     """The whole file, once what its first bytes promise agrees with its length."""
     with open(path, "rb", opener=_open_without_waiting) as file:
@@ -60,9 +88,7 @@ def _read(path: Path) -> bytes:
         if status.st_size > MAX_FILE_BYTES:
             raise MapFileError(f"file length = {status.st_size} bytes: must be at most {MAX_FILE_BYTES}")
         start = file.read(_START_BYTES)
-        if is_dat(start):
-            dat.check_length(dat.read_header(start), status.st_size)
-        elif not (is_datx(start) or is_text(start)):
+        if not (_agrees(start, status.st_size) or is_text(start)):
             raise MapFileError(
                 f"begins with bytes {start[:8].hex(' ') or '(none)'}: not a ZYGO .dat, .datx, .asc or .xyz file"
             )

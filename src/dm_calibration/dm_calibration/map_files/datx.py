@@ -62,7 +62,7 @@ def parse_datx(content: bytes) -> SurfaceMap:
         MapFileError: not a whole, meaningful map; the message names what is missing or wrong.
     """
     try:
-        check_end(content)
+        check_end(content, len(content))
         with h5py.File(io.BytesIO(content), "r") as file:
             return _parse(file, content)
     except MapFileError:

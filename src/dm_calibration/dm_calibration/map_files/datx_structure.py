@@ -28,22 +28,22 @@ _LEAST_HEIGHT = {4: 1e-30, 8: 1e-200}
 _FILTER_NAMES = {h5py.h5z.FILTER_SZIP: "Szip", h5py.h5z.FILTER_DEFLATE: "gzip"}
 
 
-def check_end(content: bytes) -> None:
-    """The superblock tells where the file ends; the library minds a shorter file only.
+def check_end(start: bytes, length: int) -> None:
+    """The superblock, in the first bytes of a file, tells its length; the library minds a shorter file only.
 
     Raises:
         MapFileError: the file is longer or shorter, or has no superblock that can be understood.
     """
-    version = content[len(SIGNATURE)] if len(content) > 64 else -1
+    version = start[len(SIGNATURE)] if len(start) > 64 else -1
     if version not in _END_ADDRESS:
         raise MapFileError(f"HDF5 superblock version = {version}: must be one of {', '.join(map(str, _END_ADDRESS))}")
-    sizes = content[_SIZE_OF_OFFSETS[version]]
+    sizes = start[_SIZE_OF_OFFSETS[version]]
     if sizes != 8:
         raise MapFileError(f"HDF5 superblock: size of offsets = {sizes}: must be 8")
-    (end,) = struct.unpack_from("<Q", content, _END_ADDRESS[version])
-    if end != len(content):
-        problem = "truncated" if len(content) < end else "longer than its superblock says"
-        raise MapFileError(f"file length = {len(content)} bytes: must be {end}; the file is {problem}")
+    (end,) = struct.unpack_from("<Q", start, _END_ADDRESS[version])
+    if end != length:
+        problem = "truncated" if length < end else "longer than its superblock says"
+        raise MapFileError(f"file length = {length} bytes: must be {end}; the file is {problem}")
 
 
 def check_storage(surface: h5py.Dataset, length: int) -> None:
