@@ -14,7 +14,7 @@ from rclpy.node import Node
 from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities, tolerance_of
 from dm_autofocus.autofocus_parameters import PARAMETERS
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
-from dm_autofocus.optics import FocusOptics, OpticsError, dioptre_of, distance_of
+from dm_autofocus.optics import FocusOptics, dioptre_of, distance_of
 from dm_autofocus.search import Phase
 from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode, Refusal
@@ -56,40 +56,32 @@ class AutofocusNode(Node):
     def _on_set_focus_distance(
         self, request: SetFocusDistance.Request, response: SetFocusDistance.Response
     ) -> SetFocusDistance.Response:
+        if request.distance != 0 and request.dioptre != 0:
+            raise Refusal(
+                ErrorCode.INVALID_ARGUMENT,
+                f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
+            )
+        if self._action.busy:
+            raise Refusal(ErrorCode.BUSY, "a search or tracking (action autofocus) is running; cancel it first")
+        response.dioptre = dioptre_of(request.distance) or request.dioptre
+        response.distance = distance_of(response.dioptre)
+        response.curvature = self._optics.curvature_for(response.dioptre)
+        response.power = 2 * response.curvature
+        wanted = SetFocus.Request(request=FocusRequest(curvature=response.curvature), dry_run=request.dry_run)
         try:
-            if request.distance != 0 and request.dioptre != 0:
-                raise Refusal(
-                    ErrorCode.INVALID_ARGUMENT,
-                    f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
-                )
-            if self._action.busy:
-                raise Refusal(ErrorCode.BUSY, "a search or tracking (action autofocus) is running; cancel it first")
-            response.dioptre = dioptre_of(request.distance) or request.dioptre
-            response.distance = distance_of(response.dioptre)
-            response.curvature = self._optics.curvature_for(response.dioptre)
-            response.power = 2 * response.curvature
-            wanted = SetFocus.Request(request=FocusRequest(curvature=response.curvature), dry_run=request.dry_run)
             answer = call(self._set_focus, wanted, self._values["move_timeout"])
-            response.state = answer.state
-            response.error_code, response.message = answer.error_code, answer.message
-            if answer.error_code == ErrorCode.UNREACHABLE and self._probe.capabilities is not None:
-                response.message += f"; the camera focuses {self._range_text(self._probe.capabilities)}"
-        except OpticsError as error:
-            response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
-        except Refusal as error:
-            response.error_code, response.message = error.error_code, str(error)
         except ServiceCallError as error:
-            response.error_code, response.message = ErrorCode.TIMEOUT, f"focus_controller: {error}"
+            raise Refusal(ErrorCode.TIMEOUT, f"focus_controller: {error}") from error
+        response.state = answer.state
+        response.error_code, response.message = answer.error_code, answer.message
+        if answer.error_code == ErrorCode.UNREACHABLE and self._probe.capabilities is not None:
+            response.message += f"; the camera focuses {self._range_text(self._probe.capabilities)}"
         return response
 
     def _on_get_focus_range(
         self, _request: GetFocusRange.Request, response: GetFocusRange.Response
     ) -> GetFocusRange.Response:
-        try:
-            capabilities = ready_capabilities(self._probe)
-        except Refusal as error:
-            response.error_code, response.message = error.error_code, str(error)
-            return response
+        capabilities = ready_capabilities(self._probe)
         response.curvature_min, response.curvature_max = capabilities.curvature_min, capabilities.curvature_max
         response.dioptre_min, response.dioptre_max = self._dioptres(capabilities)
         response.distance_far = distance_of(response.dioptre_min)

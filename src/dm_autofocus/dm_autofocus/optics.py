@@ -23,9 +23,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from dm_common.errors import ErrorCode
+
 
 class OpticsError(ValueError):
     """A distance, dioptre or optical parameter outside its range; the message names field, value and range."""
+
+    error_code = ErrorCode.OUT_OF_RANGE
 
 
 @dataclass(frozen=True)

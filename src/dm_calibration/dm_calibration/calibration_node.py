@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from dm_calibration.calibrator import refit
 from dm_calibration.recalibration.map_listener import PUBLISH_PERIOD_S, MapListener
 from dm_calibration.regression.error_prediction import ErrorPrediction
 from dm_calibration.report.report_writer import ReportingStore, ReportWriter
-from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
+from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.messages import mirror_from, recipe_book_from, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.bench_services import BenchServices
@@ -47,7 +46,6 @@ class CalibrationNode(Node):
     def __init__(self) -> None:
         super().__init__("calibration")
         self._values = declare(self, PARAMETERS)
-        self._last_refusal = ""
         self._frame_id = ""
         self._start_pending = bool(self._values["load_on_start"])
         # Latched: a controller that starts later must know the calibration in use.
@@ -71,11 +69,8 @@ class CalibrationNode(Node):
         WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)
         WorkerService(self, StoreRecipes, "store_recipes", self._on_store_recipes)
         prediction = ErrorPrediction(self._manager, self._values)
-        for kind, name, work in (
-            (FitRegression, "fit_regression", prediction.fit),
-            (PredictError, "predict_error", prediction.predict),
-        ):
-            WorkerService(self, kind, name, partial(self._serve, work))
+        WorkerService(self, FitRegression, "fit_regression", prediction.fit)
+        WorkerService(self, PredictError, "predict_error", prediction.predict)
         self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._ticker = self.create_timer(PUBLISH_PERIOD_S, self._listener.tick, clock=steady)
@@ -127,25 +122,6 @@ class CalibrationNode(Node):
         except EXPECTED as error:
             self.get_logger().warning(f"load_on_start = {name!r}: {error}")
 
-    def _answer(self, response: Any, work: Callable[[], None], logged: str = "") -> Any:
-        """Run `work`; an expected failure becomes error code and message of the response.
-
-        It is logged too, unless its sentence is `logged`.
-        """
-        try:
-            work()
-        except EXPECTED as error:
-            response.error_code, response.message = error_code(error), str(error)
-            if response.message != logged:
-                self.get_logger().warning(response.message)
-        return response
-
-    def _serve(self, work: Callable[[Any, Any], None], request: Any, response: Any) -> Any:
-        # The controller asks for many commands at once; one refusal is one line of the log.
-        self._answer(response, lambda: work(request, response), self._last_refusal)
-        self._last_refusal = response.message if response.error_code else ""
-        return response
-
     def _on_list(self, _request: Any, response: Any) -> Any:
         in_use = self._manager.in_use
         for entry in self._manager.store.entries():
@@ -161,43 +137,37 @@ class CalibrationNode(Node):
         return response
 
     def _on_load(self, request: Any, response: Any) -> Any:
-        def work() -> None:
-            response.id = self._manager.load(request.calibration).id
-            response.message = f"calibration {response.id} is in use"
-
-        return self._answer(response, work)
+        response.id = self._manager.load(request.calibration).id
+        response.message = f"calibration {response.id} is in use"
+        return response
 
     def _on_fit(self, request: Any, response: Any) -> Any:
-        def work() -> None:
-            named = request.calibration
-            stored = self._manager.store.load(named) if named else self._manager.in_use
-            if stored is None:
-                raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use and none was named")
-            if request.activate:
-                self._manager.check_fits(stored)
-            provenance = self._manager.provenance(stored.mirror_name, stored.mirror_serial, "")
-            calibration = refit(stored, fit_options(self._values, request.method), request.exclude, provenance)
-            response.file = str(self._manager.store.save(calibration))
-            response.id = calibration.id
-            response.in_sample_rms = calibration.fit.in_sample_rms
-            response.held_out_rms = calibration.fit.held_out_rms
-            response.condition_number = calibration.fit.condition_number
-            response.message = f"fitted again from {stored.id}: {int(calibration.fit.used.sum())} maps used"
-            if request.activate:
-                self._manager.use(calibration)
-
-        return self._answer(response, work)
+        named = request.calibration
+        stored = self._manager.store.load(named) if named else self._manager.in_use
+        if stored is None:
+            raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use and none was named")
+        if request.activate:
+            self._manager.check_fits(stored)
+        provenance = self._manager.provenance(stored.mirror_name, stored.mirror_serial, "")
+        calibration = refit(stored, fit_options(self._values, request.method), request.exclude, provenance)
+        response.file = str(self._manager.store.save(calibration))
+        response.id = calibration.id
+        response.in_sample_rms = calibration.fit.in_sample_rms
+        response.held_out_rms = calibration.fit.held_out_rms
+        response.condition_number = calibration.fit.condition_number
+        response.message = f"fitted again from {stored.id}: {int(calibration.fit.used.sum())} maps used"
+        if request.activate:
+            self._manager.use(calibration)
+        return response
 
     def _on_store_recipes(self, request: Any, response: Any) -> Any:
-        def work() -> None:
-            book = recipe_book_from(request.recipes)
-            calibration = self._manager.add_recipes(request.calibration_id, book)
-            response.message = (
-                f"{len(book.recipes)} recipes stored with calibration {calibration.id}, which now has "
-                f"{len(calibration.recipes.recipes)}"
-            )
-
-        return self._answer(response, work)
+        book = recipe_book_from(request.recipes)
+        calibration = self._manager.add_recipes(request.calibration_id, book)
+        response.message = (
+            f"{len(book.recipes)} recipes stored with calibration {calibration.id}, which now has "
+            f"{len(calibration.recipes.recipes)}"
+        )
+        return response
 
     def _health(self) -> diagnostics.Health:
         calibration, mirror = self._manager.in_use, self._manager.mirror

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +24,11 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from dm_calibration.acquisition import interferometer_messages as messages
-from dm_calibration.acquisition.acquisition import (
-    Acquired,
-    Acquisition,
-)
+from dm_calibration.acquisition.acquisition import Acquired, Acquisition
 from dm_calibration.acquisition.ingest import Ingest
 from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
 from dm_calibration.map_files import MapFileError, SurfaceMap
-from dm_common.errors import CodedError, ErrorCode
+from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.ros import diagnostics, parameters, qos
 from dm_common.ros.executor import run_node
@@ -126,11 +125,9 @@ class InterferometerNode(LifecycleNode):
 
     def _on_ingest_file(self, request: IngestFile.Request, response: IngestFile.Response) -> IngestFile.Response:
         if not self._configured:
-            return self._refuse(response, ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
-        try:
+            raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
+        with self._counting_refusals():
             surface, measured = self._read(self._expanded(request.path))
-        except CodedError as error:
-            return self._refuse_for(response, error)
         header = self._header(self._file_time(surface, believe_header=True))
         return self._accept(response, surface, measured, header, "ingested")
 
@@ -144,18 +141,12 @@ class InterferometerNode(LifecycleNode):
     def _on_measure(self, request: Measure.Request, response: Measure.Response) -> Measure.Response:
         acquisition = self._acquisition
         if not self._active or acquisition is None:
-            return self._refuse(
-                response, ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not active: activate it first"
-            )
+            raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not active: activate it first")
         timeout_s = request.timeout or self._values["measure_timeout"]
         if not 0 < timeout_s < 86400:
-            return self._refuse(
-                response, ErrorCode.OUT_OF_RANGE, f"timeout = {request.timeout} s: must be 0 (configured) to 86400 s"
-            )
-        try:
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"timeout = {request.timeout} s: must be 0 (configured) to 86400 s")
+        with self._counting_refusals():
             acquired = acquisition.acquire(timeout_s)
-        except CodedError as error:
-            return self._refuse_for(response, error)
         header = self._header(self._measurement_time(acquired))
         what = f"measured {request.label}".strip()
         return self._accept(response, acquired.surface, acquired.measurement, header, what)
@@ -193,15 +184,6 @@ class InterferometerNode(LifecycleNode):
         response.samples = messages.samples_message(measured, header)
         return response
 
-    def _refuse_for(self, response: Any, error: CodedError) -> Any:
-        self._warn_of_file(str(error))
-        return self._refuse(response, error.error_code, str(error))
-
-    def _refuse(self, response: Any, code: int, message: str) -> Any:
-        response.error_code = code
-        response.message = message
-        return response
-
     def _publish(self, surface: SurfaceMap, measured: Measurement, header: Header) -> None:
         with self._publishing:
             if not self._configured:
@@ -227,9 +209,16 @@ class InterferometerNode(LifecycleNode):
                 "radius 0 (unknown); set the parameter `pitch` [m per pixel]"
             )
 
+    @contextmanager
+    def _counting_refusals(self) -> Iterator[None]:
+        try:
+            yield
+        except CodedError as error:
+            self._bad, self._last_refusal = self._bad + 1, str(error)
+            raise
+
     def _warn_of_file(self, reason: str) -> None:
-        self._bad += 1
-        self._last_refusal = reason
+        self._bad, self._last_refusal = self._bad + 1, reason
         self.get_logger().warning(reason)
 
     def _now_ns(self) -> int:

@@ -21,7 +21,7 @@ from dm_calibration.calibration_messages import put_updates
 from dm_calibration.calibration_parameters import update_options
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
-from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
+from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
 from dm_common.messages import applied_from, measurement_from, stamp_ns
@@ -219,13 +219,14 @@ class MapListener:
                 self._forget(request, response)
             else:
                 self._check(request, response)
-        except EXPECTED as error:
-            response.error_code, response.message = error_code(error), str(error)
-            self._node.get_logger().warning(f"update_calibration: {error}")
-        updates = self._updates.updates
-        if updates is not None:
-            response.revision = updates.revision
-            response.gain_drift, response.offset_drift = abs(updates.drift.largest_gain[0]), updates.drift.offset_rms
+        finally:
+            updates = self._updates.updates
+            if updates is not None:
+                response.revision = updates.revision
+                response.gain_drift, response.offset_drift = (
+                    abs(updates.drift.largest_gain[0]),
+                    updates.drift.offset_rms,
+                )
         return response
 
     def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:

@@ -31,7 +31,7 @@ class ErrorPrediction:
         self._of = ""
         self._predictor: ErrorPredictor | None = None
 
-    def fit(self, request: Any, response: Any) -> None:
+    def fit(self, request: Any, response: Any) -> Any:
         """Serve `fit_regression`.
 
         Raises:
@@ -53,8 +53,9 @@ class ErrorPrediction:
             f"{row.model} on {row.n} surfaces of {stored.id}: {row.k} variables, held-out error "
             f"{row.leave_one_out_rms * 1e9:.1f} nm rms; R^2 and p are optimistic after selection"
         )
+        return response
 
-    def predict(self, request: Any, response: Any) -> None:
+    def predict(self, request: Any, response: Any) -> Any:
         """Serve `predict_error`.
 
         Raises:
@@ -70,6 +71,7 @@ class ErrorPrediction:
         response.predicted_rms, response.lower, response.upper = predictor.predict(signals)
         method = predictor.regression.table2.model
         response.message = f"by {method} on calibration {calibration.id}, over many histories before this command"
+        return response
 
     def _in_use(self) -> Calibration:
         calibration = self._manager.in_use

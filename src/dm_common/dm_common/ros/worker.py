@@ -23,7 +23,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.service import Service
 
-from dm_common.errors import ErrorCode
+from dm_common.errors import EXPECTED, ErrorCode, error_code
 from dm_common.ros import qos
 
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
@@ -47,17 +47,26 @@ def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
 
 
 def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """`callback(request, response) -> response` of service `name` that answers ErrorCode.INTERNAL instead of raising.
+    """`callback(request, response) -> response` of service `name` that answers with an error code instead of raising.
 
-    A service whose callback raises sends no answer: whoever called it waits until its patience ends.
+    A service whose callback raises sends no answer: whoever called it waits until its patience ends. What is EXPECTED
+    is answered with its own code and logged as a warning, once however often it repeats.
     """
+    refused = ""
 
     def answer(request: Any, response: Any) -> Any:
+        nonlocal refused
+        before, refused = refused, ""
         try:
             return callback(request, response)
+        except EXPECTED as error:
+            refused = str(error)
+            response.error_code, response.message = error_code(error), refused
+            if refused != before:
+                node.get_logger().warning(f"{name}: {refused}")
         except Exception as error:
             _answer_error(node, f"service {name}", error, response)
-            return response
+        return response
 
     return answer
 
