@@ -7,8 +7,8 @@ import pytest
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import FitOptions, fit_influence
-from dm_calibration.regression.surface_error import Reading, regress_surface_errors
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
+from studies.paper.readings import Reading, regress_surface_errors
 
 pytestmark = pytest.mark.slow
 

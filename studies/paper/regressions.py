@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
 from dm_calibration.regression.stepwise import leave_one_out, stepwise
-from dm_calibration.regression.surface_error import ErrorRegression, Reading, regress_surface_errors
 from dm_calibration.regression.surface_samples import surface_errors
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
+from studies.paper.readings import Reading, ReadRegression, regress_surface_errors
 from studies.paper.reported import MODELS, TEST_SURFACES
 from studies.paper.samples import Samples
 
@@ -36,7 +36,7 @@ class Regressions:
             from a model selected without it; with their names in `training`.
     """
 
-    by_reading: dict[Reading, dict[str, ErrorRegression]]
+    by_reading: dict[Reading, dict[str, ReadRegression]]
     shuffled_p: Floats
     training: tuple[str, ...]
     linear_left_out: Floats
@@ -46,7 +46,7 @@ class Regressions:
         return float((self.shuffled_p < p).mean())
 
     @property
-    def taken(self) -> dict[str, ErrorRegression]:
+    def taken(self) -> dict[str, ReadRegression]:
         """Both models in the reading taken."""
         return self.by_reading[TAKEN]
 
@@ -72,18 +72,19 @@ def regress_samples(samples: Samples, shuffles: int = 0, seed: int = 0) -> Regre
     }
     errors = surface_errors(samples.calibration.maps, samples.fit)
     train = np.array([label not in TEST_SURFACES for label in errors.labels])
-    candidates, response = np.hstack((errors.signals, errors.coefficients))[train], errors.response[train]
+    candidates = np.hstack((errors.signals, maps.coefficients[errors.rows]))[train]
+    response = errors.response[train]
     names = [f"x{k + 1}" for k in range(candidates.shape[1])]
     random = np.random.default_rng(seed)
     return Regressions(
         by_reading,
         np.array([stepwise(candidates, random.permutation(response), names).p_value for _ in range(shuffles)]),
         tuple(label for label, trained in zip(errors.labels, train, strict=True) if trained),
-        np.abs(leave_one_out(candidates, response, names) - response),
+        np.abs(leave_one_out(candidates, response) - response),
     )
 
 
-def relative_errors(regression: ErrorRegression) -> Floats:
+def relative_errors(regression: ReadRegression) -> Floats:
     """(S,) RelErr of the test surfaces in the order of the paper; NaN for one that was not measured."""
     by_name = {row.surface: row.relative_error for row in regression.table3}
     return np.array([by_name.get(name, np.nan) for name in TEST_SURFACES])

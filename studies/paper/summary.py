@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from dm_calibration.regression.surface_error import ErrorRegression
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from studies.paper import reported
 from studies.paper.control import Series, share_within
 from studies.paper.page.content_coefficients import MARKS
+from studies.paper.readings import ReadRegression
 from studies.paper.regions import RegionStatistics
 from studies.paper.regressions import LEVEL, TAKEN
 from studies.paper.results import BenchResults, Results
@@ -90,7 +90,7 @@ def _bench(bench: BenchResults) -> dict[str, Any]:
     }
 
 
-def _table_2(models: dict[str, ErrorRegression]) -> dict[str, Any]:
+def _table_2(models: dict[str, ReadRegression]) -> dict[str, Any]:
     result = {}
     for model in reported.MODELS:
         row = models[model].table2
@@ -107,7 +107,7 @@ def _table_2(models: dict[str, ErrorRegression]) -> dict[str, Any]:
     return result
 
 
-def _table_3(models: dict[str, ErrorRegression]) -> dict[str, Any]:
+def _table_3(models: dict[str, ReadRegression]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for model in reported.MODELS:
         for row in models[model].table3:

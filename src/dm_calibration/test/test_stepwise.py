@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 import statsmodels.api as sm
 
-from dm_calibration.regression.sample_checks import CollinearError, TooFewSamplesError
-from dm_calibration.regression.stepwise import SelectionOptions, leave_one_out, stepwise
+from dm_calibration.regression.stepwise import (
+    CollinearError,
+    SelectionOptions,
+    TooFewSamplesError,
+    leave_one_out,
+    stepwise,
+)
 
 NAMES = [f"x{k}" for k in range(58)]
 
@@ -29,7 +34,7 @@ def test_finds_the_variables_that_matter_and_agrees_with_statsmodels() -> None:
     reference = sm.OLS(y, sm.add_constant(x[:, list(fit.columns)])).fit()
     assert fit.parameters == pytest.approx(reference.params, rel=1e-9)
     assert (fit.adjusted_r2, fit.f_statistic) == pytest.approx((reference.rsquared_adj, reference.fvalue))
-    assert fit.residual_sd == pytest.approx(np.sqrt(reference.mse_resid))
+    assert fit.result.mse_resid == pytest.approx(reference.mse_resid)
     assert fit.p_value == pytest.approx(reference.f_pvalue)
     frame = reference.get_prediction(np.column_stack((np.ones(5), x[:5, list(fit.columns)]))).summary_frame()
     mean, lower, upper = fit.predict(x[:5])
@@ -83,7 +88,7 @@ def test_selection_makes_p_optimistic_and_leaving_out_tells() -> None:
         y = np.random.default_rng(seed).standard_normal(50)  # has nothing to do with x
         fit = stepwise(x, y, NAMES)
         significant += fit.p_value < 0.05
-        held_out = leave_one_out(x, y, NAMES) - y
+        held_out = leave_one_out(x, y) - y
         worse += np.sqrt(np.mean(held_out**2)) > np.std(y)
     assert significant >= 8 and worse >= 8
 
@@ -91,9 +96,9 @@ def test_selection_makes_p_optimistic_and_leaving_out_tells() -> None:
 def test_leaving_out_means_that_the_sample_has_no_say() -> None:
     x = candidates(6, count=8)
     y = x[:, 2] + 0.2 * np.random.default_rng(6).standard_normal(50)
-    before = leave_one_out(x, y, NAMES[:8])
+    before = leave_one_out(x, y)
     y[7] += 100.0
-    after = leave_one_out(x, y, NAMES[:8])
+    after = leave_one_out(x, y)
     assert after[7] == pytest.approx(before[7], rel=1e-12)
     assert np.abs(np.delete(after - before, 7)).max() > 1.0
 
@@ -107,8 +112,8 @@ def test_candidates_that_vary_in_one_sample_only_have_no_say_when_that_is_left_o
         x[7] += 1.0
         y = 50.0 + 3.0 * x[:, 0] + random.standard_normal(40)
         weights = random.uniform(0.5, 2.0, 40)
-        without = leave_one_out(x[:, :4], y, NAMES[:4], weights)
-        assert leave_one_out(x, y, NAMES, weights)[7] == pytest.approx(without[7])
+        without = leave_one_out(x[:, :4], y, weights)
+        assert leave_one_out(x, y, weights)[7] == pytest.approx(without[7])
 
 
 def test_an_unexplained_response_gives_the_mean_alone() -> None:
@@ -144,17 +149,12 @@ def _constant(x: np.ndarray) -> None:
     x[:, 2] = 0.7
 
 
-def _gap(x: np.ndarray) -> None:
-    x[4, 1] = np.nan
-
-
 @pytest.mark.parametrize(
     ("spoil", "error", "words"),
     [
         (_duplicate, CollinearError, "x1 and x3 are proportional"),
         (_sum, CollinearError, "the other candidates determine x"),
         (_constant, CollinearError, "x2 is the same for all samples"),
-        (_gap, ValueError, "candidate x1, sample 5: not finite"),
     ],
 )
 def test_candidates_refused(spoil: Any, error: type[Exception], words: str) -> None:
@@ -171,7 +171,7 @@ def test_dependent_candidates_are_never_selected_together_when_samples_are_few()
     y = x[:, 3] + 0.01 * np.random.default_rng(14).standard_normal(30)
     fit = stepwise(x, y, NAMES[:40])
     assert not {"x0", "x1", "x3"} <= set(fit.variables)
-    assert np.isfinite(fit.standard_errors).all()
+    assert np.isfinite(fit.result.bse).all()
 
 
 def test_other_bad_input_is_refused_in_words() -> None:
@@ -179,17 +179,9 @@ def test_other_bad_input_is_refused_in_words() -> None:
     with pytest.raises(TooFewSamplesError, match=r"11 samples: .* need at least 12"):
         stepwise(x[:11], y[:11], NAMES[:4])
     with pytest.raises(TooFewSamplesError, match="11 samples"):
-        leave_one_out(x[:12], y[:12], NAMES[:4])
+        leave_one_out(x[:12], y[:12])
     with pytest.raises(ValueError, match="the response is the same for all samples"):
         stepwise(x, np.full(50, 3e-8), NAMES[:4])
-    with pytest.raises(ValueError, match="response of sample 1: not finite"):
-        stepwise(x, np.full(50, np.nan), NAMES[:4])
-    with pytest.raises(ValueError, match="4 names"):
-        stepwise(x, y[:-1], NAMES[:4])
-    with pytest.raises(ValueError, match="unique"):
-        stepwise(x, y, ["a", "a", "b", "c"])
-    with pytest.raises(ValueError, match="weights: must be 50 finite numbers above 0"):
-        stepwise(x, y, NAMES[:4], np.zeros(50))
     with pytest.raises(ValueError, match=r"p_enter = 1\.5: must be above 0 and below 1"):
         SelectionOptions(p_enter=1.5)
     with pytest.raises(ValueError, match=r"p_remove = 0\.01: must be at least p_enter = 0\.05"):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from dm_calibration.regression.surface_error import ErrorRegression, Reading
 from dm_calibration.report.document import Picture, Section, Table
 from studies.paper import reported
 from studies.paper.page.figures import predictions_figure
+from studies.paper.readings import Reading, ReadRegression
 from studies.paper.regressions import LEVEL, TAKEN, relative_errors
 from studies.paper.results import STANDARD, BenchResults, Results
 
@@ -179,5 +179,5 @@ def table_3(results: Results) -> Section:
     )
 
 
-def _percent(regression: ErrorRegression) -> np.ndarray:
+def _percent(regression: ReadRegression) -> np.ndarray:
     return 100 * relative_errors(regression)

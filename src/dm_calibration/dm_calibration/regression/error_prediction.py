@@ -42,16 +42,15 @@ class ErrorPrediction:
         with self._lock:
             predictor = self._fitted(stored, request.method or stored.fit.method, options)
             self._of, self._predictor = stored.id, predictor
-        regression = predictor.regression
-        row = regression.table2
-        response.adjusted_r2, response.f_statistic, response.p_value = row.adjusted_r2, row.f_statistic, row.p_value
-        response.samples = row.n
-        response.variables = list(regression.fit.variables)
-        response.parameters = doubles(regression.fit.parameters)
-        response.held_out_rms = row.leave_one_out_rms
+        fit, held_out = predictor.regression.fit, predictor.regression.leave_one_out_rms
+        response.adjusted_r2, response.f_statistic, response.p_value = fit.adjusted_r2, fit.f_statistic, fit.p_value
+        response.samples = fit.n
+        response.variables = list(fit.variables)
+        response.parameters = doubles(fit.parameters)
+        response.held_out_rms = held_out
         response.message = (
-            f"{row.model} on {row.n} surfaces of {stored.id}: {row.k} variables, held-out error "
-            f"{row.leave_one_out_rms * 1e9:.1f} nm rms; R^2 and p are optimistic after selection"
+            f"{predictor.influence.method} on {fit.n} surfaces of {stored.id}: {fit.k} variables, held-out error "
+            f"{held_out * 1e9:.1f} nm rms; R^2 and p are optimistic after selection"
         )
         return response
 
@@ -69,7 +68,7 @@ class ErrorPrediction:
                 self._of = calibration.id
             predictor = self._predictor
         response.predicted_rms, response.lower, response.upper = predictor.predict(signals)
-        method = predictor.regression.table2.model
+        method = predictor.influence.method
         response.message = f"by {method} on calibration {calibration.id}, over many histories before this command"
         return response
 

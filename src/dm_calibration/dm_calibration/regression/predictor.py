@@ -1,9 +1,9 @@
 """The surface control error of a command that is still to come, with an interval.
 
-The regression of the reading HISTORY says how the error follows from a command and those before it. Whoever asks about
-a command gives no history, and the error depends on it: so the answer is taken over many histories, as the mirror may
-have in use: smooth shapes (the spheres and Zernike surfaces of the calibration) of any size the range allows, in random
-order from a rested mirror. The interval holds 95 % of them, widened by the uncertainty of the regression.
+The regression says how the error follows from a command and those before it. Whoever asks about a command gives no
+history, and the error depends on it: so the answer is taken over many histories, as the mirror may have in use: smooth
+shapes (the spheres and Zernike surfaces of the calibration) of any size the range allows, in random order from a rested
+mirror. The interval holds 95 % of them, widened by the uncertainty of the regression.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from dm_calibration.influence.surfaces import MODEL_NAMES
 from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory, SagModel
 from dm_calibration.regression.stepwise import SelectionOptions
-from dm_calibration.regression.surface_error import ErrorRegression, Reading, regress_surface_errors
+from dm_calibration.regression.surface_error import ErrorRegression, model_candidates, regress
+from dm_calibration.regression.surface_samples import surface_errors
 from dm_common.optics.piston_tilt import rms
 
 Floats = NDArray[np.float64]
@@ -37,7 +38,7 @@ class ErrorPredictor:
 
     Attributes:
         influence: the influence function that nominal surfaces come from.
-        regression: of the reading HISTORY, fitted to all surfaces p01-p58.
+        regression: fitted to all surfaces p01-p58.
         sag: from commands, by all good maps.
         histories: (1 + COMMANDS, HISTORIES, N) normalised; the first is rest, for creep has died away there.
     """
@@ -55,12 +56,7 @@ class ErrorPredictor:
 
         Returns:
             mean, lower, upper: m, none below 0.
-
-        Raises:
-            ValueError: another number of signals than actuators, or values that are not finite.
         """
-        if signals.shape != (self.influence.actuators,) or not np.isfinite(signals).all():
-            raise ValueError(f"signals {signals.shape}: must be {self.influence.actuators} finite numbers")
         commands, count, actuators = self.histories.shape
         applied = np.concatenate((self.histories, np.broadcast_to(signals, (1, count, actuators))))
         # Histories side by side, as if each had a mirror of its own.
@@ -79,20 +75,19 @@ class ErrorPredictor:
         )
 
 
-def fit_predictor(
-    maps: MapSet, influence: InfluenceFit, options: SelectionOptions | None = None, seed: int = 0
-) -> ErrorPredictor:
+def fit_predictor(maps: MapSet, influence: InfluenceFit, options: SelectionOptions | None = None) -> ErrorPredictor:
     """A predictor from all surfaces p01-p58 of a calibration; its held-out error is the leave-one-out one.
 
-    Args:
-        seed: of the random histories.
-
     Raises:
-        As :func:`~dm_calibration.regression.surface_error.regress_surface_errors`.
+        As :func:`~dm_calibration.regression.surface_samples.surface_errors` and
+        :func:`~dm_calibration.regression.surface_error.regress`.
     """
-    regression = regress_surface_errors(maps, influence, Reading.HISTORY, options, test_set=())
-    sag = RunHistory(maps, influence.sag_offset + maps.applied @ influence.influence_sag.T).fit(influence.used)
-    return ErrorPredictor(influence, regression, sag, _histories(maps, influence, np.random.default_rng(seed)))
+    errors = surface_errors(maps, influence)
+    history = RunHistory(maps, influence.sag_offset + maps.applied @ influence.influence_sag.T)
+    names, candidates = model_candidates(maps, influence, errors, history.predict)
+    regression = regress(errors, names, candidates, influence.method, options)
+    histories = _histories(maps, influence, np.random.default_rng(0))
+    return ErrorPredictor(influence, regression, history.fit(influence.used), histories)
 
 
 def _histories(maps: MapSet, influence: InfluenceFit, rng: np.random.Generator) -> Floats:

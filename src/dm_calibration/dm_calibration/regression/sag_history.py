@@ -6,8 +6,6 @@ hundred maps of sample surfaces turn the actuators far less often than the excit
 creep rate are shared by all actuators; gains are in the influence function. Sag = figure + H e is bilinear, so figure
 and H, then weights and creep rate are least-squares solutions in turn. The figure follows the reference frames
 (:func:`~dm_calibration.influence.regression.drift_columns`).
-
-Without hysteresis it is the influence function in sag with a constant figure.
 """
 
 from __future__ import annotations
@@ -54,21 +52,20 @@ class SagModel:
 class RunHistory:
     """The maps of one calibration run as a sequence of commands, ready to fit models to some and predict the others."""
 
-    def __init__(self, maps: MapSet, model: Floats, hysteresis: bool = True) -> None:
+    def __init__(self, maps: MapSet, model: Floats) -> None:
         """Run through the commands once.
 
         Args:
             maps: of the run, in the order measured, which begins at rest, demagnetised (degauss).
             model: (M, P) m, sag to fill points without data from.
-            hysteresis: whether to follow hysteresis, creep and drift.
         """
-        self._maps, self._linear = maps, not hysteresis
+        self._maps = maps
         reasons = ["" if np.isfinite(row).any() else "no data" for row in maps.sag]
         self.usable = np.array([not reason for reason in reasons])
         self._sag = usable_sag(maps, reasons)
         self._sag[self.usable] = fill_gaps(maps.sag[self.usable], model[self.usable], maps.points)
-        self._figure = drift_columns(maps.stamp_ns, maps.reference) if hysteresis else np.ones((len(maps), 1))
-        self._radius = np.array((0.0, *PLAY_RADII)) if hysteresis else np.zeros(1)
+        self._figure = drift_columns(maps.stamp_ns, maps.reference)
+        self._radius = np.array((0.0, *PLAY_RADII))
         parts = parts_of(maps.segment)
         self._plays = in_parts(parts, lambda part: play_features(maps.applied[part], self._radius, 1))
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
@@ -88,18 +85,14 @@ class RunHistory:
         free = np.linalg.qr(figure)[0]  # what the figure takes up is no evidence about the weights
         without_figure = sag - free @ (free.T @ sag)
         weights, rate = np.eye(len(self._radius))[0], 0.0
-        for _ in range(1 if self._linear else ROUNDS):
+        for _ in range(ROUNDS):
             design = np.hstack((figure, self._effective(weights, rate)[keep]))
             solution = np.linalg.lstsq(design, sag, rcond=1e-9)[0]
             offset, influence = solution[: figure.shape[1]], solution[figure.shape[1] :]
-            if not self._linear:
-                features = np.concatenate((self._plays[keep], (weights @ self._crept[keep])[:, np.newaxis]), axis=1)
-                found = self._weights(features @ influence, free, without_figure)
-                weights, rate = found[:-1], min(float(found[-1]), CREEP_RATE_MAX)
-        none = np.zeros(0)
-        model = HysteresisModel(
-            self._radius, weights[:, np.newaxis], none, 0.0, rate, none if self._linear else CREEP_TIMES
-        )
+            features = np.concatenate((self._plays[keep], (weights @ self._crept[keep])[:, np.newaxis]), axis=1)
+            found = self._weights(features @ influence, free, without_figure)
+            weights, rate = found[:-1], min(float(found[-1]), CREEP_RATE_MAX)
+        model = HysteresisModel(self._radius, weights[:, np.newaxis], np.zeros(0), 0.0, rate, CREEP_TIMES)
         return SagModel(model, influence / area, offset / area)
 
     @staticmethod
@@ -117,7 +110,8 @@ class RunHistory:
         """(M, N) effective signals of the run."""
         return np.asarray(weights @ self._plays + rate * (weights @ self._crept))
 
-    def predict(self, model: SagModel) -> Floats:
-        """(M, P) m: sag of every command of the run."""
+    def predict(self, keep: NDArray[np.bool_]) -> Floats:
+        """(M, P) m: sag of every command of the run, by the model that explains the maps in `keep` (M,) best."""
+        model = self.fit(keep)
         effective = self._effective(model.hysteresis.play_weight[:, 0], model.hysteresis.creep_rate)
         return np.asarray(self._figure @ model.figure + effective @ model.influence)

@@ -14,27 +14,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
-from dm_calibration.regression.sample_checks import (
-    CONSTANT,
-    TOLERANCE,
-    check_collinear,
-    check_freedom,
-    checked,
-    checked_weights,
-)
+from dm_common.errors import ErrorCode
 
 Floats = NDArray[np.float64]
 
+#: Share of a candidate's variation not explained by those selected, below which it brings nothing of its own.
+TOLERANCE = 1e-8
+#: Spread of values, relative to their size, below which they count as constant.
+CONSTANT = 1e-12
 P_ENTER = 0.05
 P_REMOVE = 0.10
 #: Degrees of freedom that must be left for the residual: with more candidates than samples, a selection that runs on
 #: until none is left fits anything.
 FREEDOM_MIN = 10
+
+
+class CollinearError(ValueError):
+    """Candidates that cannot be told apart, or from the constant; the message names them."""
+
+    error_code = ErrorCode.TOO_FEW_MAPS
+
+
+class TooFewSamplesError(ValueError):
+    """Fewer samples than a regression needs."""
+
+    error_code = ErrorCode.TOO_FEW_MAPS
 
 
 @dataclass(frozen=True)
@@ -70,59 +80,58 @@ class StepwiseFit:
     Attributes:
         variables: (k,) names, in the order in which they entered.
         columns: (k,) their columns among the candidates.
-        parameters: (k + 1,) the constant first.
-        standard_errors: (k + 1,).
-        n: samples.
-        k: selected variables.
-        r2, adjusted_r2: of the selected model; 0 without variables.
-        f_statistic, p_value: of the model against the constant; 0 and 1 without variables. Optimistic: see the module.
-        residual_sd: standard deviation of the residual of a sample of weight 1.
+        result: of statsmodels for the selected model.
         weighted: whether samples had weights (WLS).
-        covariance: (k + 1, k + 1) of the parameters, for a residual of standard deviation 1.
     """
 
     variables: tuple[str, ...]
     columns: tuple[int, ...]
-    parameters: Floats
-    standard_errors: Floats
-    n: int
-    k: int
-    r2: float
-    adjusted_r2: float
-    f_statistic: float
-    p_value: float
-    residual_sd: float
+    result: Any
     weighted: bool
-    covariance: Floats
 
-    def predict(
-        self, candidates: ArrayLike, weights: ArrayLike | None = None, level: float = 0.95
-    ) -> tuple[Floats, Floats, Floats]:
-        """Mean and prediction interval of new samples.
+    @property
+    def parameters(self) -> Floats:
+        """(k + 1,) the constant first."""
+        return np.asarray(self.result.params)
+
+    @property
+    def n(self) -> int:
+        """Samples."""
+        return int(self.result.nobs)
+
+    @property
+    def k(self) -> int:
+        """Selected variables."""
+        return len(self.columns)
+
+    @property
+    def adjusted_r2(self) -> float:
+        """Of the selected model; 0 without variables. Optimistic: see the module."""
+        return float(self.result.rsquared_adj) if self.k else 0.0
+
+    @property
+    def f_statistic(self) -> float:
+        """Of the model against the constant; 0 without variables."""
+        return float(self.result.fvalue) if self.k else 0.0
+
+    @property
+    def p_value(self) -> float:
+        """Of the F statistic; 1 without variables. Optimistic: see the module."""
+        return float(self.result.f_pvalue) if self.k else 1.0
+
+    def predict(self, candidates: ArrayLike, weights: ArrayLike | None = None) -> tuple[Floats, Floats, Floats]:
+        """Mean and 95 % prediction interval of new samples, without the uncertainty of the selection itself.
 
         Args:
             candidates: (M, C) all candidates, in the order they had in the fit.
             weights: (M,) of the samples, as in the fit; 1 when None.
-            level: probability of the interval; it does not include the uncertainty of the selection itself.
 
         Returns:
             mean, lower, upper: (M,) each, in the unit of the response.
-
-        Raises:
-            ValueError: fewer columns than the fit has used, weights not above 0, or a level outside 0 to 1.
         """
-        x = np.asarray(candidates, dtype=float)
-        needed = max(self.columns, default=-1) + 1
-        if x.ndim != 2 or x.shape[1] < needed:
-            raise ValueError(f"candidates have the shape {x.shape}: must be (samples, {needed} columns or more)")
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"level = {level:g}: must be above 0 and below 1; 0.95 is usual")
-        design = np.column_stack((np.ones(len(x)), x[:, list(self.columns)]))
-        w = np.ones(len(x)) if weights is None else checked_weights(weights, len(x))
-        mean = design @ self.parameters
-        variance = 1.0 / w + np.einsum("ij,jk,ik->i", design, self.covariance, design)
-        reach = special.stdtrit(self.n - self.k - 1, 0.5 + 0.5 * level) * self.residual_sd * np.sqrt(variance)
-        return mean, mean - reach, mean + reach
+        x = np.asarray(candidates, dtype=float)[:, list(self.columns)]
+        found = self.result.get_prediction(np.column_stack((np.ones(len(x)), x)), weights=weights)
+        return found.predicted_mean, *found.conf_int(obs=True).T
 
 
 def stepwise(
@@ -145,19 +154,22 @@ def stepwise(
             candidates, any that the others determine. (With fewer samples every set of candidates is dependent; the
             selection then leaves out what the selected ones determine.)
         TooFewSamplesError: no freedom left for one variable.
-        ValueError: shapes that disagree, values that are not finite, a constant response, weights not above 0.
+        ValueError: a constant response.
     """
+    import statsmodels.api as sm  # here: with pandas and all that comes with it, it takes a third of a node's start
+
     options = options or SelectionOptions()
-    x, y, w = checked(candidates, response, names, weights)
-    check_freedom(len(y), options.freedom_min)
-    check_collinear(x, names)
-    return _fit(x, y, w, names, _select(x, y, w, options), weights is not None)
+    x, y, w = _samples(candidates, response, weights, options.freedom_min, 0)
+    _check_collinear(x, names)
+    columns = _select(x, y, w, options)
+    design = np.column_stack((np.ones(len(y)), x[:, columns]))
+    model = sm.OLS(y, design) if weights is None else sm.WLS(y, design, weights=w)
+    return StepwiseFit(tuple(names[column] for column in columns), tuple(columns), model.fit(), weights is not None)
 
 
 def leave_one_out(
     candidates: ArrayLike,
     response: ArrayLike,
-    names: Sequence[str],
     weights: ArrayLike | None = None,
     options: SelectionOptions | None = None,
 ) -> Floats:
@@ -167,8 +179,7 @@ def leave_one_out(
         TooFewSamplesError: as :func:`stepwise`, for one sample fewer.
     """
     options = options or SelectionOptions()
-    x, y, w = checked(candidates, response, names, weights)
-    check_freedom(len(y) - 1, options.freedom_min)
+    x, y, w = _samples(candidates, response, weights, options.freedom_min, 1)
     predicted = np.empty(len(y))
     for row in range(len(y)):
         keep = np.arange(len(y)) != row
@@ -231,25 +242,49 @@ def _remove(columns: Floats, target: Floats, selected: list[int], options: Selec
         del selected[worst]
 
 
-def _fit(x: Floats, y: Floats, w: Floats, names: Sequence[str], columns: list[int], weighted: bool) -> StepwiseFit:
-    import statsmodels.api as sm  # here: with pandas and all that comes with it, it takes a third of a node's start
+def _samples(
+    candidates: ArrayLike, response: ArrayLike, weights: ArrayLike | None, freedom_min: int, left_out: int
+) -> tuple[Floats, Floats, Floats]:
+    """Candidates, response and weights as arrays, of which a regression can be made, also with some `left_out`."""
+    x, y = np.asarray(candidates, dtype=float), np.asarray(response, dtype=float)
+    if np.ptp(y) <= CONSTANT * np.abs(y).max():
+        raise ValueError(
+            "the response is the same for all samples, so there is nothing to explain: use samples that differ"
+        )
+    if len(y) - left_out < freedom_min + 2:
+        raise TooFewSamplesError(
+            f"{len(y) - left_out} samples: a constant, one variable and {freedom_min} degrees of freedom for the "
+            f"residual need at least {freedom_min + 2}; measure more surfaces"
+        )
+    return x, y, np.ones(len(y)) if weights is None else np.asarray(weights, dtype=float)
 
-    design = np.column_stack((np.ones(len(y)), x[:, columns]))
-    model = sm.WLS(y, design, weights=w) if weighted else sm.OLS(y, design)
-    result = model.fit()
-    k = len(columns)
-    return StepwiseFit(
-        variables=tuple(names[column] for column in columns),
-        columns=tuple(columns),
-        parameters=np.asarray(result.params),
-        standard_errors=np.asarray(result.bse),
-        n=len(y),
-        k=k,
-        r2=float(result.rsquared) if k else 0.0,
-        adjusted_r2=float(result.rsquared_adj) if k else 0.0,
-        f_statistic=float(result.fvalue) if k else 0.0,
-        p_value=float(result.f_pvalue) if k else 1.0,
-        residual_sd=float(np.sqrt(result.mse_resid)),
-        weighted=weighted,
-        covariance=np.asarray(result.normalized_cov_params),
-    )
+
+def _check_collinear(x: Floats, names: Sequence[str]) -> None:
+    if not x.shape[1]:
+        return
+    centred = x - x.mean(axis=0)
+    size = np.linalg.norm(centred, axis=0)
+    constant = np.flatnonzero(size <= CONSTANT * np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny))
+    if constant.size:
+        raise CollinearError(
+            f"candidate {names[constant[0]]} is the same for all samples, which the constant says already: "
+            "leave it out, or add samples in which it differs"
+        )
+    unit = centred / size
+    likeness = np.triu(np.abs(unit.T @ unit), 1)
+    alike = np.argwhere(likeness > 1.0 - 0.5 * TOLERANCE)
+    if len(alike):
+        one, other = alike[0]
+        raise CollinearError(
+            f"candidates {names[one]} and {names[other]} are proportional over all samples: leave one of them out, or "
+            "add samples in which they differ"
+        )
+    if len(x) > x.shape[1] + 1:
+        _, r, order = linalg.qr(unit, mode="economic", pivoting=True)
+        diagonal = np.abs(np.diag(r))
+        dependent = order[diagonal < np.sqrt(TOLERANCE)]
+        if dependent.size:
+            listed = ", ".join(sorted(names[column] for column in dependent))
+            raise CollinearError(
+                f"the other candidates determine {listed}: leave out as many, or add samples that tell them apart"
+            )

@@ -11,7 +11,7 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
-from dm_calibration.regression.sample_checks import TooFewSamplesError
+from dm_calibration.regression.stepwise import TooFewSamplesError
 from dm_common.optics.sample_regions import regional_rms
 
 Floats = NDArray[np.float64]
@@ -25,27 +25,20 @@ class SurfaceErrors:
     """The sample surfaces of a calibration with their errors.
 
     Attributes:
-        labels: (M,) of p01-p58.
-        signals: (M, N) as applied.
-        coefficients: (M, 21) m, as measured.
-        regional: (M, R) m, rms surface control error inside concentric regions, the whole aperture last.
+        rows: (S,) their places among the maps.
+        labels: (S,) of p01-p58.
+        signals: (S, N) as applied.
+        regional: (S, R) m, rms surface control error inside concentric regions, the whole aperture last.
     """
 
+    rows: NDArray[np.int64]
     labels: tuple[str, ...]
     signals: Floats
-    coefficients: Floats
     regional: Floats
-
-    def __post_init__(self) -> None:
-        count = len(self.labels)
-        for name in ("signals", "coefficients", "regional"):
-            value = getattr(self, name)
-            if value.ndim != 2 or len(value) != count or not np.isfinite(value).all():
-                raise ValueError(f"{name} has the shape {value.shape}: must be {count} rows of finite numbers")
 
     @property
     def response(self) -> Floats:
-        """(M,) m, rms surface control error over the whole aperture."""
+        """(S,) m, rms surface control error over the whole aperture."""
         return np.asarray(self.regional[:, -1])
 
 
@@ -57,15 +50,16 @@ def surface_errors(maps: MapSet, fit: InfluenceFit) -> SurfaceErrors:
         TooFewSamplesError: there is none of these surfaces.
         ValueError: other than 21 terms.
     """
-    rows = surface_rows(maps, fit)
+    rows = np.array([k for k, label in enumerate(maps.label) if label in SURFACES and fit.used[k]], dtype=np.int64)
+    if not rows.size:
+        raise TooFewSamplesError("none of the surfaces p01 to p58 is among the good maps: calibrate with the plan FULL")
     labels = tuple(maps.label[row] for row in rows)
     error = surface_control_error(maps.sag[rows], maps.applied[rows], fit.influence_zernike, maps.points)
-    regional = regional_rms(error, maps.points, labels=labels)
-    return SurfaceErrors(labels, maps.applied[rows], maps.coefficients[rows], regional)
+    return SurfaceErrors(rows, labels, maps.applied[rows], regional_rms(error, maps.points, labels=labels))
 
 
 def surface_weights(errors: SurfaceErrors) -> Floats:
-    """(M,) weights of the surfaces for AZWreg: Eq. (8) with r the variance of a surface's regional errors, m^2.
+    """(S,) weights of the surfaces for AZWreg: Eq. (8) with r the variance of a surface's regional errors, m^2.
 
     Scaled such that a surface of weight 1 has the average variance: that is what a new one, whose regional errors
     nobody has measured, counts as.
@@ -79,10 +73,3 @@ def surface_weights(errors: SurfaceErrors) -> Floats:
         raise ValueError("the errors do not differ from region to region: Eq. (8) gives no weights; use AZreg")
     weights = region_weights(variance, epsilon)
     return weights * np.mean(1.0 / weights)
-
-
-def surface_rows(maps: MapSet, fit: InfluenceFit) -> NDArray[np.int64]:
-    rows = np.array([k for k, label in enumerate(maps.label) if label in SURFACES and fit.used[k]], dtype=np.int64)
-    if not rows.size:
-        raise TooFewSamplesError("none of the surfaces p01 to p58 is among the good maps: calibrate with the plan FULL")
-    return rows
