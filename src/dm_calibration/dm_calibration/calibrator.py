@@ -133,7 +133,8 @@ def _evaluated(
             "The maps do not tell their aperture radius; the mirror's working aperture "
             f"({mirror.working_radius * 1e3:.2f} mm radius) is taken."
         )
-    if outcome.wavelength == 0.0:
+    wavelength = outcome.setup.wavelength if outcome.setup else 0.0
+    if wavelength == 0.0:
         limitations.append("The maps do not tell their wavelength.")
     if (parts := np.unique(maps.segment).size) > 1:
         limitations.append(f"Measured in {parts} parts: the run was interrupted and resumed.")
@@ -143,7 +144,7 @@ def _evaluated(
         id=provenance.id,
         mirror_name=mirror.name,
         mirror_serial=mirror.serial,
-        wavelength=outcome.wavelength,
+        wavelength=wavelength,
         aperture_radius=mirror.working_radius,
         created_ns=provenance.created_ns,
         actuator_x=mirror.x,

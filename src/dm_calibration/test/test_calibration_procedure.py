@@ -96,7 +96,7 @@ def test_all_steps_are_measured_in_order(bench: Bench, mirror: Mirror) -> None:
     assert bench.degaussed == 1
     assert [record.label for record in outcome.records] == [step.label for step in plan.steps[1:]]
     assert outcome.dropped == []
-    assert outcome.wavelength == 632.8e-9
+    assert outcome.setup is not None and outcome.setup.wavelength == 632.8e-9
     record = outcome.records[1]
     assert (record.label, record.kind, record.file) == ("poke+01", "poke", "poke+01.dat")
     assert record.signals[0] == 0.5

@@ -19,9 +19,10 @@ from dm_calibration.calibration import Calibration, CalibrationFileError, to_col
 from dm_calibration.calibrator import Provenance, calibrate, refit
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.procedure.outcome import Outcome, Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.procedure.procedure import Outcome
-from dm_calibration.store.calibration_store import CalibrationStore, StoreError, UnknownCalibrationError, check_id
+from dm_calibration.store.atomic_write import StoreError
+from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError, check_id
 from dm_calibration.store.hdf5_image import content_hash, read_image, write_image
 from dm_common.measurement import Measurement
 from dm_common.names import UnknownNameError
@@ -32,7 +33,7 @@ MIRROR = make_mirror(rings=1, serial="S 7/é")
 
 def make_calibration(identifier: str = "PDM_1", created_ns: int = 10**18) -> Calibration:
     plant = LinearMirror(MIRROR.x, MIRROR.y, noise=1e-9)
-    outcome = Outcome(points=plant.points, wavelength=632.8e-9, dropped=["poke+02 (2): no map within 5 s"])
+    outcome = Outcome(setup=Setup(plant.points, 632.8e-9, -1), dropped=["poke+02 (2): no map within 5 s"])
     for number, step in enumerate(make_plan(PlanKind.POKES, MIRROR, PlanOptions(degauss=False)).steps):
         assert step.signals is not None
         sag = plant.sag(step.signals)

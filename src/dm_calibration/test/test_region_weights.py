@@ -24,8 +24,8 @@ from dm_calibration.influence.weights import (
     region_weights,
     surface_control_error,
 )
+from dm_calibration.procedure.outcome import Outcome, Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.procedure.procedure import Outcome
 from dm_common.measurement import Measurement
 from dm_common.names import UnknownNameError
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
@@ -295,7 +295,7 @@ def make_calibration(identifier: str = "one") -> Calibration:
     plant = LinearMirror(mirror.x, mirror.y, noise=1 * NM)
     plan = [s for s in make_plan(PlanKind.FULL, mirror, PlanOptions(degauss=False)).steps if s.signals is not None]
     signals = np.stack([step.signals for step in plan if step.signals is not None])
-    outcome = Outcome(points=plant.points, wavelength=632.8e-9)
+    outcome = Outcome(setup=Setup(plant.points, 632.8e-9, -1))
     for number, (step, s) in enumerate(zip(plan, signals, strict=True)):
         sag = plant.sag(s)
         outcome.records.append(

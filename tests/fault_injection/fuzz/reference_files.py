@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
+from dm_calibration.procedure.outcome import Outcome, Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.procedure.procedure import Outcome
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.geometry import neighbour_pairs
 from dm_common.limits import Limits
@@ -184,7 +184,7 @@ def _calibration() -> ReferenceFile:
     away = np.hypot(points.x[:, None] * 11e-3 - x, points.y[:, None] * 11e-3 - y)
     influence = 4e-6 * np.exp(-((away / 4e-3) ** 2))
     modes = basis(points.x, points.y)
-    outcome = Outcome(points=points, wavelength=WAVELENGTH)
+    outcome = Outcome(setup=Setup(points, WAVELENGTH, -1))
     for number, step in enumerate(make_plan(PlanKind.POKES, mirror, PlanOptions(degauss=False)).steps):
         assert step.signals is not None
         sag = influence @ step.signals

@@ -13,7 +13,7 @@ from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
 from dm_calibration.influence.maps import CHECK, EXCITATION, POKE, REFERENCE, SURFACE
 from dm_calibration.map_files import SurfaceMap
-from dm_calibration.procedure.map_acquisition import ProcedureOptions, check_comparable
+from dm_calibration.procedure.map_acquisition import check_comparable
 from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
@@ -67,17 +67,15 @@ def outcome_of(
         if hysteresis:
             raise ValueError("times: hysteresis and creep cannot be told apart without; give s, one for each map")
         measured = [replace(one, stamp_ns=number * 10**9) for number, one in enumerate(measured)]
-    outcome, options = Outcome(), ProcedureOptions()
+    outcome = Outcome()
     steps = np.cumsum(np.abs(np.diff(signals, axis=0, prepend=signals[:1])).any(axis=1))
     for number, (one, row, kind) in enumerate(zip(measured, signals, _kinds(signals, mirror, hysteresis), strict=True)):
         label = f"{number + 1} {Path(one.file).name}" if one.file else f"map {number + 1}"
         try:
-            check_comparable(
-                one, outcome, mirror.working_radius, options.aperture_tolerance, options.wavelength_tolerance
-            )
+            check_comparable(one, outcome, mirror.working_radius)
         except MeasurementError as error:
             raise MeasurementError(error.error_code, f"{label}: {error}") from error
-        if outcome.points is None:
+        if outcome.setup is None:
             outcome.take(Setup.of(one))
         one = replace(one, label=label, kind=kind, step=int(steps[number]), signals=row, applied=row)
         outcome.take(MapTaken(one, one.radius > 0.0))

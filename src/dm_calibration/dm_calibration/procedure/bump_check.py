@@ -6,12 +6,14 @@ and by a little drift; a tilt, a shift on the camera or another figure beyond th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.measurement import Measurement
+from dm_calibration.influence.maps import REFERENCE
+from dm_calibration.procedure.outcome import MapTaken
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 Floats = NDArray[np.float64]
@@ -37,34 +39,28 @@ class BumpOptions:
     hysteresis_allowance: float = 0.10
 
 
-@dataclass(frozen=True, eq=False)
-class _ReferenceFrame:
-    label: str
-    coefficients: Floats
-    centre: Floats
-
-
 class BumpCheck:
     """Compares each reference frame with the one before it."""
 
     def __init__(self, options: BumpOptions, rest: Floats) -> None:
         """`rest`: (N,) signals of the reference frames."""
         self._options, self._rest = options, rest
-        self._last: _ReferenceFrame | None = None
+        self._last: MapTaken | None = None
         self._moved = np.zeros_like(rest)
         # Sums of squares: what the maps showed, rms m, and what was commanded. Their ratio is the size of a response.
         self._shown = self._commanded = 0.0
 
-    def take(self, record: Measurement, centre: tuple[float, float], reference: bool) -> None:
+    def take(self, taken: MapTaken) -> None:
         """Take a good map, which later reference frames are compared with."""
-        if reference:
-            self._last = _ReferenceFrame(record.label, record.coefficients, np.array(centre))
+        record = taken.record
+        if record.kind == REFERENCE:
+            self._last = taken
             self._moved = np.zeros_like(self._moved)
             return
         away = record.applied - self._rest
         self._moved = np.maximum(self._moved, np.abs(away))
         if self._last is not None and np.isfinite(record.coefficients).all():
-            self._shown += _figure_rms(record.coefficients - self._last.coefficients) ** 2
+            self._shown += _figure_rms(record.coefficients - self._last.record.coefficients) ** 2
             # A common signal lifts the plate without bending it.
             self._commanded += float(np.square(away - away.mean()).sum())
 
@@ -72,27 +68,26 @@ class BumpCheck:
         """All actuators went `signal` away from rest, as in a degauss."""
         self._moved = np.maximum(self._moved, abs(signal))
 
-    def change(
-        self, record: Measurement, centre: tuple[float, float], pixel: float = 0.0, interrupted: bool = False
-    ) -> str:
-        """How the reference frame `record` differs from the one before it; "" = as it should.
+    def change(self, frame: MapTaken, pixel: float, interrupted: bool) -> str:
+        """How the reference frame `frame` differs from the one before it; "" = as it should.
 
         Args:
-            centre: of the aperture on the map, m.
             pixel: m.
             interrupted: somebody may have aligned the instrument since; a tilt does not matter then.
         """
-        last, options = self._last, self._options
-        if last is None or record.coefficients.shape != last.coefficients.shape:
+        if self._last is None:
             return ""
-        difference = record.coefficients - last.coefficients
+        last, options = self._last.record, self._options
+        if frame.record.coefficients.shape != last.coefficients.shape:
+            return ""
+        difference = frame.record.coefficients - last.coefficients
         tilt = float(np.hypot(difference[1], difference[2]))
         if options.tilt_max and not interrupted and tilt > options.tilt_max:
             return (
                 f"the tilt changed by {tilt * 1e6:.2f} um at the edge since {last.label} "
                 f"(bump.tilt_max {options.tilt_max * 1e6:.2f} um)"
             )
-        shift = float(np.hypot(*(np.array(centre) - last.centre)))
+        shift = math.dist(frame.centre, self._last.centre)
         if options.shift_max and shift > max(options.shift_max, _WANDER_PX * pixel):
             return (
                 f"the mirror moved by {shift * 1e3:.3f} mm on the map since {last.label} "

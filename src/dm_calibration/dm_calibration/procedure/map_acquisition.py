@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 
 #: Pixels of an instrument agree so well from map to map, relatively; files keep the pitch in single precision.
 PITCH_TOLERANCE = 1e-4
+#: Largest relative difference of wavelengths between maps.
+WAVELENGTH_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,6 @@ class ProcedureOptions:
         failures_max: states in a row without a map after which the run is given up.
         maps_per_state: maps taken in each commanded state.
         aperture_tolerance: largest relative deviation of a map's aperture radius from the mirror's.
-        wavelength_tolerance: largest relative difference of wavelengths between maps.
         fit: options of the fit that the surfaces with a prescribed shape are solved from.
         bump: what reference frames may differ by.
     """
@@ -41,7 +42,6 @@ class ProcedureOptions:
     failures_max: int = 3
     maps_per_state: int = 1
     aperture_tolerance: float = APERTURE_TOLERANCE
-    wavelength_tolerance: float = 1e-4
     fit: FitOptions = field(default_factory=FitOptions)
     bump: BumpOptions = field(default_factory=BumpOptions)
 
@@ -65,7 +65,7 @@ class MapAcquisition:
         self._bump = BumpCheck(options.bump, mirror.rest)
         self._swung = False
         for record, centre in zip(outcome.records, outcome.centres, strict=True):
-            self._bump.take(record, centre, record.kind == REFERENCE)
+            self._bump.take(MapTaken(record, centre=centre))
 
     def swung(self) -> None:
         """The actuators went through their whole range since the last map, nobody knows where the mirror went."""
@@ -85,7 +85,7 @@ class MapAcquisition:
         """
         taken = self._taken(label, step, number, applied)
         self._note(taken)
-        self._bump.take(taken.record, taken.centre, step.kind is StepKind.REFERENCE)
+        self._bump.take(taken)
         self._swung = False
 
     def _taken(self, label: str, step: Step, number: int, applied: Floats) -> MapTaken:
@@ -100,11 +100,11 @@ class MapAcquisition:
                     raise MeasurementError(error.error_code, f"{error}{tries}") from error
         taken = self._as_event(label, step, number, applied, measured)
         if step.kind is StepKind.REFERENCE:
-            suspicion = self._bump.change(taken.record, taken.centre, measured.pitch, self._swung)
+            suspicion = self._bump.change(taken, measured.pitch, self._swung)
             if suspicion:  # a bad map, or a mirror that stands otherwise: another map tells
                 measured = self._measured(label)
                 taken = self._as_event(label, step, number, applied, measured)
-                if suspicion := self._bump.change(taken.record, taken.centre, measured.pitch, self._swung):
+                if suspicion := self._bump.change(taken, measured.pitch, self._swung):
                     self._stop_bumped(label, suspicion)
         return taken
 
@@ -126,7 +126,7 @@ class MapAcquisition:
         )
 
     def _as_event(self, label: str, step: Step, number: int, applied: Floats, measured: Measurement) -> MapTaken:
-        if self.outcome.points is None:
+        if self.outcome.setup is None:
             self._note(Setup.of(measured))
         assert step.signals is not None
         record = replace(
@@ -149,74 +149,56 @@ class MapAcquisition:
         """A map that can be compared with the others."""
         measured = self._bench.measure(label)
         self._guard()
-        options = self._options
-        check_comparable(
-            measured,
-            self.outcome,
-            self._mirror.working_radius,
-            options.aperture_tolerance,
-            options.wavelength_tolerance,
-        )
+        check_comparable(measured, self.outcome, self._mirror.working_radius, self._options.aperture_tolerance)
         return measured
 
 
 def check_comparable(
-    measured: Measurement,
-    outcome: Outcome,
-    working_radius: float,
-    aperture_tolerance: float,
-    wavelength_tolerance: float,
+    measured: Measurement, outcome: Outcome, working_radius: float, aperture_tolerance: float = APERTURE_TOLERANCE
 ) -> None:
     """Refuse a map of another aperture, wavelength, instrument or evaluation than those in `outcome`.
 
     Args:
         working_radius: of the mirror, m.
-        aperture_tolerance, wavelength_tolerance: relative.
+        aperture_tolerance: relative.
 
     Raises:
         MeasurementError: naming what differs, its value, and what the others have.
     """
     if measured.radius > 0.0 and abs(measured.radius - working_radius) > aperture_tolerance * working_radius:
-        raise MeasurementError(
-            ErrorCode.MAP_REJECTED,
+        different = (
             f"aperture radius {measured.radius * 1e3:.3f} mm, the mirror's is {working_radius * 1e3:.3f} mm "
             f"+-{aperture_tolerance:.1%}: never mix apertures in one fit, set the "
-            "interferometer's aperture.radius to the mirror's",
+            "interferometer's aperture.radius to the mirror's"
         )
-    if outcome.points is None:
-        return
-    if not same_points(measured.points, outcome.points):
-        raise MeasurementError(
-            ErrorCode.MAP_REJECTED,
-            "sampled at other points than the maps before: leave the interferometer's sample_count alone in a run",
-        )
-    if abs(measured.wavelength - outcome.wavelength) > wavelength_tolerance * outcome.wavelength:
-        raise MeasurementError(
-            ErrorCode.MAP_REJECTED,
-            f"wavelength {measured.wavelength * 1e9:.3f} nm, before it was {outcome.wavelength * 1e9:.3f} nm "
-            "(0 = not known): never mix wavelengths in one fit, measure the whole run with one instrument",
-        )
-    if different := _other_instrument(measured, outcome):
-        raise MeasurementError(
-            ErrorCode.MAP_REJECTED, f"{different}: never mix instruments in one fit, measure the whole run with one"
-        )
-    if measured.system_error_subtracted != outcome.system_error_subtracted:
-        raise MeasurementError(
-            ErrorCode.MAP_REJECTED, "system error subtracted differs from the maps before: never mix them"
-        )
-    if outcome.records and measured.coefficients.shape != outcome.records[0].coefficients.shape:
-        raise MeasurementError(
-            ErrorCode.MAP_REJECTED, f"{measured.coefficients.size} Zernike terms, the maps before had others"
-        )
+    else:
+        different = _other_setup(measured, outcome.setup) if outcome.setup else ""
+    if not different and outcome.records and measured.coefficients.shape != outcome.records[0].coefficients.shape:
+        different = f"{measured.coefficients.size} Zernike terms, the maps before had others"
+    if different:
+        raise MeasurementError(ErrorCode.MAP_REJECTED, different)
 
 
-def _other_instrument(measured: Measurement, outcome: Outcome) -> str:
-    """What tells that another instrument took the map; "" = nothing."""
-    if measured.instrument != outcome.instrument:
-        return f"instrument {measured.instrument!r}, before it was {outcome.instrument!r}"
-    if measured.camera != outcome.camera:
-        here, before = ("{} x {}".format(*size) for size in (measured.camera, outcome.camera))
-        return f"camera of {here} pixels, before it was {before}"
-    if not np.isclose(measured.pitch, outcome.pitch, rtol=PITCH_TOLERANCE, atol=0.0):
-        return f"pixel pitch {measured.pitch * 1e6:.3f} um, before it was {outcome.pitch * 1e6:.3f} um (0 = not known)"
+def _other_setup(measured: Measurement, setup: Setup) -> str:
+    """What a map does not share with those before; "" = nothing."""
+    if not same_points(measured.points, setup.points):
+        return "sampled at other points than the maps before: leave the interferometer's sample_count alone in a run"
+    if abs(measured.wavelength - setup.wavelength) > WAVELENGTH_TOLERANCE * setup.wavelength:
+        return (
+            f"wavelength {measured.wavelength * 1e9:.3f} nm, before it was {setup.wavelength * 1e9:.3f} nm "
+            "(0 = not known): never mix wavelengths in one fit, measure the whole run with one instrument"
+        )
+    different = ""
+    if measured.instrument != setup.instrument:
+        different = f"instrument {measured.instrument!r}, before it was {setup.instrument!r}"
+    elif measured.camera != setup.camera:
+        here, before = ("{} x {}".format(*size) for size in (measured.camera, setup.camera))
+        different = f"camera of {here} pixels, before it was {before}"
+    elif not np.isclose(measured.pitch, setup.pitch, rtol=PITCH_TOLERANCE, atol=0.0):
+        before = f"{setup.pitch * 1e6:.3f} um (0 = not known)"
+        different = f"pixel pitch {measured.pitch * 1e6:.3f} um, before it was {before}"
+    if different:
+        return f"{different}: never mix instruments in one fit, measure the whole run with one"
+    if measured.system_error_subtracted != setup.system_error_subtracted:
+        return "system error subtracted differs from the maps before: never mix them"
     return ""

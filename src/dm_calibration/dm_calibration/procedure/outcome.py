@@ -7,7 +7,7 @@ Each thing that happens is an event. A live run takes its events one by one and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +37,7 @@ class Setup:
     @classmethod
     def of(cls, measured: Measurement) -> Setup:
         """The setup that `measured` was taken with."""
-        return cls(
-            measured.points,
-            measured.wavelength,
-            measured.system_error_subtracted,
-            measured.instrument,
-            measured.pitch,
-            measured.camera,
-        )
+        return cls(**{shared.name: getattr(measured, shared.name) for shared in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -116,10 +109,7 @@ class Outcome:
 
     Attributes:
         records: the maps, in order.
-        points: the sampling points of all of them; None before the first.
-        wavelength: m; 0 = unknown.
-        system_error_subtracted: as in Measurement, the same for all maps.
-        instrument, pitch, camera: as in Measurement, the same for all maps.
+        setup: what all of them share; None before the first.
         radius_known: whether the maps tell their aperture radius.
         dropped: "label: reason" of each map or state that gave none.
         remarks: what was measured differently than asked.
@@ -129,12 +119,7 @@ class Outcome:
     """
 
     records: list[Measurement] = field(default_factory=list)
-    points: SamplePoints | None = None
-    wavelength: float = 0.0
-    system_error_subtracted: int = -1
-    instrument: str = ""
-    pitch: float = 0.0
-    camera: tuple[int, int] = (0, 0)
+    setup: Setup | None = None
     radius_known: bool = True
     dropped: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -150,9 +135,7 @@ class Outcome:
         """Add `event`."""
         match event:
             case Setup():
-                self.points, self.wavelength = event.points, event.wavelength
-                self.system_error_subtracted = event.system_error_subtracted
-                self.instrument, self.pitch, self.camera = event.instrument, event.pitch, event.camera
+                self.setup = event
             case Segment():
                 self._begin(event.number)
             case MapTaken():
@@ -183,7 +166,7 @@ class Outcome:
         Raises:
             TooFewMapsError: there is none.
         """
-        if self.points is None or not self.records:
+        if not self.records:
             raise TooFewMapsError("no map was measured; " + "; ".join(self.dropped[:3]))
         return MapSet.of(self.records)
 

@@ -16,9 +16,9 @@ from dm_calibration.calibration import software_version
 from dm_calibration.procedure.event_frames import Storing
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions
-from dm_calibration.procedure.run_journal import RunJournal
-from dm_calibration.procedure.unfinished_runs import Found, UnfinishedRuns
-from dm_calibration.store.calibration_store import StoreError
+from dm_calibration.procedure.run_journal import Kept, RunJournal
+from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
+from dm_calibration.store.atomic_write import StoreError
 from dm_common.mirror import Mirror
 
 #: Room that must be there for each map, in the journal and then in the calibration [bytes].
@@ -110,14 +110,14 @@ def open_run(
         StoreError: the journal cannot be written, or there is no room for all maps.
     """
     notes = [f"unfinished run {text}: it waits for its own goal" for text in runs.others(identity)]
-    chosen: Found | None = None
+    chosen: Kept | None = None
     for found in runs.find(identity, plan.remarks):
         reason = "a newer one goes on" if chosen else _reason_against(found, plan, options)
         if not reason:
             chosen = found
             continue
         runs.set_aside(found.folder)
-        notes.append(f"unfinished run {found.id} ({found.kept.maps} maps) is set aside: {reason}")
+        notes.append(f"unfinished run {found.folder.name} ({found.maps} maps) is set aside: {reason}")
     notes += [f"{name} deleted: too many unfinished runs" for name in runs.prune()]
     missing = ROOM_PER_MAP * len(plan.steps) * maps_per_state
     if chosen is None:
@@ -129,25 +129,26 @@ def open_run(
             journal.remove()
             raise
         return OpenRun(journal, Outcome(remarks=list(plan.remarks)), notes=tuple(notes))
-    kept = chosen.kept
-    if kept.torn:
-        notes.append(f"unfinished run {chosen.id}: the last {kept.torn} bytes are not whole and do not count")
-    text = f"resumed run {chosen.id} with {len(kept.outcome.records)} maps"
+    if chosen.torn:
+        notes.append(
+            f"unfinished run {chosen.folder.name}: the last {chosen.torn} bytes are not whole and do not count"
+        )
+    text = f"resumed run {chosen.folder.name} with {len(chosen.outcome.records)} maps"
     journal = RunJournal.reopen(chosen.folder)
     journal.check_room(missing)
-    return OpenRun(journal, kept.outcome, kept.storing, text, tuple(notes))
+    return OpenRun(journal, chosen.outcome, chosen.storing, text, tuple(notes))
 
 
-def _reason_against(found: Found, plan: Plan, options: ResumeOptions) -> str:
+def _reason_against(found: Kept, plan: Plan, options: ResumeOptions) -> str:
     """Why an unfinished run is not to go on; "" = it is."""
-    age = 1e-9 * (time.time_ns() - found.kept.last_ns)
+    age = 1e-9 * (time.time_ns() - found.last_ns)
     if options.fresh:
         return "a fresh run was asked for"
     if not options.age_max:
         return "resume_max_age = 0"
     if age > options.age_max:
         return f"it is {age:.0f} s old, resume_max_age is {options.age_max:.0f} s"
-    latest = max((record.stamp_ns for record in found.kept.outcome.records), default=0)
+    latest = max((record.stamp_ns for record in found.outcome.records), default=0)
     if plan.kind is PlanKind.HYSTERESIS and options.now_ns and options.now_ns < latest:
         return f"the clock is {1e-9 * (latest - options.now_ns):.0f} s before its last map: creep needs times that rise"
     return ""

@@ -19,8 +19,7 @@ from typing import Any
 
 from dm_calibration.procedure.event_frames import FIRST, Storing, decode, encode
 from dm_calibration.procedure.outcome import Event, MapTaken, Outcome, Segment
-from dm_calibration.store.atomic_write import write_whole
-from dm_calibration.store.calibration_store import StoreError
+from dm_calibration.store.atomic_write import StoreError, storing, write_whole
 
 SCHEMA = "dm_calibration/unfinished"
 SCHEMA_VERSION = 1
@@ -33,9 +32,10 @@ class JournalError(ValueError):
 
 @dataclass(frozen=True)
 class Kept:
-    """What a journal holds.
+    """What a journal holds: a run to go on with.
 
     Attributes:
+        folder: of the journal; its name is the run's.
         outcome: the run so far.
         maps: measured, those in doubt included.
         last_ns: wall time of the last write, ns since the epoch.
@@ -43,6 +43,7 @@ class Kept:
         torn: bytes after the last whole frame.
     """
 
+    folder: Path
     outcome: Outcome
     maps: int
     last_ns: int
@@ -66,13 +67,13 @@ class RunJournal:
         """
         content = json.dumps({"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **manifest}, indent=1)
         try:
-            write_whole(folder / EVENTS, b"")
-            write_whole(folder / MANIFEST, content.encode())
-            return cls(folder, os.open(folder / EVENTS, os.O_WRONLY | os.O_NOFOLLOW), 0, FIRST)
-        except OSError as error:
-            with suppress(OSError):
-                shutil.rmtree(folder)
-            raise StoreError(f"no run can be kept in {folder.parent}: {error.strerror or error}") from error
+            with storing(f"no run can be kept in {folder.parent}"):
+                write_whole(folder / EVENTS, b"")
+                write_whole(folder / MANIFEST, content.encode())
+                return cls(folder, os.open(folder / EVENTS, os.O_WRONLY | os.O_NOFOLLOW), 0, FIRST)
+        except StoreError:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
 
     @classmethod
     def reopen(cls, folder: Path) -> RunJournal:
@@ -84,11 +85,9 @@ class RunJournal:
         """
         frames = _frames(folder)
         end, seal = frames[-1][1:] if frames else (0, FIRST)
-        try:
+        with storing(f"the run in {folder} cannot go on"):
             handle = os.open(folder / EVENTS, os.O_WRONLY | os.O_NOFOLLOW)
             os.ftruncate(handle, end)
-        except OSError as error:
-            raise StoreError(f"the run in {folder} cannot go on: {error.strerror or error}") from error
         return cls(folder, handle, end, seal)
 
     def check_room(self, size: int) -> None:
@@ -97,7 +96,7 @@ class RunJournal:
         Raises:
             StoreError: disk full, read-only, ...
         """
-        try:
+        with storing(f"no room for the maps of a run, {size / 1e6:.1f} MB, in {self.folder.parent}"):
             try:
                 position = self._end
                 while position < self._end + size:
@@ -105,11 +104,6 @@ class RunJournal:
                 os.fdatasync(self._handle)
             finally:
                 os.ftruncate(self._handle, self._end)
-        except OSError as error:
-            raise StoreError(
-                f"no room for the maps of a run, {size / 1e6:.1f} MB, in {self.folder.parent}: "
-                f"{error.strerror or error}"
-            ) from error
 
     def keep(self, event: Event | Storing) -> None:
         """Append `event`; it is on the disk when this returns.
@@ -118,19 +112,18 @@ class RunJournal:
             StoreError: disk full, read-only, ...; the journal is as it was.
         """
         frame, seal = encode(event, self._seal)
-        try:
-            view, position = memoryview(frame), self._end
-            while view:
-                written = os.pwrite(self._handle, view, position)
-                view, position = view[written:], position + written
-            os.fdatasync(self._handle)
-        except OSError as error:
-            with suppress(OSError):
-                os.ftruncate(self._handle, self._end)
-            what = f"map {event.record.label}" if isinstance(event, MapTaken) else type(event).__name__.lower()
-            raise StoreError(
-                f"{what} could not be kept in {self.folder}: {error.strerror or error}; the run up to it is kept"
-            ) from error
+        what = f"map {event.record.label}" if isinstance(event, MapTaken) else type(event).__name__.lower()
+        with storing(f"the run is kept up to {what}, which could not be kept in {self.folder}"):
+            try:
+                view, position = memoryview(frame), self._end
+                while view:
+                    written = os.pwrite(self._handle, view, position)
+                    view, position = view[written:], position + written
+                os.fdatasync(self._handle)
+            except OSError:
+                with suppress(OSError):
+                    os.ftruncate(self._handle, self._end)
+                raise
         self._end, self._seal = self._end + len(frame), seal
 
     def close(self) -> None:
@@ -195,7 +188,7 @@ def read_run(folder: Path, remarks: tuple[str, ...] = ()) -> Kept:
         maps += isinstance(event, MapTaken)
         outcome.take(event)
     status = (folder / EVENTS).stat()
-    return Kept(outcome, maps, status.st_mtime_ns, storing, status.st_size - end)
+    return Kept(folder, outcome, maps, status.st_mtime_ns, storing, status.st_size - end)
 
 
 def _frames(folder: Path) -> list[tuple[Event | Storing, int, bytes]]:

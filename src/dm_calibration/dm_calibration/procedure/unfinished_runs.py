@@ -12,12 +12,11 @@ import shutil
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dm_calibration.procedure.run_journal import JournalError, Kept, RunJournal, read_manifest, read_run
-from dm_calibration.store.calibration_store import StoreError
+from dm_calibration.store.atomic_write import storing
 from dm_common.errors import ErrorCode, Refusal
 
 #: Name of the folder among the calibrations.
@@ -30,18 +29,6 @@ ASIDE_MAX = 5
 WAITING_MAX = 20
 
 _LOCK = ".lock"
-
-
-@dataclass(frozen=True)
-class Found:
-    """A run to go on with."""
-
-    folder: Path
-    kept: Kept
-
-    @property
-    def id(self) -> str:
-        return self.folder.name
 
 
 class UnfinishedRuns:
@@ -58,11 +45,9 @@ class UnfinishedRuns:
             Refusal: another node calibrates into it.
             StoreError: it cannot be made.
         """
-        try:
+        with storing(f"no run can be kept in {self.folder}"):
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-        except OSError as error:
-            raise StoreError(f"no run can be kept in {self.folder}: {error.strerror or error}") from error
         try:
             # Ends with the process, also with kill -9.
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -92,7 +77,7 @@ class UnfinishedRuns:
         name = next(name for name in names if name not in taken)
         return RunJournal.create(self.folder / name, {"identity": identity, **about})
 
-    def find(self, identity: Mapping[str, Any], remarks: tuple[str, ...] = ()) -> list[Found]:
+    def find(self, identity: Mapping[str, Any], remarks: tuple[str, ...] = ()) -> list[Kept]:
         """Runs of the same plan, settings and mirror that hold at least a map, the newest first."""
         found = []
         for folder in self._runs():
@@ -103,10 +88,10 @@ class UnfinishedRuns:
             except JournalError:
                 continue
             if kept.maps:
-                found.append(Found(folder, kept))
+                found.append(kept)
             else:
                 shutil.rmtree(folder, ignore_errors=True)
-        return sorted(found, key=lambda run: (run.kept.last_ns, run.id), reverse=True)
+        return sorted(found, key=lambda run: (run.last_ns, run.folder.name), reverse=True)
 
     def others(self, identity: Mapping[str, Any]) -> list[str]:
         """Each unfinished run that a goal with `identity` does not go on with, and why."""
@@ -129,11 +114,8 @@ class UnfinishedRuns:
             StoreError: read-only, ...
         """
         target = folder.with_name(folder.name + ASIDE)
-        try:
-            folder.rename(target)
-        except OSError as error:
-            raise StoreError(f"run {folder.name} cannot be set aside: {error.strerror or error}") from error
-        return target
+        with storing(f"run {folder.name} cannot be set aside"):
+            return folder.rename(target)
 
     def prune(self) -> list[str]:
         """Delete the oldest of too many runs; returns their names."""

@@ -17,6 +17,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
+from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter, DriftRates
 from dm_calibration.recalibration.update_storage import (
     Updates,
@@ -25,7 +26,7 @@ from dm_calibration.recalibration.update_storage import (
     read_updates,
     write_updates,
 )
-from dm_calibration.store.calibration_store import StoreError
+from dm_calibration.store.atomic_write import storing
 from dm_common.measurement import Measurement
 from dm_common.mirror import APERTURE_TOLERANCE
 
@@ -33,8 +34,6 @@ Floats = NDArray[np.float64]
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
-#: Share by which wavelengths may differ.
-WAVELENGTH_TOLERANCE = 1e-4
 SUFFIX = ".updates.hdf5"
 
 
@@ -179,7 +178,8 @@ class RecalibrationManager:
                 changed = Updates(comparison.updated, updates.revision + 1, measured.stamp_ns, 0)
             else:
                 changed = replace(updates, surprising=updates.surprising + 1)
-            self._store(calibration.id, changed)
+            with storing(f"the update of {calibration.id} was not stored in {self._folder}"):
+                write_updates(self._file(calibration.id), calibration.id, self._basis, changed)
             self._updates = changed
             if accepted:
                 if not repeat:
@@ -199,23 +199,14 @@ class RecalibrationManager:
         with self._lock:
             if self._calibration is None or self._filter is None:
                 raise MapNotUsableError("no calibration is in use")
-            try:
+            with storing(f"updates of {self._calibration.id} were not removed"):
                 self._file(self._calibration.id).unlink(missing_ok=True)
-            except OSError as error:
-                raise StoreError(f"updates of {self._calibration.id} were not removed: {error.strerror}") from error
             self._updates = Updates(self._filter.start(self._calibration.stamp_ns))
             self._forget_repeats()
 
     def _repeats(self, stamp_ns: int, settled: SettledState) -> int:
         same = settled.since == self._since and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
         return self._repeat if same else 0
-
-    def _store(self, identifier: str, updates: Updates) -> None:
-        try:
-            write_updates(self._file(identifier), identifier, self._basis, updates)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise StoreError(f"the update of {identifier} was not stored in {self._folder}: {reason}") from error
 
     def _file(self, identifier: str) -> Path:
         return self._folder / f"{identifier}{SUFFIX}"

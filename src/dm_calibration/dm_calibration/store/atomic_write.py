@@ -3,8 +3,26 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from dm_common.errors import CodedError, ErrorCode
+
+
+class StoreError(CodedError):
+    """Something could not be written; the message says why, and nothing that was stored has changed."""
+
+    error_code = ErrorCode.STORAGE_FAILED
+
+
+@contextmanager
+def storing(failure: str) -> Iterator[None]:
+    """What the disk refuses in the body is a StoreError that begins with `failure`."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"{failure}: {error.strerror or error}") from error
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -8,20 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
-from dm_calibration.store.atomic_write import write_whole
+from dm_calibration.store.atomic_write import StoreError, storing, write_whole
 from dm_calibration.store.hdf5_image import ImageError, content_hash, read_image, write_image
-from dm_common.errors import CodedError, ErrorCode
+from dm_common.errors import ErrorCode
 
 SUFFIX = ".h5"
 #: What was measured, and where: never changed after a calibration was stored.
 _RAW = ("maps/", "points/", "mirror/")
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
-
-
-class StoreError(CodedError):
-    """A calibration could not be written; the message says why, and nothing that was stored has changed."""
-
-    error_code = ErrorCode.STORAGE_FAILED
 
 
 class UnknownCalibrationError(ValueError):
@@ -97,11 +91,8 @@ class CalibrationStore:
 
     def _write(self, target: Path, calibration: Calibration) -> None:
         image = write_image(*to_columns(calibration))
-        try:
+        with storing(f"calibration {calibration.id} was not stored in {self.folder}"):
             write_whole(target, image)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise StoreError(f"calibration {calibration.id} was not stored in {self.folder}: {reason}") from error
 
     def load(self, name: str) -> Calibration:
         """The calibration with the id `name`, or in the file `name` of this folder.
