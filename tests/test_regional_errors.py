@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dm_calibration.optics.aperture import Aperture
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sample_regions import EmptyRegionError, disc_shares, regional_rms
 from dm_common.optics.sampling import edge_clustered_points, sample_map
 from dm_common.optics.zernike import basis
-from studies.paper.regions import ConcentricRegions, figure_5, levelled_rms, region_statistics
+from studies.paper.regions import (
+    ConcentricRegions,
+    figure_5,
+    levelled_rms,
+    region_statistics,
+    row_spans,
+    squared_distance,
+)
 
 SIZE = 301
 APERTURE = Aperture(150.0, 150.0, 150.0)
@@ -61,7 +70,7 @@ def test_levelled_regions() -> None:
 def test_a_region_without_data_is_named() -> None:
     regions = ConcentricRegions((SIZE, SIZE), APERTURE)
     whole, holed = smooth_map(1), smooth_map(2)
-    holed[APERTURE.squared_distance(holed.shape) <= 0.25] = np.nan
+    holed[squared_distance(APERTURE, holed.shape) <= 0.25] = np.nan
     with pytest.raises(EmptyRegionError, match=r"p07: the concentric region of 10% of the area holds no valid data"):
         regions.rms_of_each([whole, holed], ["p06", "p07"])
     points = edge_clustered_points(500)
@@ -113,9 +122,28 @@ def test_rms_inside_each_disc_of_a_rough_map() -> None:
 
 def test_regions_have_the_stated_share_of_the_area() -> None:
     aperture = Aperture(149.5, 149.5, 150)
-    step = np.where(aperture.squared_distance((300, 300)) <= 0.3, 1.0, 0.0)
+    step = np.where(squared_distance(aperture, (300, 300)) <= 0.3, 1.0, 0.0)
     found = ConcentricRegions((300, 300), aperture).rms(step)
     np.testing.assert_allclose(found**2, np.minimum(1, 0.3 / (np.arange(1, 11) / 10)), rtol=2e-3)
     assert np.isnan(ConcentricRegions((300, 300), aperture).rms(np.full((300, 300), np.nan))).all()
     with pytest.raises(ValueError, match="must rise within 0 to 1"):
         ConcentricRegions((3, 3), aperture, [0.5, 0.4])
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    x=st.one_of(st.floats(-20, 80), st.integers(0, 60).map(lambda n: n / 2)),
+    y=st.one_of(st.floats(-20, 80), st.integers(0, 60).map(lambda n: n / 2)),
+    radius=st.one_of(st.floats(0.2, 60), st.sampled_from([2.5, 5.0, 12.5, 25.0, 32.5])),
+    fraction=st.sampled_from([0.1, 0.36, 0.64, 1.0]),
+)
+def test_row_spans_are_the_pixels_inside(x: float, y: float, radius: float, fraction: float) -> None:
+    """Also where pixels lie on the circle to the last bit, as with whole-numbered right triangles."""
+    aperture, shape = Aperture(x, y, radius), (50, 60)
+    start, end = row_spans(aperture, shape, fraction)
+    column = np.arange(shape[1])
+    found = (column >= start[:, None]) & (column < end[:, None])
+    np.testing.assert_array_equal(found, squared_distance(aperture, shape) <= fraction)
+    if fraction == 1.0:
+        on_the_circle = np.isclose(squared_distance(aperture, shape), 1.0, rtol=0.0, atol=1e-12)
+        np.testing.assert_array_equal(aperture.disc(shape) | on_the_circle, found | on_the_circle)

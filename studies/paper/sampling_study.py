@@ -28,6 +28,7 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_common.optics.sampling import GOLDEN_ANGLE, SamplePoints, edge_clustered_points, sample_map
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis
 from dm_simulation.interferometer.interferometer import InterferometerConfig
+from studies.paper.regions import squared_distance
 from studies.paper.samples import Samples
 
 Floats = NDArray[np.float64]
@@ -142,7 +143,7 @@ def study_sampling(
         for name, (fit, _samples) in ways.items():
             scatter[name].append(fit(noise_map))
 
-    rim = valid & (aperture.squared_distance(valid.shape) >= 1.0 - RIM_SHARE)
+    rim = valid & (squared_distance(aperture, valid.shape) >= 1.0 - RIM_SHARE)
     row, column = np.nonzero(rim)
     rim_terms = basis(
         (column - aperture.centre_x_px) / aperture.radius_px, (aperture.centre_y_px - row) / aperture.radius_px

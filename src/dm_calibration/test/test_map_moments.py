@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import legendre
 
-from dm_calibration.optics.aperture import Aperture
 from dm_calibration.optics.map_moments import MaskedMoments, mask_moments
 
 
@@ -44,19 +43,3 @@ def test_moments_and_energy_of_a_map_equal_the_plain_product(shape: tuple[int, i
     scale = np.abs(rows).T @ np.abs(filled) @ np.abs(columns)
     assert (np.abs(found - rows.T @ filled @ columns) <= 1e-13 * scale + 1e-300).all()
     assert energy == pytest.approx((filled**2).sum(), rel=1e-12)
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    x=st.one_of(st.floats(-20, 80), st.integers(0, 60).map(lambda n: n / 2)),
-    y=st.one_of(st.floats(-20, 80), st.integers(0, 60).map(lambda n: n / 2)),
-    radius=st.one_of(st.floats(0.2, 60), st.sampled_from([2.5, 5.0, 12.5, 25.0, 32.5])),
-    fraction=st.sampled_from([0.1, 0.36, 0.64, 1.0]),
-)
-def test_row_spans_are_the_pixels_inside(x: float, y: float, radius: float, fraction: float) -> None:
-    """Also where pixels lie on the circle to the last bit, as with whole-numbered right triangles."""
-    aperture, shape = Aperture(x, y, radius), (50, 60)
-    start, end = aperture.row_spans(shape, fraction)
-    column = np.arange(shape[1])
-    found = (column >= start[:, None]) & (column < end[:, None])
-    np.testing.assert_array_equal(found, aperture.squared_distance(shape) <= fraction)

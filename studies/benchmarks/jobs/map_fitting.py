@@ -15,7 +15,7 @@ from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.zernike import TERMS, basis, noll_to_born_wolf
 from studies.benchmarks.sample_maps import CAMERA, Ring, full_aperture, maps, mask_of
 from studies.benchmarks.timing import Effort, medians
-from studies.paper.regions import ConcentricRegions
+from studies.paper.regions import ConcentricRegions, squared_distance
 
 Floats = NDArray[np.float64]
 Fit = Callable[[Floats], Floats]
@@ -92,7 +92,7 @@ def _regions(effort: Effort, fitter: MapFitter, some: list[Floats]) -> dict[str,
     residuals = [fitter.residual(sag, fitter.fit(sag).coefficients) for sag in some[:4]]
     shape, aperture = residuals[0].shape, fitter.aperture
     regions = ConcentricRegions(shape, aperture)
-    discs = [aperture.squared_distance(shape) <= fraction for fraction in AREA_FRACTIONS]
+    discs = [squared_distance(aperture, shape) <= fraction for fraction in AREA_FRACTIONS]
     ours, theirs = Ring(residuals), Ring(residuals)
 
     def ten_passes() -> Floats:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,48 +38,11 @@ class Aperture:
     centre_y_px: float
     radius_px: float
 
-    def squared_distance(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """(height, width): squared distance of each pixel from the centre, in units of the radius."""
-        x = (np.arange(shape[1]) - self.centre_x_px) / self.radius_px
-        y = (np.arange(shape[0]) - self.centre_y_px) / self.radius_px
-        return x**2 + y[:, None] ** 2
-
-    def row_spans(
-        self, shape: tuple[int, int], area_fraction: float = 1.0
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """First column and column after the last of the pixels inside, for each row of a map.
-
-        The same pixels as ``squared_distance(shape) <= area_fraction``, without visiting each: the square root is only
-        a guess, which that very comparison settles at the columns beside it.
-
-        Args:
-            area_fraction: of the concentric disc that is meant.
-
-        Returns:
-            Two of (height,); equal where a row has no pixel inside.
-        """
-        y2 = ((np.arange(shape[0]) - self.centre_y_px) / self.radius_px) ** 2
-        half = self.radius_px * np.sqrt(np.maximum(area_fraction - y2, 0.0))
-        beside = np.arange(-2, 3)
-        left = np.ceil(self.centre_x_px - half)[:, None] + beside
-        right = np.floor(self.centre_x_px + half)[:, None] - beside
-
-        def inside(column: NDArray[np.float64]) -> NDArray[np.bool_]:
-            return ((column - self.centre_x_px) / self.radius_px) ** 2 + y2[:, None] <= area_fraction
-
-        rows = np.arange(shape[0])
-        found = inside(left)
-        start = left[rows, found.argmax(axis=1)]
-        end = np.where(found.any(axis=1), right[rows, inside(right).argmax(axis=1)] + 1, start)
-        return np.clip(start, 0, shape[1]).astype(np.intp), np.clip(end, 0, shape[1]).astype(np.intp)
-
     def disc(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """(height, width): True for pixels whose centre lies inside or on the circle."""
-        start, end = self.row_spans(shape)
-        narrow: type[np.int16 | np.int32] = np.int16 if shape[1] < 2**15 else np.int32  # quicker to compare
-        column: NDArray[Any] = np.arange(shape[1]).astype(narrow)
-        inside: NDArray[np.bool_] = column >= start.astype(narrow)[:, None]
-        inside &= column < end.astype(narrow)[:, None]
+        x = np.arange(shape[1]) - self.centre_x_px
+        y = np.arange(shape[0]) - self.centre_y_px
+        inside: NDArray[np.bool_] = x**2 <= self.radius_px**2 - y[:, None] ** 2
         return inside
 
     def pixels(self) -> int:
