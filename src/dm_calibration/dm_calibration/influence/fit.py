@@ -19,7 +19,7 @@ from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GradeOptions
 from dm_calibration.influence.region_weighting import choose_weighting, weighted_coefficients
-from dm_calibration.influence.regression import METHODS, Design, Method, Regression, TooFewMapsError, make_design
+from dm_calibration.influence.regression import METHODS, Design, Regression, TooFewMapsError, least_squares, make_design
 from dm_calibration.influence.screening import ScreeningOptions
 from dm_calibration.influence.weights import check_epsilon
 from dm_common.names import unknown_name
@@ -133,12 +133,11 @@ def fit_influence(
     for label in exclude:
         if label not in maps.label:
             raise unknown_name("map label", label, maps.label)
-    method = METHODS[options.method]
     reasons = screening.unusable(maps, options.screening)
     reasons = ["excluded by request" if label in exclude else r for label, r in zip(maps.label, reasons, strict=True)]
 
     sag = usable_sag(maps, reasons)
-    good, design, fitted, responses = _fit_good(method, maps, sag, reasons)
+    good, design, fitted, responses = _fit_good(maps, sag, reasons)
     budget = int(options.screening.dropped_max * len(maps))
     doubtful = False
     while not doubtful:
@@ -158,17 +157,17 @@ def fit_influence(
         index = maps.label.index(good.label[outlier[0]])
         reasons[index] = outlier[1]
         try:
-            good, design, fitted, responses = _fit_good(method, maps, sag, reasons)
+            good, design, fitted, responses = _fit_good(maps, sag, reasons)
         except TooFewMapsError:  # a doubtful map is better than none
             reasons[index] = ""
             doubtful = True
     remarks = []
-    if method.region_weighted:
+    if options.method == "AZWreg":
         # The outliers do not depend on it: they are found in the sag, which the weights do not touch.
         filled = responses[:, maps.terms :]
         weighting = choose_weighting(design, good, filled, options.folds, options.epsilon)
         responses = np.hstack((weighted_coefficients(good, filled, weighting.weights), filled))
-        fitted = method.estimate(design, responses)
+        fitted = least_squares(design, responses)
         remarks.append(weighting.sentence())
     if doubtful:
         remarks.append(
@@ -178,14 +177,12 @@ def fit_influence(
     return _judge(maps, options, rings, reasons, good, design, fitted, responses, remarks)
 
 
-def _fit_good(
-    method: Method, maps: MapSet, sag: Floats, reasons: list[str]
-) -> tuple[MapSet, Design, Regression, Floats]:
+def _fit_good(maps: MapSet, sag: Floats, reasons: list[str]) -> tuple[MapSet, Design, Regression, Floats]:
     """Fit the maps without a reason against them: those maps, their design, the regression, its responses."""
     used = np.array([not reason for reason in reasons], dtype=bool)
     good = maps.select(used)
     design = make_design(good)
-    fitted, responses = regress(method.estimate, design, good, sag[used])
+    fitted, responses = regress(design, good, sag[used])
     return good, design, fitted, responses
 
 

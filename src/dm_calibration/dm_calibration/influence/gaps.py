@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import Design, Regression, TooFewMapsError
+from dm_calibration.influence.regression import Design, Regression, TooFewMapsError, least_squares
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
 
@@ -39,9 +37,7 @@ def usable_sag(maps: MapSet, reasons: list[str]) -> Floats:
     return sag
 
 
-def regress(
-    estimate: Callable[[Design, Floats], Regression], design: Design, maps: MapSet, sag: Floats
-) -> tuple[Regression, Floats]:
+def regress(design: Design, maps: MapSet, sag: Floats) -> tuple[Regression, Floats]:
     """Regress coefficients and sag together; points without data are filled from the fit, round by round.
 
     That is the expectation-maximisation form of least squares with missing data; a gap converges as fast as the other
@@ -56,7 +52,7 @@ def regress(
     gaps = np.isnan(sag).any(axis=1)
     if not gaps.any():
         responses = np.hstack((maps.coefficients, sag))
-        return estimate(design, responses), responses
+        return least_squares(design, responses), responses
     modes = basis(maps.points.x, maps.points.y)
     filled = sag.copy()
     model = weighted_fit(sag[gaps], modes, maps.points.weight) @ modes.T
@@ -68,4 +64,4 @@ def regress(
             break
         model = projection[gaps] @ (projection.T @ filled)
     responses = np.hstack((maps.coefficients, filled))
-    return estimate(design, responses), responses
+    return least_squares(design, responses), responses

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from dm_calibration.influence import quality
 from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import SURFACE, MapSet
-from dm_calibration.influence.regression import Design, TooFewMapsError, least_squares, make_design
+from dm_calibration.influence.regression import Design, TooFewMapsError, make_design
 from dm_calibration.influence.weights import (
-    check_epsilon,
     coefficient_operator,
     region_weights,
     surface_control_error,
@@ -111,8 +110,6 @@ def choose_weighting(
     """
     if maps.terms != len(TERMS):
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
-    if epsilon is not None:
-        check_epsilon(epsilon)
     chosen = sample_surfaces(maps)
     # `sag` has its gaps filled from a fit: a region that nobody saw would get its weight from what was made up.
     labels = [label for label, used in zip(maps.label, chosen, strict=True) if used]
@@ -168,7 +165,7 @@ def weighting_of(
     good = maps if used is None else maps.select(used)
     design = make_design(good)
     sag = usable_sag(good, [""] * len(good))
-    _, responses = regress(least_squares, design, good, sag)
+    _, responses = regress(design, good, sag)
     return choose_weighting(design, good, responses[:, maps.terms :], folds, epsilon)
 
 

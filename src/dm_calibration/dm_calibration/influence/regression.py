@@ -1,4 +1,4 @@
-"""Eq. (6): the influence function as an ordinary least-squares problem, and the registry of methods.
+"""Eq. (6): the influence function as an ordinary least-squares problem, and the methods.
 
 Both methods of [1] regress by Eq. (6). AZreg takes the coefficients fitted to every pixel of a map alike; AZWreg
 takes coefficients fitted to the sag with region weights (see :mod:`~dm_calibration.influence.weights` for why the
@@ -14,7 +14,6 @@ map.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +25,9 @@ from dm_common.errors import ErrorCode
 
 Floats = NDArray[np.float64]
 
+#: Methods by the name used in messages and calibration files; AZWreg fits the Zernike coefficients anew to the sag with
+#: region weights, Eq. (8).
+METHODS = ("AZreg", "AZWreg")
 #: Least range of applied signals over the maps, normalised, for an actuator to count as excited.
 EXCITATION_MIN = 0.02
 #: Maps beyond the number of unknowns before the drift is followed; with fewer, the figure is taken as constant.
@@ -142,23 +144,3 @@ def least_squares(design: Design, responses: Floats) -> Regression:
         leverage=np.square(q).sum(axis=1),
         covariance=inverse @ inverse.T,
     )
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way from maps to an influence function.
-
-    Attributes:
-        estimate: (p, Q) coefficients, with what is needed to judge them, from a design and responses (M, Q).
-        region_weighted: whether the Zernike coefficients are fitted anew to the sag with region weights, Eq. (8).
-    """
-
-    estimate: Callable[[Design, Floats], Regression]
-    region_weighted: bool = False
-
-
-#: Methods by the name used in messages and calibration files.
-METHODS: dict[str, Method] = {
-    "AZreg": Method(least_squares),
-    "AZWreg": Method(least_squares, region_weighted=True),
-}
