@@ -13,11 +13,11 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from dm_calibration.report.document import Section, Table
-from dm_calibration.report.html_page import write_html
-from dm_calibration.report.pdf_pages import write_pdf
+from dm_calibration.report.pdf_pages import pdf_pages
 from studies.comparison.simulated_bench import SimulationConfig
 from studies.paper import control, reported
 from studies.paper.f_statistic import adjusted_r2_of_f, p_of_f
+from studies.paper.page.page import write_html
 from studies.paper.results import PaperOptions
 from studies.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
 from studies.verbs.paper import paper
@@ -203,7 +203,7 @@ def test_text_is_escaped_and_long_tables_go_on_over_pages(tmp_path: Path) -> Non
     section = Section("a < b & c", ["x < y"], [table])
     page = write_html(tmp_path, "t & u", [section]).read_text()
     assert "a &lt; b &amp; c" in page and page.count("&lt;&amp;&gt;") == 150
-    pdf = write_pdf(tmp_path / "t.pdf", "t", [section]).read_bytes()
+    pdf = pdf_pages("t", [section])
     assert len(re.findall(rb"/Type /Page\b", pdf)) >= 3
     with pytest.raises(ValueError, match="1 cells under 2 headings"):
         Table("short", ("a", "b"), [("only one",)])

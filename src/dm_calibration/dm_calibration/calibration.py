@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,28 @@ from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
 
-T = TypeVar("T")
 Floats = NDArray[np.float64]
 
 SCHEMA = "dm_calibration/calibration"
 SCHEMA_VERSION = 1
 
 _POINTS = ("x", "y", "weight")
+#: Fields of a calibration that are attributes of its file, and their types there.
+_ATTRIBUTES: dict[str, type] = {
+    "id": str,
+    "mirror_name": str,
+    "mirror_serial": str,
+    "wavelength": float,
+    "aperture_radius": float,
+    "created_ns": int,
+    "software_version": str,
+    "dropped": tuple,
+    "targets": tuple,
+    "limitations": tuple,
+    "note": str,
+}
+#: Names of attributes that differ from their fields'.
+_STORED_AS = {"limitations": "known_limitations"}
 
 
 class CalibrationFileError(ValueError):
@@ -112,17 +127,7 @@ def to_columns(calibration: Calibration) -> tuple[dict[str, Column], dict[str, A
     attributes: dict[str, Attribute] = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
-        "id": calibration.id,
-        "mirror_name": calibration.mirror_name,
-        "mirror_serial": calibration.mirror_serial,
-        "wavelength": float(calibration.wavelength),
-        "aperture_radius": float(calibration.aperture_radius),
-        "created_ns": int(calibration.created_ns),
-        "software_version": calibration.software_version,
-        "dropped": calibration.dropped,
-        "targets": calibration.targets,
-        "known_limitations": calibration.limitations,
-        "note": calibration.note,
+        **{_STORED_AS.get(name, name): kind(getattr(calibration, name)) for name, kind in _ATTRIBUTES.items()},
         "maps_used": int(fit.used.sum()),
     }
     for figure in fields(InfluenceFit):
@@ -167,22 +172,15 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
             path = f"result/{figure.name}"
             result[figure.name] = columns[path] if path in columns else attributes[f"fit_{figure.name}"]
         fit = InfluenceFit(**result)
+        described: dict[str, Any] = {
+            name: _typed(attributes, _STORED_AS.get(name, name), kind) for name, kind in _ATTRIBUTES.items()
+        }
         calibration = Calibration(
-            id=_typed(attributes, "id", str),
-            mirror_name=_typed(attributes, "mirror_name", str),
-            mirror_serial=_typed(attributes, "mirror_serial", str),
-            wavelength=_typed(attributes, "wavelength", float),
-            aperture_radius=_typed(attributes, "aperture_radius", float),
-            created_ns=_typed(attributes, "created_ns", int),
+            **described,
             actuator_x=np.asarray(columns["mirror/actuator_x"], dtype=np.float64),
             actuator_y=np.asarray(columns["mirror/actuator_y"], dtype=np.float64),
             maps=maps,
             fit=fit,
-            dropped=_typed(attributes, "dropped", tuple),
-            targets=_typed(attributes, "targets", tuple),
-            limitations=_typed(attributes, "known_limitations", tuple),
-            note=_typed(attributes, "note", str),
-            software_version=_typed(attributes, "software_version", str),
             hysteresis=hysteresis_from(columns),
             recipes=recipes_from(columns),
             region_weights=np.asarray(columns.get("regions/weights", np.zeros(0)), dtype=np.float64),
@@ -195,7 +193,7 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
     return calibration
 
 
-def _typed(attributes: Mapping[str, Attribute], name: str, kind: type[T]) -> T:
+def _typed(attributes: Mapping[str, Attribute], name: str, kind: type) -> Attribute:
     value = attributes[name]
     if not isinstance(value, kind):
         raise ValueError(f"attribute {name} = {value!r}: must be a {kind.__name__}")

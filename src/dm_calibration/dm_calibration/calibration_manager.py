@@ -24,6 +24,8 @@ class CalibrationManager:
 
     Attributes:
         store: the folder of calibration files.
+        mirror: that the driver describes; None before it did.
+        in_use: the calibration in use; None = there is none.
     """
 
     def __init__(
@@ -39,20 +41,8 @@ class CalibrationManager:
         self._lock = threading.RLock()
         # Held while a stored calibration is changed, so that no change gets lost; writing may take long.
         self._changing = threading.Lock()
-        self._mirror: Mirror | None = None
-        self._in_use: Calibration | None = None
-
-    @property
-    def mirror(self) -> Mirror | None:
-        """The mirror the driver describes; None before it did."""
-        with self._lock:
-            return self._mirror
-
-    @property
-    def in_use(self) -> Calibration | None:
-        """The calibration in use."""
-        with self._lock:
-            return self._in_use
+        self.mirror: Mirror | None = None
+        self.in_use: Calibration | None = None
 
     def known_mirror(self, wait_s: float = 0.0) -> Mirror:
         """The mirror. A worker thread may wait for a driver that is still starting.
@@ -70,11 +60,11 @@ class CalibrationManager:
     def set_mirror(self, mirror: Mirror) -> str:
         """Take over the mirror. Returns why the calibration in use was withdrawn; "" = it was not."""
         with self._lock:
-            self._mirror = mirror
-            wrong = self.mismatch(self._in_use) if self._in_use else ""
+            self.mirror = mirror
+            wrong = self.mismatch(self.in_use) if self.in_use else ""
             if not wrong:
                 return ""
-            withdrawn = self._in_use.id if self._in_use else ""
+            withdrawn = self.in_use.id if self.in_use else ""
             self.use(None)
             return f"calibration {withdrawn} withdrawn: {wrong}"
 
@@ -95,19 +85,19 @@ class CalibrationManager:
     def use(self, calibration: Calibration | None) -> None:
         """Use `calibration`, which is in the store, from now on."""
         with self._lock:
-            self._in_use = calibration
+            self.in_use = calibration
             self._publish(calibration, self.store.find(calibration.id) if calibration else None)
 
     def publish_again(self) -> None:
         """Publish the calibration in use anew."""
         with self._lock:
-            if self._in_use is None:
+            if self.in_use is None:
                 return
             try:
-                file = self.store.find(self._in_use.id)
+                file = self.store.find(self.in_use.id)
             except UnknownCalibrationError:  # removed meanwhile; what is in use stays
                 file = None
-            self._publish(self._in_use, file)
+            self._publish(self.in_use, file)
 
     def load(self, name: str) -> Calibration:
         """Load by id or file, or the newest that fits when `name` is empty, and use it.

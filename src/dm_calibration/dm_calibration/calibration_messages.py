@@ -19,6 +19,12 @@ from dm_common.messages import doubles, recipe_book_message, time_message
 
 Floats = NDArray[np.float64]
 
+# Fields of the message that are named as those of a calibration and of its fit.
+_NAMES = ("id", "mirror_name", "mirror_serial", "software_version", "wavelength", "aperture_radius", "maps_dropped")
+_RANGE = ("method", "actuators", "signal_min", "signal_max")
+_FIGURES = ("in_sample_rms", "held_out_rms", "held_out_max_zernike", "condition_number")
+_MODEL = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
+
 
 def driver_facts(message: MirrorInfo) -> dict[str, Any]:
     """What maps depend on beside the mirror itself: wiring, electronics and volts."""
@@ -47,33 +53,19 @@ def calibration_message(
     usable = np.isin(fit.grades, (CalibrationMsg.GRADE_GOOD, CalibrationMsg.GRADE_WEAK)).all()
     good = fit.held_out_max_zernike <= calibrated_error_max and bool(usable)
     message.header.stamp = time_message(calibration.stamp_ns)
-    message.id = calibration.id
     message.file = str(file or "")
-    message.mirror_name = calibration.mirror_name
-    message.mirror_serial = calibration.mirror_serial
-    message.method = fit.method
-    message.software_version = calibration.software_version
-    message.wavelength = calibration.wavelength
-    message.aperture_radius = calibration.aperture_radius
-    message.actuators = fit.actuators
     message.convention = ZernikeCoefficients.BORN_WOLF
     message.terms = calibration.maps.terms
-    message.influence_zernike = doubles(fit.influence_zernike)
-    message.zernike_offset = doubles(fit.zernike_offset)
     message.points = points.x.size
     message.sample_x = doubles(points.x)
     message.sample_y = doubles(points.y)
     message.sample_weight = doubles(points.weight)
-    message.influence_sag = doubles(fit.influence_sag)
-    message.sag_offset = doubles(fit.sag_offset)
-    message.signal_min = fit.signal_min
-    message.signal_max = fit.signal_max
     message.maps_used = int(fit.used.sum())
-    message.maps_dropped = calibration.maps_dropped
-    message.in_sample_rms = fit.in_sample_rms
-    message.held_out_rms = fit.held_out_rms
-    message.held_out_max_zernike = fit.held_out_max_zernike
-    message.condition_number = fit.condition_number
+    for source, names in ((calibration, _NAMES), (fit, _RANGE), (fit, _FIGURES)):
+        for name in names:
+            setattr(message, name, getattr(source, name))
+    for name in _MODEL:
+        setattr(message, name, doubles(getattr(fit, name)))
     message.quality = CalibrationMsg.CALIBRATED if good else CalibrationMsg.APPROXIMATE
     message.actuator_grade = array("B", fit.grades.astype(np.uint8).tobytes())
     message.known_limitations = list(calibration.limitations)
@@ -94,7 +86,7 @@ def put_updates(
         doubts: sentences, added to the known limitations.
         mirror_changed: the calibration no longer counts as CALIBRATED.
     """
-    for name in ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset"):
+    for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
     message.revision = updates.revision
     message.checked = time_message(updates.checked_ns)

@@ -30,7 +30,8 @@ from dm_calibration.calibration_parameters import PARAMETERS, fit_options
 from dm_calibration.calibrator import refit
 from dm_calibration.recalibration.map_listener import PUBLISH_PERIOD_S, MapListener
 from dm_calibration.regression.error_prediction import ErrorPrediction
-from dm_calibration.report.report_writer import ReportingStore, ReportWriter
+from dm_calibration.report.report_writer import ReportWriter
+from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.messages import mirror_from, recipe_book_from, time_message
 from dm_common.ros import diagnostics, qos
@@ -52,9 +53,7 @@ class CalibrationNode(Node):
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.LATCHED)
         self._reports = ReportWriter(self._log_report)
         self._manager = CalibrationManager(
-            ReportingStore(
-                self._values["calibration_folder"], self._reports, lambda: bool(self._values["write_report"])
-            ),
+            CalibrationStore(self._values["calibration_folder"], self._write_report),
             lambda: float(self._values["aperture_tolerance"]),
             lambda: int(self.get_clock().now().nanoseconds),
             self._publish,
@@ -84,6 +83,10 @@ class CalibrationNode(Node):
         if self._server.busy and mirror is not None:
             self.get_logger().warning(f"ended during a calibration: {self._bench_services.rest_at_exit(mirror.rest)}")
         self._reports.end()
+
+    def _write_report(self, file: Path) -> None:
+        if self._values["write_report"]:
+            self._reports.write(file)
 
     def _log_report(self, text: str, warning: bool) -> None:
         if warning:

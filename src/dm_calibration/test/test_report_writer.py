@@ -11,13 +11,12 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
-from dm_calibration.report.report_writer import ReportingStore, ReportWriter
+from dm_calibration.report.report_writer import ReportWriter
+from dm_calibration.store.calibration_store import CalibrationStore
 from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
 
 pytestmark = pytest.mark.slow
-
-PATIENCE_S = 200.0
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +28,9 @@ def calibration() -> Calibration:
 def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration, tmp_path: Path) -> None:
     published: list[tuple[str, bool]] = []
     writer = ReportWriter(lambda text, warning: published.append((text, warning)))
-    store = ReportingStore(tmp_path, writer, lambda: True)
+    store = CalibrationStore(tmp_path, writer.write)
     store.save(calibration)
-    assert writer.wait(PATIENCE_S)
+    writer.finish()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c1.h5", "c1.html", "c1.pdf"]
     assert published == [("report written: c1.html and .pdf beside the calibration", False)]
     assert [entry.id for entry in store.entries()] == ["c1"]
@@ -39,10 +38,10 @@ def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration
 
 def test_a_changed_calibration_gets_a_new_report(calibration: Calibration, tmp_path: Path) -> None:
     writer = ReportWriter(lambda _text, _warning: None)
-    store = ReportingStore(tmp_path, writer, lambda: True)
+    store = CalibrationStore(tmp_path, writer.write)
     store.save(calibration)
     store.replace(replace(calibration, limitations=("Somebody leaned on the table.",)))
-    assert writer.wait(PATIENCE_S)
+    writer.finish()
     assert "Somebody leaned on the table." in (tmp_path / "c1.html").read_text()
 
 
@@ -50,24 +49,25 @@ def test_a_report_that_fails_leaves_the_calibration_and_a_sentence(calibration: 
     published: list[tuple[str, bool]] = []
     writer = ReportWriter(lambda text, warning: published.append((text, warning)))
     (tmp_path / "c1.html").mkdir()  # something else has the name
-    store = ReportingStore(tmp_path, writer, lambda: True)
+    store = CalibrationStore(tmp_path, writer.write)
     store.save(calibration)
-    assert writer.wait(PATIENCE_S)
+    writer.finish()
     ((text, warning),) = published
     assert warning and text.startswith("no report of c1.h5: ") and "./dm report" in text
     assert store.load("c1").id == "c1"
 
 
-def test_nothing_is_written_when_none_is_wanted(calibration: Calibration, tmp_path: Path) -> None:
-    writer = ReportWriter(lambda _text, _warning: None)
-    ReportingStore(tmp_path, writer, lambda: False).save(calibration)
-    assert writer.wait(PATIENCE_S)
+def test_a_store_tells_of_every_file_that_it_writes(calibration: Calibration, tmp_path: Path) -> None:
+    written: list[Path] = []
+    store = CalibrationStore(tmp_path, written.append)
+    store.save(calibration)
+    store.replace(calibration)
+    assert written == 2 * [tmp_path / "c1.h5"]
     assert [path.name for path in tmp_path.iterdir()] == ["c1.h5"]
 
 
 def test_the_end_of_the_node_leaves_no_halves(calibration: Calibration, tmp_path: Path) -> None:
     writer = ReportWriter(lambda _text, _warning: None)
-    ReportingStore(tmp_path, writer, lambda: True).save(calibration)
+    CalibrationStore(tmp_path, writer.write).save(calibration)
     writer.end()
-    assert writer.wait(0.0)
     assert {path.name for path in tmp_path.iterdir()} <= {"c1.h5", "c1.html", "c1.pdf"}

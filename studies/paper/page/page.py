@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from dm_calibration.report.document import Section
-from dm_calibration.report.html_page import write_html
-from dm_calibration.report.pdf_pages import write_pdf
+from dm_calibration.report.document import Picture, Section
+from dm_calibration.report.html_page import PNG_DPI, html_page
+from dm_calibration.report.pdf_pages import pdf_pages
 from studies.paper.page import content, content_coefficients, content_control, content_regressions, content_sampling
 from studies.paper.results import Results
 
@@ -41,6 +42,20 @@ def sections(results: Results) -> list[Section]:
     ]
 
 
+def write_html(folder: Path, title: str, sections: Sequence[Section]) -> Path:
+    """Write `index.html` and its pictures into `folder`; returns the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def place(picture: Picture) -> str:
+        file = f"{picture.name}.png"
+        (folder / file).write_bytes(picture.png(PNG_DPI))
+        return file
+
+    page = folder / "index.html"
+    page.write_text(html_page(title, sections, place))
+    return page
+
+
 def write_page(results: Results, folder: Path) -> Written:
     """Write the page into `folder`.
 
@@ -49,4 +64,6 @@ def write_page(results: Results, folder: Path) -> Written:
     """
     made = sections(results)
     pictures = [folder / f"{picture.name}.png" for section in made for picture in section.pictures]
-    return Written(write_html(folder, TITLE, made), write_pdf(folder / "paper.pdf", TITLE, made), pictures)
+    html, pdf = write_html(folder, TITLE, made), folder / "paper.pdf"
+    pdf.write_bytes(pdf_pages(TITLE, made))
+    return Written(html, pdf, pictures)

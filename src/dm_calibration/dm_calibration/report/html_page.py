@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Sequence
 from html import escape
-from pathlib import Path
 from string import Template
 
 from dm_calibration.report.document import Picture, Section, Table
@@ -53,30 +52,16 @@ $sections
 """)
 
 
-def write_html(folder: Path, title: str, sections: Sequence[Section]) -> Path:
-    """Write `index.html` and its pictures into `folder`; returns the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-
-    def place(picture: Picture) -> str:
-        file = f"{picture.name}.png"
-        (folder / file).write_bytes(picture.png(PNG_DPI))
-        return file
-
-    page = folder / "index.html"
-    page.write_text(_html(title, sections, place))
-    return page
-
-
 def one_html(title: str, sections: Sequence[Section]) -> str:
     """The page as one file, with its pictures inside."""
-    return _html(
+    return html_page(
         title,
         sections,
         lambda picture: f"data:image/png;base64,{base64.b64encode(picture.png(PNG_DPI)).decode('ascii')}",
     )
 
 
-def _html(title: str, sections: Sequence[Section], place: Callable[[Picture], str]) -> str:
+def html_page(title: str, sections: Sequence[Section], place: Callable[[Picture], str]) -> str:
     """The page; `place` puts a picture somewhere and returns its address."""
     parts, links = [], []
     for number, section in enumerate(sections, start=1):

@@ -57,13 +57,6 @@ CAPTION = ParagraphStyle("caption", fontName=REGULAR, fontSize=8, leading=10.5, 
 TABLE_TITLE = ParagraphStyle("table", fontName=BOLD, fontSize=8.5, leading=11, spaceBefore=6, spaceAfter=3)
 
 
-def write_pdf(path: Path, title: str, sections: Sequence[Section]) -> Path:
-    """Write all sections to a PDF, as :func:`pdf_pages`; returns its path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(pdf_pages(title, sections))
-    return path
-
-
 def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     """All sections as a PDF: text, tables and pictures one below the other, title and page number at the foot."""
     _register_fonts()

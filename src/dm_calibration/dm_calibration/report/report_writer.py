@@ -12,9 +12,9 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from dm_calibration.calibration import Calibration
 from dm_calibration.store.calibration_store import CalibrationStore
 
 #: Longest time for one report, s of wall time; a loaded machine may need a multiple of the usual few.
@@ -33,58 +33,49 @@ class ReportWriter:
     def __init__(self, publish: Callable[[str, bool], None]) -> None:
         self._publish = publish
         self._lock = threading.Lock()
-        self._waiting: list[Path] = []
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reports")
+        self._waiting: set[Path] = set()
         self._process: subprocess.Popen[bytes] | None = None
-        self._thread: threading.Thread | None = None
         self._ended = False
 
     def write(self, file: Path) -> None:
         """Have the report of the calibration in `file` written beside it; returns at once."""
         with self._lock:
-            if self._ended or file in self._waiting:
-                return
-            self._waiting.append(file)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._work, name="reports", daemon=True)
-                self._thread.start()
+            if not self._ended and file not in self._waiting:
+                self._waiting.add(file)
+                self._worker.submit(self._work, file)
 
     def end(self) -> None:
         """Stop: a report under way is given up, with no trace of it."""
         with self._lock:
             self._ended = True
-            self._waiting.clear()
-            process, thread = self._process, self._thread
-        if process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                process.terminate()
-        if thread is not None:
-            thread.join(5.0)
+            if self._process is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    self._process.terminate()
+        self.finish()
 
-    def wait(self, timeout_s: float) -> bool:
-        """Whether all reports were done within `timeout_s`."""
+    def finish(self) -> None:
+        """Wait until all reports are done; no more are taken."""
+        self._worker.shutdown()
+
+    def _work(self, file: Path) -> None:
         with self._lock:
-            thread = self._thread
-        if thread is not None:
-            thread.join(timeout_s)
-        return thread is None or not thread.is_alive()
-
-    def _work(self) -> None:
-        while True:
-            with self._lock:
-                if self._ended or not self._waiting:
-                    self._thread = None
-                    return
-                file = self._waiting.pop(0)
-                try:
-                    command = [sys.executable, "-m", "dm_calibration.report.report_writer", str(file)]
-                    self._process = subprocess.Popen(
-                        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                        start_new_session=True,
-                    )  # fmt: skip
-                except OSError as error:
-                    self._publish(f"no report of {file.name}: {error}", True)
-                    continue
-            self._finish(file, self._process)
+            self._waiting.discard(file)
+            if self._ended:
+                return
+            try:
+                command = [sys.executable, "-m", "dm_calibration.report.report_writer", str(file)]
+                self._process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.PIPE,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                self._publish(f"no report of {file.name}: {error}", True)
+                return
+        self._finish(file, self._process)
 
     def _finish(self, file: Path, process: subprocess.Popen[bytes]) -> None:
         try:
@@ -104,33 +95,6 @@ class ReportWriter:
         else:
             reason = errors.splitlines()[-1] if errors else f"its process ended with status {process.returncode}"
             self._publish(f"no report of {file.name}: {reason}; `./dm report` tries again", True)
-
-
-class ReportingStore(CalibrationStore):
-    """A store whose calibrations get a report beside them.
-
-    Args:
-        folder: of the calibration files.
-        writer: writes them.
-        wanted: whether to; asked at every calibration.
-    """
-
-    def __init__(self, folder: str | Path, writer: ReportWriter, wanted: Callable[[], bool]) -> None:
-        super().__init__(folder)
-        self._reports, self._wanted = writer, wanted
-
-    def save(self, calibration: Calibration) -> Path:
-        """As :meth:`CalibrationStore.save`, then the report."""
-        return self._reported(super().save(calibration))
-
-    def replace(self, calibration: Calibration) -> Path:
-        """As :meth:`CalibrationStore.replace`, then the report anew."""
-        return self._reported(super().replace(calibration))
-
-    def _reported(self, file: Path) -> Path:
-        if self._wanted():
-            self._reports.write(file)
-        return file
 
 
 def main(arguments: list[str]) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,10 +43,16 @@ def new_id(mirror_name: str, serial: str, created_ns: int) -> str:
 
 
 class CalibrationStore:
-    """Calibrations of one folder, one file ``<id>.h5`` each."""
+    """Calibrations of one folder, one file ``<id>.h5`` each.
 
-    def __init__(self, folder: str | Path) -> None:
+    Args:
+        folder: of the files.
+        written: called with each file that was stored or replaced.
+    """
+
+    def __init__(self, folder: str | Path, written: Callable[[Path], None] = lambda file: None) -> None:
         self.folder = Path(folder).expanduser()
+        self._written = written
 
     def new_id(self, mirror_name: str, serial: str, created_ns: int) -> str:
         """An id that no file of the folder has: mirror, serial number, time (UTC), and a number when needed."""
@@ -93,6 +100,7 @@ class CalibrationStore:
         image = write_image(*to_columns(calibration))
         with storing(f"calibration {calibration.id} was not stored in {self.folder}"):
             write_whole(target, image)
+        self._written(target)
 
     def load(self, name: str) -> Calibration:
         """The calibration with the id `name`, or in the file `name` of this folder.
