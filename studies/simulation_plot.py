@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from scipy.optimize import lsq_linear
 
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.mirror.hysteresis import LAWS
-from dm_simulation.mirror.piezo import CREEP_FASTEST_S, PiezoActuators, PiezoConfig
+from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from dm_simulation.mirror.plate import Plate
 from dm_simulation.mirror.zernike import Array
 
@@ -26,7 +27,6 @@ from dm_simulation.mirror.zernike import Array
 COLOURS = "cividis"
 DARK, LIGHT, WARM = "#00204d", "#7c7b78", "#c2410c"
 PIXELS = 400
-LAW_TITLES = dict(zip(LAWS, ("none", "Prandtl–Ishlinskii", "Preisach", "Bouc–Wen", "mixed"), strict=True))
 
 
 class View:
@@ -82,7 +82,7 @@ def sphere_command(view: View, curvature: float, stroke: float) -> tuple[Array, 
 
 def draw_hysteresis(axes: Axes, config: PiezoConfig) -> None:
     """The full loop from rest, with minor loops in it."""
-    actuator = PiezoActuators(PiezoConfig(config.stroke, 0.0, config.law, config.hysteresis, 0.0), _rng(), np.zeros(1))
+    actuator = PiezoActuators(replace(config, gain_spread=0.0, creep=0.0), _rng(), np.zeros(1))
 
     def drive(*turns: float) -> tuple[Array, Array]:
         signals = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(turns)])
@@ -96,7 +96,7 @@ def draw_hysteresis(axes: Axes, config: PiezoConfig) -> None:
     axes.plot(*drive(1, -1, 1), color=DARK, lw=1.8, label="full loop")
     axes.plot(*drive(1, -0.2, 0.6, -0.2, 1), color=WARM, lw=1.1, label="minor loop")
     axes.set(
-        title=f"Hysteresis, {LAW_TITLES[config.law]}, {100 * config.hysteresis:g} %",
+        title=f"Hysteresis, {config.law.replace('_', ' ')}, {100 * config.hysteresis:g} %",
         xlabel="signal",
         ylabel="base displacement / µm",
     )
@@ -106,7 +106,7 @@ def draw_hysteresis(axes: Axes, config: PiezoConfig) -> None:
 
 def draw_creep(axes: Axes, config: PiezoConfig) -> None:
     """Displacement after a step, against the logarithmic law."""
-    actuator = PiezoActuators(PiezoConfig(config.stroke, 0.0, "none", 0.0, config.creep), _rng(), np.zeros(1))
+    actuator = PiezoActuators(replace(config, gain_spread=0.0, law="none"), _rng(), np.zeros(1))
     actuator.apply(np.ones(1), 0.0)
     times = np.geomspace(0.01, 1e6, 200)
     percent = []
@@ -114,9 +114,16 @@ def draw_creep(axes: Axes, config: PiezoConfig) -> None:
         actuator.advance(time)
         percent.append(100 * (actuator.displacement[0] / (config.stroke / 2) - 1))
     axes.semilogx(times, percent, color=DARK, lw=1.8, label="simulated")
-    law = np.geomspace(CREEP_FASTEST_S, 1e5, 2)
+    law = np.geomspace(config.creep_fastest, config.creep_slowest, 2)
     start = np.interp(1.0, times, percent) - 100 * config.creep
-    axes.semilogx(law, start + 100 * config.creep * np.log10(law / 0.1), color=WARM, lw=1.1, ls="--", label="∝ log t")
+    axes.semilogx(
+        law,
+        start + 100 * config.creep * np.log10(law / config.creep_fastest),
+        color=WARM,
+        lw=1.1,
+        ls="--",
+        label="∝ log t",
+    )
     axes.set(
         title=f"Creep, {100 * config.creep:g} % per decade",
         xlabel="time after the step / s",

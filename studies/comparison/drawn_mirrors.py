@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from studies.comparison.simulated_bench import SimulationConfig
 LAWS = {"drawn_preisach": 0.55, "drawn_mixed": 0.25, "drawn_bouc_wen": 0.2}
 #: Largest difference between neighbours as shipped, see pdm_driver's `limits.neighbour_difference`.
 SHIPPED_NEIGHBOUR_DIFFERENCE = 1.0
-#: Time constants of a mirror whose creep is that of few elements, s.
-FEW_CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
+#: Creep of few elements: first and last time constant, s, a decade apart.
+FEW_ELEMENTS_S = (0.3, 300.0)
 #: What may happen after the calibration, and how often each does.
 GAIN_STEP, DIES, NOTHING = "gain step", "actuator dies", ""
 EVENTS = {NOTHING: 0.8, GAIN_STEP: 0.1, DIES: 0.1}
@@ -49,7 +49,7 @@ class DrawnMirror:
         parts = [
             config.law.removeprefix("drawn_").replace("_", "-"),
             f"loop {config.hysteresis:.0%} ± {piezo.hysteresis_spread:.0%}",
-            f"creep {config.creep:.1%}" + (" (4 elements)" if piezo.creep_times == FEW_CREEP_TIMES_S else ""),
+            f"creep {config.creep:.1%}" + (" (4 elements)" if piezo.creep_per_decade == 1 else ""),
             f"figure {1e9 * instrument.figure_rms:.0f} nm",
             f"noise {1e9 * instrument.pixel_noise:.1f} nm",
         ]
@@ -78,11 +78,15 @@ def draw_mirror(seed: int, pixels: int = 236) -> DrawnMirror:
 
     few = rng.random() < 0.3
     rate = float(rng.uniform(0.006, 0.014))
-    piezo = PiezoConfig(
+    elements = PiezoConfig()
+    if few:
+        fastest, slowest = FEW_ELEMENTS_S
+        elements = replace(elements, creep_fastest=fastest, creep_slowest=slowest, creep_per_decade=1)
+    piezo = replace(
+        elements,
         gain_spread=0.03,
         hysteresis_spread=float(rng.uniform(0.1, 0.2)),
         creep_spread=0.1,
-        creep_times=FEW_CREEP_TIMES_S if few else PiezoConfig().creep_times,
         spectrum_spread=0.2 if few else 0.3,
         creep_position=sometimes(-0.2, 0.2),
         rate_dependence=sometimes(0.0, 0.03),

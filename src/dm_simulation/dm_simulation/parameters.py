@@ -18,11 +18,11 @@ from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_simulation.interferometer.zygo_files import FORMATS, UNITS
 from dm_simulation.mirror.hysteresis import LAWS
 from dm_simulation.mirror.membrane import MembraneConfig
-from dm_simulation.mirror.piezo import PiezoConfig
+from dm_simulation.mirror.piezo import DRAWN, PiezoConfig
 from dm_simulation.mirror.plate import PlateConfig
 
 _PLATE = PlateConfig()
-_PIEZO = PiezoConfig()
+_PIEZO = DRAWN
 _MEMBRANE = MembraneConfig()
 _INSTRUMENT = InterferometerConfig()
 _CAMERA = CameraConfig()
@@ -35,7 +35,7 @@ _PLATE_ON_PIEZOS, _ELECTROSTATIC_MEMBRANE = PRINCIPLES = ("piezo", "membrane")
 _PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
 
 PARAMETERS = (
-    Parameter("seed", whole(1, 0, 2**31), "Fixes gains, initial figure and noise."),
+    Parameter("seed", whole(1, 0, 2**31), "Fixes gains, initial figure and noise, and what else is drawn."),
     Parameter("mirror.name", text(_FILES.part_name), "Model of the mirror, as map files name it."),
     Parameter(
         "mirror.principle",
@@ -60,9 +60,23 @@ PARAMETERS = (
     ),
     Parameter("piezo.stroke", real(_PIEZO.stroke, 0.0, 1e-3, "m"), "Stroke of a stack from signal -1 to +1."),
     Parameter("piezo.gain_spread", real(_PIEZO.gain_spread, 0.0, 0.3), "Standard deviation of relative gains."),
-    Parameter("piezo.law", text(_PIEZO.law, choices=LAWS), "Hysteresis law."),
+    Parameter(
+        "piezo.law", text(_PIEZO.law, choices=LAWS), "Hysteresis law; drawn_* = each actuator its own, by the seed."
+    ),
     Parameter("piezo.hysteresis", real(_PIEZO.hysteresis, 0.0, 0.3), "Widest loop opening over the full stroke."),
+    Parameter("piezo.hysteresis_spread", real(_PIEZO.hysteresis_spread, 0.0, 0.3), "Spread of relative loop openings."),
     Parameter("piezo.creep", real(_PIEZO.creep, 0.0, 0.1), "Creep of a step per decade of time."),
+    Parameter("piezo.creep_spread", real(_PIEZO.creep_spread, 0.0, 0.3), "Spread of relative creep."),
+    Parameter("piezo.creep_fastest", real(_PIEZO.creep_fastest, 1e-3, 1e6, "s"), "Fastest element of creep."),
+    Parameter("piezo.creep_slowest", real(_PIEZO.creep_slowest, 1e-3, 1e7, "s"), "Slowest element of creep."),
+    Parameter("piezo.creep_per_decade", whole(_PIEZO.creep_per_decade, 1, 10), "Elements per decade of time."),
+    Parameter("piezo.spectrum_spread", real(_PIEZO.spectrum_spread, 0.0, 1.0), "Spread of elements, as a logarithm."),
+    Parameter("piezo.creep_position", real(_PIEZO.creep_position, -0.5, 0.5), "Change of creep from mid range to 1."),
+    Parameter(
+        "piezo.rate_dependence", real(_PIEZO.rate_dependence, 0.0, 0.1), "Widening of loops per decade of speed."
+    ),
+    Parameter("piezo.stiffening", real(_PIEZO.stiffening, 0.0, 0.2), "Share of stroke lost at its ends, in squares."),
+    Parameter("piezo.drift", real(_PIEZO.drift, 0.0, 1e-7, "m"), "Drift of the bases over a day."),
     Parameter("membrane.diameter", real(_MEMBRANE.diameter, 1e-3, 1.0, "m"), "Diameter inside the frame."),
     Parameter("membrane.tension", real(_MEMBRANE.tension, 1e-3, 1e5, "N/m"), "Tension of the membrane."),
     Parameter("membrane.gap", real(_MEMBRANE.gap, 1e-6, 1e-2, "m"), "From the electrodes to the flat membrane."),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, PreisachHysteresis, skew_density
-from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+from dm_simulation.mirror.piezo import DRAWN, PiezoActuators, PiezoConfig
+from dm_simulation.mirror.preisach import PreisachOperator, drawn_density
 
 Array = NDArray[np.float64]
 HYSTERETIC = ("prandtl_ishlinskii", "preisach", "bouc_wen", "drawn_preisach", "drawn_bouc_wen")
@@ -139,6 +142,52 @@ def test_unknown_laws_and_impossible_loops_are_refused() -> None:
         Hysteresis("prandtl_ishlinskii", 0.9, 1)
 
 
+DRAWN_LAWS = ("drawn_preisach", "drawn_bouc_wen", "drawn_mixed")
+
+
+@pytest.mark.parametrize("law", DRAWN_LAWS)
+def test_drawn_laws_follow_from_their_seed_and_differ_between_actuators_and_seeds(law: str) -> None:
+    def loop(seed: int) -> Array:
+        hysteresis = Hysteresis(law, 0.1, 5, np.random.default_rng(seed))
+        return np.array([hysteresis.move(np.full(5, u)) for u in (1.0, -1.0, 0.4, -0.3, 0.7)])
+
+    first = loop(1)
+    np.testing.assert_array_equal(loop(1), first)
+    assert np.abs(loop(2) - first).max() > 1e-3
+    assert np.ptp(first[2:], axis=1).min() > 1e-4  # each actuator is another
+
+
+def test_a_drawn_density_is_one_of_relays_and_each_actuator_s_own() -> None:
+    """The definition again: an operator of a drawn density beside a crowd of relays with the same."""
+    density = drawn_density(2, np.random.default_rng(4))
+    operator = PreisachOperator(2, density)
+    radii, centres = 150, 1200
+    r, v = (np.arange(radii) + 0.5) / radii * 1.2, (np.arange(centres) + 0.5) / centres * 4 - 2
+    weight = density(v[None, :], r[:, None]) * (4 / centres) * (1.2 / radii)
+    assert weight.min() >= 0
+    up = np.repeat((v < 0)[None, :], radii, axis=0)
+    start = (weight * up).sum(axis=(1, 2))
+    for u in np.random.default_rng(5).uniform(-1, 1, 60):
+        up = np.where(u >= v + r[:, None], True, np.where(u <= v - r[:, None], False, up))
+        switched = (weight * up).sum(axis=(1, 2)) - start
+        np.testing.assert_allclose(operator.move(np.full(2, u)), switched, atol=3e-3)
+    assert abs(switched[0] / switched[1] - 1) > 0.02
+
+
+def test_what_a_preisach_operator_remembers_stays_bounded_and_a_degauss_wipes_it_out() -> None:
+    """Turning points that are passed go; after a fading swing it answers as at the beginning."""
+    density = drawn_density(3, np.random.default_rng(6))
+    old, new = PreisachOperator(3, density), PreisachOperator(3, density)
+    for u in np.random.default_rng(7).uniform(-1, 1, (500, 3)):
+        old.move(u)
+    for step in range(400, -1, -1):
+        old.move(np.full(3, (-1) ** step * step / 400))
+    begun = old.move(np.zeros(3)) - new.move(np.zeros(3))
+    np.testing.assert_allclose(begun, 0.0, atol=2e-3)
+    for u in (0.3, -0.2, 0.9, -0.9):
+        np.testing.assert_allclose(old.move(np.full(3, u)), new.move(np.full(3, u)), atol=2e-3)
+
+
 def rested(config: PiezoConfig, count: int = 1, signal: float = 0.0) -> PiezoActuators:
     return PiezoActuators(config, np.random.default_rng(7), np.full(count, signal))
 
@@ -203,3 +252,60 @@ def test_a_clock_that_jumps_back_does_not_age_the_mirror() -> None:
     assert actuators.displacement[0] == before
     actuators.advance(6.0)
     assert actuators.displacement[0] > before
+
+
+def full_loops(actuators: PiezoActuators, grid: Array, seconds: float = 0.0) -> tuple[Array, Array]:
+    """Displacements (U, N) on the rising and the falling branch of a cycle, over rising signals."""
+    time, branches = 0.0, []
+    for signals in (grid, grid[::-1], grid, grid[::-1]):
+        branch = []
+        for signal in signals:
+            time += seconds
+            actuators.apply(np.full(len(actuators.signals), signal), time)
+            branch.append(actuators.displacement)
+        branches.append(np.array(branch))
+    return branches[2], branches[3][::-1]
+
+
+def test_spreads_between_actuators_are_the_stated_ones() -> None:
+    config = replace(DRAWN, law="preisach", gain_spread=0.0, hysteresis_spread=0.15, creep_spread=0.1)
+    count = 400
+    rising, falling = full_loops(rested(config, count), np.linspace(-1, 1, 41))
+    opening = np.max(falling - rising, axis=0) / (rising[-1] - rising[0])
+    assert opening.mean() == pytest.approx(0.1, rel=0.05)
+    assert opening.std() / opening.mean() == pytest.approx(0.15, rel=0.15)
+    actuators = rested(replace(config, law="none"), count)
+    actuators.apply(np.ones(count), 0.0)
+    before = actuators.displacement
+    actuators.advance(1e8)
+    crept = actuators.displacement - before
+    assert crept.std() / crept.mean() == pytest.approx(0.1, rel=0.15)
+
+
+def test_loops_widen_with_speed_where_asked() -> None:
+    config = PiezoConfig(gain_spread=0.0, law="preisach", creep=0.0, rate_dependence=0.03)
+    widths = []
+    for seconds in (1.0, 0.1, 0.01):
+        rising, falling = full_loops(rested(config), np.linspace(-1, 1, 41), seconds)
+        widths.append(np.max(falling - rising))
+    growth = np.array(widths[1:]) / widths[:-1] - 1
+    assert np.all((growth > 0.01) & (growth < 0.05))
+
+
+def test_creep_grows_with_position_and_stiffening_takes_stroke() -> None:
+    actuators = rested(replace(LINEAR, creep_position=0.2), 2)
+    actuators.apply(np.array([0.5, -0.5]), 0.0)
+    before = actuators.displacement
+    actuators.advance(1e3)
+    crept = np.abs(actuators.displacement - before)
+    assert crept[0] / crept[1] == pytest.approx(1.1 / 0.9)
+    stiff = rested(replace(LINEAR, creep=0.0, stiffening=0.02))
+    stiff.apply(np.ones(1), 0.0)
+    assert stiff.displacement[0] == pytest.approx(0.98 * 4e-6)
+
+
+def test_a_stuck_actuator_stays_and_the_others_go_on() -> None:
+    actuators = rested(replace(LINEAR, creep=0.0), 2)
+    actuators.stuck[0] = True
+    actuators.apply(np.full(2, 0.5), 0.0)
+    np.testing.assert_allclose(actuators.displacement, [0.0, 2e-6])

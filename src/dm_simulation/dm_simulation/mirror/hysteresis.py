@@ -19,7 +19,7 @@ from dm_simulation.mirror.zernike import Array
 #: Bouc-Wen laws are integrated in steps of at most so much of a signal.
 BOUC_WEN_STEP = 0.02
 #: Points of a sweep and cycles from which the opening of a loop is taken.
-SWEEP_POINTS, SWEEP_CYCLES = 101, 2
+SWEEP_POINTS, SWEEP_CYCLES = 61, 2
 
 
 class HysteresisLaw(ABC):

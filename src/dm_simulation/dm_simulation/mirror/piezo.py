@@ -12,14 +12,8 @@ import numpy as np
 from dm_simulation.mirror.hysteresis import Hysteresis
 from dm_simulation.mirror.zernike import Array
 
-#: Creep: first-order elements with time constants (s), so many per decade. Their sum follows log t to 1 % of the creep
-#: rate in between.
-CREEP_FASTEST_S = 0.1
-CREEP_SLOWEST_S = 1e5
-CREEP_PER_DECADE = 3
-CREEP_TIMES_S = tuple(np.geomspace(CREEP_FASTEST_S, CREEP_SLOWEST_S, 19).tolist())
-#: The same of the part of a loop that lags behind fast moves.
-LAG_TIMES_S = np.geomspace(1e-3, 10.0, 13)
+#: Time constants of the part of a loop that lags behind fast moves, s, and how many of them a decade holds.
+LAG_TIMES_S, LAG_PER_DECADE = np.geomspace(1e-3, 10.0, 13), 3
 #: Periods of the drift of a day, s.
 DRIFT_PERIODS_S = np.array([86400.0, 7 * 3600.0, 3600.0])
 
@@ -35,8 +29,9 @@ class PiezoConfig:
         hysteresis_spread: of the relative openings of the loops.
         creep: growth of a displacement step per decade of time, as a fraction of the step.
         creep_spread: of the relative creep.
-        creep_times: time constants of the elements, s.
-        spectrum_spread: unevenness of creep over them: logarithm of the ratio of neighbouring elements.
+        creep_fastest, creep_slowest, creep_per_decade: creep is that of first-order elements with time constants
+            between both, s, so many per decade. The sum of three follows log t to 1 % of the creep rate in between.
+        spectrum_spread: of the elements, common to all stacks, as a logarithm.
         creep_position: relative change of creep from mid range to signal 1.
         rate_dependence: share by which the loop widens with each decade of speed.
         stiffening: share of half the stroke that is lost at signals -1 and +1, in squares.
@@ -50,12 +45,18 @@ class PiezoConfig:
     hysteresis_spread: float = 0.0
     creep: float = 0.01
     creep_spread: float = 0.0
-    creep_times: tuple[float, ...] = CREEP_TIMES_S
+    creep_fastest: float = 0.1
+    creep_slowest: float = 1e5
+    creep_per_decade: int = 3
     spectrum_spread: float = 0.0
     creep_position: float = 0.0
     rate_dependence: float = 0.0
     stiffening: float = 0.0
     drift: float = 0.0
+
+
+#: Stacks of which each has a law, a loop and a creep of its own.
+DRAWN = PiezoConfig(law="drawn_preisach", hysteresis_spread=0.15, creep_spread=0.1, spectrum_spread=0.2)
 
 
 class PiezoActuators:
@@ -84,10 +85,11 @@ class PiezoActuators:
         self.config = config
         self.gain = spread(config.gain_spread)
         opening = config.hysteresis * spread(config.hysteresis_spread)
-        self._creep_times = np.array(config.creep_times)
-        per_decade = (len(self._creep_times) - 1) / np.log10(self._creep_times[-1] / self._creep_times[0])
+        decades = np.log10(config.creep_slowest / config.creep_fastest)
+        elements = round(decades * config.creep_per_decade) + 1
+        self._creep_times = np.geomspace(config.creep_fastest, config.creep_slowest, elements)
         spectrum = np.exp(config.spectrum_spread * rng.standard_normal(len(self._creep_times)))
-        self._creep = config.creep / per_decade * spectrum * spread(config.creep_spread)[:, None]
+        self._creep = config.creep / config.creep_per_decade * spectrum * spread(config.creep_spread)[:, None]
         self._drift = config.drift * rng.standard_normal((count, len(DRIFT_PERIODS_S))) * (1.0, 0.3, 0.1)
         self._drift_phase = rng.uniform(0, 2 * np.pi, (count, len(DRIFT_PERIODS_S)))
         self._hysteresis = Hysteresis(config.law, opening, count, rng)
@@ -121,7 +123,7 @@ class PiezoActuators:
         config, position = self.config, self._position
         creep = (1 + config.creep_position * position) * np.einsum("nk,nk->n", self._creep, self._crept)
         lag = (position - self.signals)[:, None] - self._lagged
-        moved = position + creep + config.rate_dependence / CREEP_PER_DECADE * lag.sum(axis=1)
+        moved = position + creep + config.rate_dependence / LAG_PER_DECADE * lag.sum(axis=1)
         moved = moved - config.stiffening * moved * np.abs(moved)
         turns = np.sin(2 * np.pi * self._time / DRIFT_PERIODS_S + self._drift_phase)
         return np.asarray(config.stroke / 2 * self.gain * moved + (self._drift * turns).sum(axis=1))

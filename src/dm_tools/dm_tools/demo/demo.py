@@ -22,6 +22,7 @@ class Hysteresis(StrEnum):
     """Hysteresis of the simulated actuators."""
 
     off = "off"
+    drawn_preisach = "drawn_preisach"
     prandtl_ishlinskii = "prandtl_ishlinskii"
     preisach = "preisach"
     bouc_wen = "bouc_wen"
@@ -157,8 +158,12 @@ def rows_for_json(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def demo(
     hysteresis: Annotated[
-        Hysteresis, typer.Option(help="Hysteresis of the simulated actuators; `off` = ideal ones, without creep too.")
-    ] = Hysteresis.prandtl_ishlinskii,
+        Hysteresis,
+        typer.Option(
+            help="Hysteresis of the simulated actuators: each its own, drawn by the seed, or one law for all; `off` = "
+            "ideal ones, without creep too."
+        ),
+    ] = Hysteresis.drawn_preisach,
     creep: Annotated[
         float | None, typer.Option(min=0.0, max=0.2, help="Creep per decade of time; default 0.01.")
     ] = None,

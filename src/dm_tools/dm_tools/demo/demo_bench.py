@@ -12,6 +12,8 @@ from typing import Any
 
 #: A port of the virtual bench that is not offered.
 OFF = -1
+#: Parameters of a bench whose actuators follow one law.
+SAME_ACTUATORS = {f"piezo.{name}_spread": 0.0 for name in ("hysteresis", "creep", "spectrum")}
 
 
 def free_ports(count: int) -> list[int]:
@@ -40,6 +42,7 @@ def bench_config(
     """A configuration of a virtual bench with ports and folders of this run's own, and time `speed` times as fast.
 
     Args:
+        law: of all actuators, `off` = none; where its name begins with `drawn`, loops and creep differ between them.
         source: the parameter file; None = the shipped bench.
 
     Raises:
@@ -63,6 +66,7 @@ def bench_config(
         "seed": seed,
         "piezo.law": "none" if law == "off" else law,
         "piezo.creep": creep,
+        **({} if law.startswith("drawn") else SAME_ACTUATORS),
         "trigger.port": trigger,
         "clock.speed": speed,
         "output_folder": str(folder / "maps"),
