@@ -19,7 +19,7 @@ from dm_simulation.interferometer.interferometer import Interferometer, Interfer
 from dm_simulation.interferometer.trigger_server import TriggerServer
 from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx
 from dm_simulation.mirror.membrane import Membrane, MembraneConfig
-from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
+from dm_simulation.mirror.piezo import DRAWN, PiezoActuators, PiezoConfig
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
 from dm_simulation.mirror.zernike import Array
 
@@ -46,7 +46,7 @@ class BenchConfig:
 
     seed: int = 1
     plate: PlateConfig = field(default_factory=PlateConfig)
-    piezo: PiezoConfig = field(default_factory=PiezoConfig)
+    piezo: PiezoConfig = DRAWN
     membrane: MembraneConfig | None = None
     interferometer: InterferometerConfig = field(default_factory=InterferometerConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
