@@ -26,7 +26,7 @@ from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import Refusal
 from dm_common.measurement import Measurement
-from hysteretic_mirror import MIRROR, RememberingBench
+from hysteretic_mirror import MIRROR, lagging_bench
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = pytest.mark.slow
@@ -68,7 +68,7 @@ def procedure(
 
 
 def test_each_map_is_measured_once_however_often_the_power_fails(tmp_path: Path) -> None:
-    bench = RememberingBench()
+    bench = lagging_bench()
     measured: dict[str, str] = {}
     good = bench.measure
     taken: list[str] = []
@@ -104,7 +104,7 @@ def test_each_map_is_measured_once_however_often_the_power_fails(tmp_path: Path)
 
 def test_what_is_read_back_is_bit_for_bit_what_was_measured(tmp_path: Path) -> None:
     run = opened(tmp_path, POKES)
-    live = procedure(run, POKES, RememberingBench()).run()
+    live = procedure(run, POKES, lagging_bench()).run()
     again = read_run(run.journal.folder).outcome
     assert map_hashes(again.maps()) == map_hashes(live.maps())
     assert np.array_equal(again.centres, live.centres, equal_nan=True)
@@ -119,10 +119,10 @@ def test_shapes_solved_before_and_after_a_power_cut_come_from_the_same_pokes(tmp
     order = [step.label for step in plan.steps]
     run = opened(tmp_path, plan)
     with pytest.raises(PowerCut):
-        procedure(run, plan, RememberingBench(), cut_before(order.index("p57") - 1)).run()
+        procedure(run, plan, lagging_bench(), cut_before(order.index("p57") - 1)).run()
     run.journal.close()
-    resumed = procedure(opened(tmp_path, plan), plan, RememberingBench()).run()
-    whole = Procedure(plan, MIRROR, RememberingBench()).run()
+    resumed = procedure(opened(tmp_path, plan), plan, lagging_bench()).run()
+    whole = Procedure(plan, MIRROR, lagging_bench()).run()
     assert resumed.targets[:2] == run.outcome.targets[:2]
     assert [target.partition(":")[0] for target in resumed.targets] == [t.partition(":")[0] for t in whole.targets]
     assert {record.label for record in whole.records} == {
@@ -134,20 +134,20 @@ def test_shapes_solved_before_and_after_a_power_cut_come_from_the_same_pokes(tmp
 def test_a_torn_last_frame_is_cut_off(tmp_path: Path, torn: int) -> None:
     run = opened(tmp_path, POKES)
     with pytest.raises(PowerCut):
-        procedure(run, POKES, RememberingBench(), cut_before(5)).run()
+        procedure(run, POKES, lagging_bench(), cut_before(5)).run()
     run.journal.close()
     events = run.journal.folder / EVENTS
     events.write_bytes(events.read_bytes()[:-torn])
     again = opened(tmp_path, POKES)
     assert [record.label for record in again.outcome.records] == [r.label for r in run.outcome.records[:4]]
-    outcome = procedure(again, POKES, RememberingBench()).run()
+    outcome = procedure(again, POKES, lagging_bench()).run()
     assert {step.label for step in POKES.steps[1:]} <= {record.label for record in outcome.records}
 
 
 def test_damage_in_the_middle_is_not_taken_for_a_map(tmp_path: Path) -> None:
     run = opened(tmp_path, POKES)
     with pytest.raises(PowerCut):
-        procedure(run, POKES, RememberingBench(), cut_before(9)).run()
+        procedure(run, POKES, lagging_bench(), cut_before(9)).run()
     events = run.journal.folder / EVENTS
     content = bytearray(events.read_bytes())
     content[len(content) // 2] ^= 1
@@ -163,7 +163,7 @@ def test_only_the_same_plan_settings_and_mirror_go_on(tmp_path: Path) -> None:
         run = opened(tmp_path, POKES, settle=1)
         if not run.resumed:
             with pytest.raises(PowerCut):
-                procedure(run, POKES, RememberingBench(), cut_before(3)).run()
+                procedure(run, POKES, lagging_bench(), cut_before(3)).run()
         run.journal.close()
         return run
 
@@ -179,7 +179,7 @@ def test_only_the_same_plan_settings_and_mirror_go_on(tmp_path: Path) -> None:
 
 
 def test_what_failed_last_is_tried_again(tmp_path: Path) -> None:
-    bench = RememberingBench()
+    bench = lagging_bench()
     good = bench.measure
 
     def measure(label: str) -> Measurement:
@@ -215,7 +215,7 @@ def test_a_disk_that_fills_up_costs_one_map(tmp_path: Path, monkeypatch: pytest.
     write = os.pwrite
     monkeypatch.setattr("dm_calibration.procedure.run_journal.os.pwrite", full)
     with pytest.raises(StoreError, match=r"map poke.*could not be kept in .*No space left"):
-        procedure(run, POKES, RememberingBench()).run()
+        procedure(run, POKES, lagging_bench()).run()
     run.journal.close()
     assert len(read_run(run.journal.folder).outcome.records) == len(run.outcome.records) >= 2
 

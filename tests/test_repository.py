@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -183,3 +184,11 @@ def test_exec_of_an_unknown_command_fails_clearly() -> None:
     )
     assert done.returncode == 127
     assert "no-such-command" in done.stderr
+
+
+def test_modules_that_workers_take_test_by_test_share_no_fixture() -> None:
+    """They would make it once for every worker."""
+    settings = runpy.run_path(str(ROOT / "conftest.py"))
+    modules = {path.stem: path for folder in (SOURCE, ROOT / "tests") for path in folder.rglob("test_*.py")}
+    assert {*settings["TEST_BY_TEST"], *settings["LONGEST"]} <= modules.keys()
+    assert [name for name in settings["TEST_BY_TEST"] if "scope=" in modules[name].read_text()] == []

@@ -38,6 +38,8 @@ def mirror(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirro
     """A client of the running suite."""
     folder = tmp_path_factory.mktemp("mirror_19")
     config = bench_config(folder, "off", 0.0, SEED, 20.0, MIRROR_19)
+    config["virtual_bench"]["clock.period"] = 0.005
+    config["calibration"]["write_report"] = False
     config["calibration"]["updates.enable"] = False  # what is judged is this calibration, not what follows from maps
     with (
         own_domain() as domain,

@@ -10,13 +10,14 @@ from dm_calibration.procedure.recorded_run import Move, RecordedRun
 from dm_common.errors import ErrorCode, MeasurementError
 from dm_common.measurement import Bench, Measurement
 from dm_common.mirror import Mirror
-from hysteretic_mirror import MIRROR, Floats, RememberingBench
+from hysteretic_mirror import MIRROR, lagging_bench
+from linear_bench import Floats, LinearBench
 
 
 class RecordingBench:
     """Passes everything on to `bench` and keeps the driver's and the interferometer's side of it."""
 
-    def __init__(self, bench: RememberingBench, failing: frozenset[str] = frozenset()) -> None:
+    def __init__(self, bench: LinearBench, failing: frozenset[str] = frozenset()) -> None:
         self._bench, self._failing = bench, failing
         self.moves: list[Move] = []
         self.maps: list[Measurement] = []
@@ -27,8 +28,7 @@ class RecordingBench:
         self._moved(MIRROR.rest, MIRROR.rest, True)
 
     def apply(self, signals: Floats) -> Floats:
-        # A DAC of 16 bits: what is applied is not what was asked for.
-        applied = self._bench.apply((signals * 2**15).round() / 2**15)
+        applied = self._bench.apply(signals)
         self._moved(signals, applied, False)
         return applied
 
@@ -56,7 +56,7 @@ def recorded(
     kind: PlanKind, options: PlanOptions, maps_per_state: int = 1, failing: frozenset[str] = frozenset()
 ) -> tuple[RecordedRun, Outcome]:
     """What a recording holds of a run, and what the run itself came to."""
-    bench = RecordingBench(RememberingBench(), failing)
+    bench = RecordingBench(lagging_bench(), failing)
     plan = make_plan(kind, MIRROR, options)
     live: Bench = bench
     how = ProcedureOptions(maps_per_state=maps_per_state)

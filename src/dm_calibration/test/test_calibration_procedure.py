@@ -2,69 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
-from dm_common.errors import Cancelled, MeasurementError, Refusal
-from dm_common.measurement import Measurement
+from dm_common.errors import Cancelled, Refusal
 from dm_common.mirror import Mirror
-from linear_mirror import RADIUS, LinearMirror, make_mirror
-
-
-class Bench:
-    """A linear mirror and an interferometer that fails when told to."""
-
-    def __init__(self, mirror: Mirror) -> None:
-        self.plant = LinearMirror(mirror.x, mirror.y)
-        self.signals = mirror.rest
-        self.applied: list[np.ndarray] = []
-        self.degaussed = 0
-        self.clock_ns = 0
-        self.failing: dict[str, int] = {}  # label: measurements that still fail
-        self.changes: dict[str, dict[str, object]] = {}  # label: fields of the measurement to replace
-        self.tries: list[str] = []
-        self.stop_at = ""
-        self.stopped = False
-
-    def degauss(self) -> None:
-        self.degaussed += 1
-
-    def apply(self, signals: np.ndarray) -> np.ndarray:
-        self.signals = np.round(signals * 32768) / 32768  # a 16-bit converter
-        self.applied.append(self.signals)
-        return self.signals
-
-    def settle(self, dwell: float = 0.0) -> bool:
-        self.clock_ns += 10**9
-        return not self.stopped
-
-    def measure(self, label: str) -> Measurement:
-        self.tries.append(label)
-        if label == self.stop_at:
-            self.stopped = True
-        if self.failing.get(label, 0) > 0:
-            self.failing[label] -= 1
-            raise MeasurementError(302, "no map within 5 s")
-        sag = self.plant.sag(self.signals)
-        measured = Measurement(
-            points=self.plant.points,
-            sag=sag,
-            coefficients=self.plant.fit_terms(sag),
-            sigma=np.full(21, 1e-10),
-            stamp_ns=self.clock_ns,
-            residual_rms=2e-9,
-            valid_fraction=0.98,
-            radius=RADIUS,
-            wavelength=632.8e-9,
-            file=f"{label}.dat",
-            sha256="00",
-        )
-        return replace(measured, **self.changes.get(label, {}))  # type: ignore[arg-type]
+from linear_bench import LinearBench
+from linear_mirror import LinearMirror, make_mirror
 
 
 @pytest.fixture
@@ -73,11 +20,11 @@ def mirror() -> Mirror:
 
 
 @pytest.fixture
-def bench(mirror: Mirror) -> Bench:
-    return Bench(mirror)
+def bench(mirror: Mirror) -> LinearBench:
+    return LinearBench(mirror)
 
 
-def run(bench: Bench, mirror: Mirror, kind: PlanKind = PlanKind.POKES, **options: object) -> Procedure:
+def run(bench: LinearBench, mirror: Mirror, kind: PlanKind = PlanKind.POKES, **options: object) -> Procedure:
     plan = make_plan(kind, mirror)
     procedure = Procedure(
         plan,
@@ -90,7 +37,7 @@ def run(bench: Bench, mirror: Mirror, kind: PlanKind = PlanKind.POKES, **options
     return procedure
 
 
-def test_all_steps_are_measured_in_order(bench: Bench, mirror: Mirror) -> None:
+def test_all_steps_are_measured_in_order(bench: LinearBench, mirror: Mirror) -> None:
     outcome = run(bench, mirror).outcome
     plan = make_plan(PlanKind.POKES, mirror)
     assert bench.degaussed == 1
@@ -104,7 +51,7 @@ def test_all_steps_are_measured_in_order(bench: Bench, mirror: Mirror) -> None:
     assert record.stamp_ns == 2 * 10**9
 
 
-def test_a_failed_measurement_is_tried_again(bench: Bench, mirror: Mirror) -> None:
+def test_a_failed_measurement_is_tried_again(bench: LinearBench, mirror: Mirror) -> None:
     bench.failing = {"poke+03": 2}
     outcome = run(bench, mirror, measure_retries=2).outcome
     assert bench.tries.count("poke+03") == 3
@@ -112,14 +59,14 @@ def test_a_failed_measurement_is_tried_again(bench: Bench, mirror: Mirror) -> No
     assert "poke+03" in [record.label for record in outcome.records]
 
 
-def test_a_state_without_a_map_is_dropped_and_reported(bench: Bench, mirror: Mirror) -> None:
+def test_a_state_without_a_map_is_dropped_and_reported(bench: LinearBench, mirror: Mirror) -> None:
     bench.failing = {"poke+03": 9}
     outcome = run(bench, mirror, measure_retries=1).outcome
     assert outcome.dropped == ["poke+03: no map within 5 s (2 tries)"]
     assert len(outcome.records) == len(make_plan(PlanKind.POKES, mirror).steps) - 2
 
 
-def test_several_states_without_a_map_end_the_run(bench: Bench, mirror: Mirror) -> None:
+def test_several_states_without_a_map_end_the_run(bench: LinearBench, mirror: Mirror) -> None:
     bench.failing = {label: 99 for label in ("poke+02", "poke-02", "poke+03")}
     with pytest.raises(Refusal, match="3 states in a row gave no map; the last: no map within 5 s") as caught:
         run(bench, mirror)
@@ -127,7 +74,7 @@ def test_several_states_without_a_map_end_the_run(bench: Bench, mirror: Mirror) 
     assert "poke-03" not in bench.tries
 
 
-def test_failures_that_are_not_in_a_row_do_not_end_it(bench: Bench, mirror: Mirror) -> None:
+def test_failures_that_are_not_in_a_row_do_not_end_it(bench: LinearBench, mirror: Mirror) -> None:
     bench.failing = {label: 99 for label in ("poke+01", "poke-02", "poke+04", "poke-05")}
     assert len(run(bench, mirror).outcome.dropped) == 4
 
@@ -144,7 +91,7 @@ def test_failures_that_are_not_in_a_row_do_not_end_it(bench: Bench, mirror: Mirr
     ],
 )
 def test_maps_that_cannot_be_compared_are_dropped(
-    bench: Bench, mirror: Mirror, change: dict[str, object], words: str
+    bench: LinearBench, mirror: Mirror, change: dict[str, object], words: str
 ) -> None:
     bench.changes = {"poke+02": change}
     outcome = run(bench, mirror).outcome
@@ -153,12 +100,12 @@ def test_maps_that_cannot_be_compared_are_dropped(
     outcome.maps()
 
 
-def test_unknown_radius_is_remembered(bench: Bench, mirror: Mirror) -> None:
+def test_unknown_radius_is_remembered(bench: LinearBench, mirror: Mirror) -> None:
     bench.changes = {"poke+02": {"radius": 0.0}}
     assert not run(bench, mirror).outcome.radius_known
 
 
-def test_several_maps_per_state(bench: Bench, mirror: Mirror) -> None:
+def test_several_maps_per_state(bench: LinearBench, mirror: Mirror) -> None:
     outcome = run(bench, mirror, maps_per_state=3).outcome
     labels = [record.label for record in outcome.records]
     assert labels[:4] == ["reference 1", "reference 1 (2)", "reference 1 (3)", "poke+01"]
@@ -167,14 +114,14 @@ def test_several_maps_per_state(bench: Bench, mirror: Mirror) -> None:
 
 
 @pytest.mark.parametrize("label", ["reference 1", "poke+01", "poke-05", "reference 2"])
-def test_cancel_is_noticed_within_one_step(bench: Bench, mirror: Mirror, label: str) -> None:
+def test_cancel_is_noticed_within_one_step(bench: LinearBench, mirror: Mirror, label: str) -> None:
     bench.stop_at = label
     with pytest.raises(Cancelled):
         run(bench, mirror)
     assert bench.tries[-1] == label
 
 
-def test_a_failing_driver_ends_the_run_and_keeps_the_maps(bench: Bench, mirror: Mirror) -> None:
+def test_a_failing_driver_ends_the_run_and_keeps_the_maps(bench: LinearBench, mirror: Mirror) -> None:
     plan = make_plan(PlanKind.POKES, mirror)
     procedure = Procedure(plan, mirror, bench)
     good = bench.apply
@@ -192,7 +139,7 @@ def test_a_failing_driver_ends_the_run_and_keeps_the_maps(bench: Bench, mirror: 
 
 def test_shapes_are_solved_from_the_pokes_of_the_run() -> None:
     mirror = make_mirror()
-    bench = Bench(mirror)
+    bench = LinearBench(mirror)
     outcome = run(bench, mirror, PlanKind.FULL).outcome
     assert outcome.dropped == []
     sphere = next(record for record in outcome.records if record.label == "p57")
@@ -204,7 +151,7 @@ def test_shapes_are_solved_from_the_pokes_of_the_run() -> None:
     assert np.isfinite(maps.nominal).all(axis=1).sum() == 15
 
 
-def test_shapes_without_a_model_are_dropped_in_words(bench: Bench, mirror: Mirror) -> None:
+def test_shapes_without_a_model_are_dropped_in_words(bench: LinearBench, mirror: Mirror) -> None:
     plan = make_plan(PlanKind.SURFACES, mirror, PlanOptions(surfaces=("p01", "p55")))
     procedure = Procedure(plan, mirror, bench)
     outcome = procedure.run()
@@ -213,7 +160,7 @@ def test_shapes_without_a_model_are_dropped_in_words(bench: Bench, mirror: Mirro
     assert [record.label for record in outcome.records] == ["reference 1", "p01", "reference 2"]
 
 
-def test_progress_counts_the_steps(bench: Bench, mirror: Mirror) -> None:
+def test_progress_counts_the_steps(bench: LinearBench, mirror: Mirror) -> None:
     seen: list[Progress] = []
     plan = make_plan(PlanKind.POKES, mirror)
     Procedure(plan, mirror, bench, progress=seen.append).run()
@@ -223,6 +170,6 @@ def test_progress_counts_the_steps(bench: Bench, mirror: Mirror) -> None:
     assert seen[-1].residual_rms == 2e-9
 
 
-def test_no_maps_at_all(bench: Bench, mirror: Mirror) -> None:
+def test_no_maps_at_all(bench: LinearBench, mirror: Mirror) -> None:
     with pytest.raises(TooFewMapsError, match="no map was measured"):
         Procedure(make_plan(PlanKind.POKES, mirror), mirror, bench).outcome.maps()

@@ -27,8 +27,8 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.recipes import Recipe, RecipeBook
-from hysteretic_mirror import MIRROR, RememberingBench
-from linear_mirror import LinearMirror, make_mirror
+from hysteretic_mirror import MIRROR, lagging_bench
+from linear_mirror import make_mirror
 from recorded_bench import recorded
 
 pytestmark = pytest.mark.slow
@@ -58,24 +58,10 @@ def page(calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> 
     return text
 
 
-class SmallBench(RememberingBench):
-    """A bench with 19 actuators."""
-
-    mirror = make_mirror(rings=2)
-
-    def __init__(self) -> None:
-        self.plant = LinearMirror(self.mirror.x, self.mirror.y, noise=0.5e-9, piston_tilt=1e-7)
-        self.signals, self.clock_ns = self.mirror.rest, 0
-        self.degauss()
-
-    def degauss(self) -> None:
-        self.lag = np.zeros(self.mirror.actuators)
-
-
 def test_a_mirror_of_nineteen_actuators_has_a_report(tmp_path: Path) -> None:
-    mirror = SmallBench.mirror
+    mirror = make_mirror(rings=2)
     plan = make_plan(PlanKind.POKES, mirror, PlanOptions())
-    outcome = Procedure(plan, mirror, SmallBench(), ProcedureOptions()).run()
+    outcome = Procedure(plan, mirror, lagging_bench(mirror), ProcedureOptions()).run()
     small = calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance("small", 10**18))
     written = write_report(small, tmp_path)
     text = written.html.read_text()

@@ -22,7 +22,7 @@ from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError
 from dm_common.errors import ErrorCode, Refusal, error_code
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
-from hysteretic_mirror import MIRROR, RememberingBench
+from hysteretic_mirror import MIRROR, lagging_bench
 from linear_mirror import make_mirror
 
 ACTUATORS = MIRROR.actuators
@@ -30,7 +30,7 @@ ACTUATORS = MIRROR.actuators
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    outcome = Procedure(make_plan(PlanKind.POKES, MIRROR), MIRROR, RememberingBench()).run()
+    outcome = Procedure(make_plan(PlanKind.POKES, MIRROR), MIRROR, lagging_bench()).run()
     return calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("known", 10**18))
 
 

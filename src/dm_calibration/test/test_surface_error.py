@@ -15,7 +15,7 @@ from dm_calibration.regression.stepwise import TooFewSamplesError
 from dm_calibration.regression.surface_samples import surface_errors, surface_weights
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.zernike import basis
-from hysteretic_mirror import RememberingBench, calibrated, calibrated_by_pokes
+from hysteretic_mirror import calibrated, calibrated_by_pokes, lagging_bench
 
 
 def test_response_is_the_rms_of_the_map_against_its_nominal_surface() -> None:
@@ -74,7 +74,7 @@ def test_the_law_of_a_known_hysteresis_is_found() -> None:
 def test_commands_to_come_lie_in_their_intervals() -> None:
     maps, fit = calibrated()
     predictor = fit_predictor(maps, fit)
-    bench = RememberingBench()
+    bench = lagging_bench()
     rng = np.random.default_rng(21)
     smooth = maps.applied[[label.startswith("pz") or label in ("p55", "p56") for label in maps.label]]
     smooth /= np.abs(smooth).max(axis=1, keepdims=True)

@@ -1,0 +1,82 @@
+"""The bench of most tests of the calibration without ROS: driver and interferometer around a linear mirror."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.errors import MeasurementError
+from dm_common.measurement import Measurement
+from dm_common.mirror import Mirror
+from linear_mirror import RADIUS, LinearMirror
+
+Floats = NDArray[np.float64]
+
+
+class LinearBench:
+    """Implements dm_common.measurement.Bench; a map takes no time, the settling before it a second.
+
+    Args:
+        mirror: what the driver tells of it.
+        plant: what it does; by default without noise.
+        backlash: half-width, in signals, within which an actuator stays where it is.
+        share: of the move that lags behind so.
+    """
+
+    def __init__(
+        self, mirror: Mirror, plant: LinearMirror | None = None, backlash: float = 0.0, share: float = 0.0
+    ) -> None:
+        self.plant = plant or LinearMirror(mirror.x, mirror.y)
+        self.backlash, self.share = backlash, share
+        self.rest = self.signals = self.lag = mirror.rest
+        self.applied: list[Floats] = []
+        self.degaussed = 0
+        self.clock_ns = 0
+        self.failing: dict[str, int] = {}  # label: measurements that still fail
+        self.changes: dict[str, dict[str, object]] = {}  # label: fields of the measurement to replace
+        self.tries: list[str] = []
+        self.stop_at = ""
+        self.stopped = False
+
+    def degauss(self) -> None:
+        self.degaussed += 1
+        self.lag = self.rest
+
+    def apply(self, signals: Floats) -> Floats:
+        self.signals = np.round(signals * 32768) / 32768  # a 16-bit converter
+        self.lag = np.clip(self.lag, self.signals - self.backlash, self.signals + self.backlash)
+        self.applied.append(self.signals)
+        return self.signals
+
+    def settle(self, dwell: float = 0.0) -> bool:
+        self.clock_ns += 10**9
+        return not self.stopped
+
+    def sag(self) -> Floats:
+        """(P,) one reading of the mirror as it stands, m."""
+        return self.plant.sag((1.0 - self.share) * self.signals + self.share * self.lag)
+
+    def measure(self, label: str) -> Measurement:
+        self.tries.append(label)
+        if label == self.stop_at:
+            self.stopped = True
+        if self.failing.get(label, 0) > 0:
+            self.failing[label] -= 1
+            raise MeasurementError(302, "no map within 5 s")
+        sag = self.sag()
+        measured = Measurement(
+            points=self.plant.points,
+            sag=sag,
+            coefficients=self.plant.fit_terms(sag),
+            sigma=np.full(21, 1e-10),
+            stamp_ns=self.clock_ns,
+            residual_rms=2e-9,
+            valid_fraction=0.98,
+            radius=RADIUS,
+            wavelength=632.8e-9,
+            file=f"{label}.dat",
+            sha256="00",
+        )
+        return replace(measured, **self.changes.get(label, {}))  # type: ignore[arg-type]
