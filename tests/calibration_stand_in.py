@@ -1,7 +1,8 @@
-"""Driver and interferometer as the calibration node meets them, with a linear mirror behind."""
+"""Driver and interferometer as the nodes above them meet them, with a linear mirror behind."""
 
 from __future__ import annotations
 
+import time
 from array import array
 from collections.abc import Callable
 from typing import Any
@@ -20,13 +21,16 @@ def doubles(values: np.ndarray) -> array[float]:
 
 
 class StandIn:
-    """Driver and interferometer as the calibration node meets them, on the observer's node."""
+    """Driver and interferometer on the observer's node."""
 
     def __init__(self, node: Any, mirror: Mirror, plant: LinearMirror) -> None:
         self.node, self.mirror, self.plant = node, mirror, plant
         self.signals = mirror.rest
         self.degaussed = 0
+        self.degauss_steps: list[int] = []  # as asked for
         self.measured: list[str] = []
+        self.failures = 0  # maps that still fail
+        self.pause = 0.0  # s that a map takes
         self.failing: set[str] = set()
         self.other_wavelength: set[str] = set()
         self.other_aperture: set[str] = set()
@@ -78,7 +82,8 @@ class StandIn:
         response.applied = doubles(self.signals)
         return response
 
-    def on_degauss(self, _request: Any, response: Any) -> Any:
+    def on_degauss(self, request: Any, response: Any) -> Any:
+        self.degauss_steps.append(request.steps)
         self.degaussed += 1
         self.history_known = True
         self.move(self.mirror.rest)
@@ -87,14 +92,17 @@ class StandIn:
         return response
 
     def on_measure(self, request: Any, response: Any) -> Any:
+        time.sleep(self.pause)
+        if self.failures:
+            self.failures -= 1
+            return self.no_map(response)
         self.measured.append(request.label)
         if request.label in self.on_label:
             self.on_label[request.label]()
         if request.label == self.disturbed_at:
             self.move(np.full(self.mirror.actuators, 0.3))
         if request.label in self.failing:
-            response.error_code, response.message = ErrorCode.MAP_TIMEOUT, "no new file within 5 s"
-            return response
+            return self.no_map(response)
         response = self.map(response)
         if request.label in self.other_aperture:
             response.zernike.radius = 10e-3
@@ -102,6 +110,10 @@ class StandIn:
             response.zernike.wavelength = 635e-9
         self.tell_instrument(response)
         response.info.file, response.info.sha256 = f"/maps/{request.label}.dat", "00"
+        return response
+
+    def no_map(self, response: Any) -> Any:
+        response.error_code, response.message = ErrorCode.MAP_TIMEOUT, "no new file within 5 s"
         return response
 
     def tell_instrument(self, response: Any) -> None:

@@ -1,19 +1,15 @@
-"""What the actions `converge` and `build_recipes` work with, for tests: a host, stand-in driver and interferometer."""
+"""What the actions `converge` and `build_recipes` work with: a host, and a mirror that is not as calibrated."""
 
 from __future__ import annotations
 
-import time
-from typing import Any
-
 import numpy as np
-from dm_msgs.msg import ActuatorState, Calibration, FocusRequest, MirrorInfo, ZernikeCoefficients
-from dm_msgs.srv import Degauss, Measure, SetSignals
+from dm_msgs.msg import Calibration, FocusRequest, MirrorInfo
 from rclpy.node import Node
 
+from calibration_stand_in import StandIn
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import doubles
-from dm_common.ros import qos
 from dm_common.ros.parameters import declare
 from dm_controller.focus_actions import LOOP_PARAMETERS, serve_loops
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
@@ -21,60 +17,13 @@ from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 
 X, Y = hexagon()
+#: The mirror answers more weakly than its calibration says.
+GAIN = 0.85
 
 
-class Bench:
+def bench(node: Node) -> StandIn:
     """Driver and interferometer as services on the observer's node."""
-
-    def __init__(self, node: Node) -> None:
-        self.mirror = LinearMirror(X, Y)
-        self.gain = 0.85  # the mirror answers more weakly than its calibration says
-        self.signals = np.zeros(37)
-        self.measured = 0
-        self.failures = 0  # maps that still fail
-        self.pause = 0.0
-        self.driver_state = ActuatorState.STATE_ACTIVE
-        self.degauss_steps: list[int] = []
-        self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
-        self.node = node
-        node.create_service(SetSignals, "set_signals", self._set)
-        node.create_service(Degauss, "degauss", self._degauss)
-        node.create_service(Measure, "measure", self._measure)
-        node.create_timer(0.05, self.publish)
-
-    def publish(self) -> None:
-        signals = doubles(self.signals)
-        self.state.publish(ActuatorState(driver_state=self.driver_state, requested=signals, applied=signals))
-
-    def _set(self, request: Any, response: Any) -> Any:
-        self.signals = np.array(request.signals)
-        response.applied = request.signals
-        self.publish()
-        return response
-
-    def _degauss(self, request: Any, response: Any) -> Any:
-        self.degauss_steps.append(request.steps)
-        self.signals = np.zeros(37)
-        self.publish()
-        return response
-
-    def _measure(self, request: Any, response: Any) -> Any:
-        time.sleep(self.pause)
-        if self.failures:
-            self.failures -= 1
-            response.error_code, response.message = ErrorCode.MAP_TIMEOUT, "no new map"
-            return response
-        self.measured += 1
-        points = self.mirror.points
-        sag = self.mirror.sag(self.gain * self.signals)
-        response.zernike.convention = ZernikeCoefficients.BORN_WOLF
-        response.zernike.coefficients = doubles(self.mirror.fit_terms(sag))
-        response.zernike.radius = RADIUS
-        response.zernike.valid_fraction = 1.0
-        response.samples.x, response.samples.y = doubles(points.x), doubles(points.y)
-        response.samples.weight, response.samples.sag = doubles(points.weight), doubles(sag)
-        response.zernike.header.stamp = self.node.get_clock().now().to_msg()
-        return response
+    return StandIn(node, make_mirror(), LinearMirror(X, Y, gains=np.full(37, GAIN)))
 
 
 def calibration() -> Calibration:

@@ -12,7 +12,9 @@ from action_msgs.msg import GoalStatus
 from dm_msgs.action import Converge
 from dm_msgs.msg import ErrorCode, FocusRequest
 
-from converge_stand_in import Bench, Host
+import converge_stand_in
+from calibration_stand_in import StandIn
+from converge_stand_in import Host
 from dm_common.ros.executor import BackgroundExecutor
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS
@@ -28,8 +30,8 @@ def host(observer: Observer) -> Iterator[Host]:
 
 
 @pytest.fixture
-def bench(observer: Observer) -> Bench:
-    return Bench(observer.node)
+def bench(observer: Observer) -> StandIn:
+    return converge_stand_in.bench(observer.node)
 
 
 def goal(curvature: float = 0.02, **fields: Any) -> Converge.Goal:
@@ -41,7 +43,7 @@ def run(observer: Observer, wanted: Converge.Goal) -> tuple[int, Any]:
     return ended.status, ended.result
 
 
-def test_it_converges_and_tells_its_steps(observer: Observer, host: Host, bench: Bench) -> None:
+def test_it_converges_and_tells_its_steps(observer: Observer, host: Host, bench: StandIn) -> None:
     feedback: list[Any] = []
     handle, future = observer.send_goal(
         Converge, "converge", goal(tolerance=1e-9), lambda message: feedback.append(message.feedback)
@@ -54,39 +56,39 @@ def test_it_converges_and_tells_its_steps(observer: Observer, host: Host, bench:
     assert ended.status == GoalStatus.STATUS_SUCCEEDED, ended.result.message
     result = ended.result
     assert result.error_code == ErrorCode.OK
-    assert result.maps == bench.measured >= 2
+    assert result.maps == len(bench.measured) >= 2
     assert result.max_zernike < 1e-9
     assert result.residual_rms > 0
     np.testing.assert_allclose(result.signals, bench.signals)
-    true = bench.mirror.fit_terms(bench.mirror.sag(0.85 * bench.signals)) - FocusTarget(0.02).coefficients(RADIUS)
+    true = bench.plant.fit_terms(bench.plant.sag(bench.signals)) - FocusTarget(0.02).coefficients(RADIUS)
     assert np.abs(true[3:]).max() == pytest.approx(result.max_zernike, rel=1e-6)
     assert [step.step for step in feedback] == list(range(1, result.maps + 1))
     assert feedback[0].max_zernike > feedback[-1].max_zernike
 
 
-def test_the_map_limit_ends_it_with_the_best_command(observer: Observer, host: Host, bench: Bench) -> None:
+def test_the_map_limit_ends_it_with_the_best_command(observer: Observer, host: Host, bench: StandIn) -> None:
     status, result = run(observer, goal(tolerance=1e-11, max_maps=2, method="pseudo_inverse"))
     assert status == GoalStatus.STATUS_ABORTED
     assert result.error_code == ErrorCode.NOT_CONVERGED
-    assert result.maps == bench.measured == 2
+    assert result.maps == len(bench.measured) == 2
     assert "not within the tolerance" in result.message
     assert len(result.signals) == 37
 
 
-def test_a_failed_map_is_tried_again_then_given_up(observer: Observer, host: Host, bench: Bench) -> None:
+def test_a_failed_map_is_tried_again_then_given_up(observer: Observer, host: Host, bench: StandIn) -> None:
     bench.failures = 1
     assert run(observer, goal())[1].error_code == ErrorCode.OK
     bench.failures = 2
     _, result = run(observer, goal(-0.02))
     assert result.error_code == ErrorCode.MAP_TIMEOUT
-    assert "no new map" in result.message
+    assert "no new file" in result.message
 
 
-def test_cancelling_leaves_the_last_command(observer: Observer, host: Host, bench: Bench) -> None:
+def test_cancelling_leaves_the_last_command(observer: Observer, host: Host, bench: StandIn) -> None:
     bench.pause = 0.5
     handle, future = observer.send_goal(Converge, "converge", goal(tolerance=1e-11, max_maps=50))
     deadline = time.monotonic() + 15
-    while bench.measured < 1 and time.monotonic() < deadline:
+    while not bench.measured and time.monotonic() < deadline:
         time.sleep(0.02)
     handle.cancel_goal_async()
     while not future.done() and time.monotonic() < deadline:
@@ -112,20 +114,20 @@ def test_cancelling_leaves_the_last_command(observer: Observer, host: Host, benc
     ],
 )
 def test_bad_goals_are_refused_and_nothing_moves(
-    observer: Observer, host: Host, bench: Bench, fields: dict[str, Any], code: int, words: str
+    observer: Observer, host: Host, bench: StandIn, fields: dict[str, Any], code: int, words: str
 ) -> None:
     status, result = run(observer, goal(**fields))
     assert status == GoalStatus.STATUS_ABORTED
     assert result.error_code == code
     assert words in result.message
-    assert bench.measured == 0
+    assert not bench.measured
     assert not bench.signals.any()
 
 
-def test_what_the_host_refuses_does_not_start(observer: Observer, host: Host, bench: Bench) -> None:
+def test_what_the_host_refuses_does_not_start(observer: Observer, host: Host, bench: StandIn) -> None:
     host.refuse = True
     _, result = run(observer, goal())
     assert (result.error_code, result.message) == (ErrorCode.STALE, "header.stamp: the request is 9 s old")
     host.refuse, host.calibration = False, None
     assert run(observer, goal())[1].error_code == ErrorCode.NOT_CALIBRATED
-    assert bench.measured == 0
+    assert not bench.measured

@@ -12,7 +12,9 @@ from dm_msgs.action import BuildRecipes
 from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import StoreRecipes
 
-from converge_stand_in import Bench, Host
+import converge_stand_in
+from calibration_stand_in import StandIn
+from converge_stand_in import Host
 from dm_common.messages import recipe_book_from
 from dm_common.ros.executor import BackgroundExecutor
 from dm_controller.planning.target import FocusTarget
@@ -43,8 +45,8 @@ def host(observer: Observer) -> Iterator[Host]:
 
 
 @pytest.fixture
-def bench(observer: Observer) -> Bench:
-    return Bench(observer.node)
+def bench(observer: Observer) -> StandIn:
+    return converge_stand_in.bench(observer.node)
 
 
 @pytest.fixture
@@ -61,7 +63,7 @@ def run(observer: Observer, wanted: BuildRecipes.Goal) -> tuple[int, Any]:
     return ended.status, ended.result
 
 
-def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Bench, store: Store) -> None:
+def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: StandIn, store: Store) -> None:
     feedback: list[Any] = []
     handle, future = observer.send_goal(
         BuildRecipes,
@@ -73,7 +75,7 @@ def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Ben
     wait_until(future.done, 60)
     result = future.result().result
     assert (result.error_code, result.recipes) == (ErrorCode.OK, 2), result.message
-    assert result.maps == bench.measured
+    assert result.maps == len(bench.measured)
     assert [step.step for step in feedback] == list(range(1, result.maps + 1))
     assert [step.curvature for step in feedback] == sorted(step.curvature for step in feedback)
     assert {step.curvature for step in feedback} == {-0.01, 0.02}
@@ -84,8 +86,8 @@ def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Ben
     assert set(bench.degauss_steps) == {100}
     for recipe, curvature in zip(book.recipes, (-0.01, 0.02), strict=True):
         assert (recipe.curvature, recipe.conic_constant) == (curvature, 0.0)
-        sag = bench.mirror.sag(bench.gain * recipe.effective)
-        left = bench.mirror.fit_terms(sag) - FocusTarget(curvature).coefficients(RADIUS)
+        sag = bench.plant.sag(recipe.effective)
+        left = bench.plant.fit_terms(sag) - FocusTarget(curvature).coefficients(RADIUS)
         assert np.abs(left[3:]).max() < 1e-9
     assert result.max_zernike == max(recipe.max_zernike for recipe in book.recipes)
     assert not bench.signals.any()
@@ -93,10 +95,10 @@ def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Ben
 
 
 def test_a_cancel_keeps_whole_recipes_and_rests_the_mirror(
-    observer: Observer, host: Host, bench: Bench, store: Store
+    observer: Observer, host: Host, bench: StandIn, store: Store
 ) -> None:
     handle, future = observer.send_goal(BuildRecipes, "build_recipes", goal(-0.02, 0.0, 0.01, 0.02, 0.03))
-    wait_until(lambda: bench.measured >= 5, 60)
+    wait_until(lambda: len(bench.measured) >= 5, 60)
     bench.pause = 0.3
     handle.cancel_goal_async()
     wait_until(future.done, 60)
@@ -108,9 +110,9 @@ def test_a_cancel_keeps_whole_recipes_and_rests_the_mirror(
     assert not bench.signals.any()
 
 
-def test_a_bench_that_fails_keeps_whole_recipes(observer: Observer, host: Host, bench: Bench, store: Store) -> None:
+def test_a_bench_that_fails_keeps_whole_recipes(observer: Observer, host: Host, bench: StandIn, store: Store) -> None:
     _, future = observer.send_goal(BuildRecipes, "build_recipes", goal(-0.02, 0.0, 0.02))
-    wait_until(lambda: bench.measured >= 4, 60)
+    wait_until(lambda: len(bench.measured) >= 4, 60)
     bench.failures = 1000
     wait_until(future.done, 60)
     result = future.result().result
@@ -119,7 +121,7 @@ def test_a_bench_that_fails_keeps_whole_recipes(observer: Observer, host: Host, 
     assert not bench.signals.any()
 
 
-def test_what_the_store_refuses_is_told(observer: Observer, host: Host, bench: Bench, store: Store) -> None:
+def test_what_the_store_refuses_is_told(observer: Observer, host: Host, bench: StandIn, store: Store) -> None:
     store.answer = (ErrorCode.STORAGE_FAILED, "calibration known was not stored: No space left on device")
     status, result = run(observer, goal(0.01))
     assert status == GoalStatus.STATUS_ABORTED
@@ -128,7 +130,7 @@ def test_what_the_store_refuses_is_told(observer: Observer, host: Host, bench: B
 
 
 def test_recipes_beyond_the_tolerance_are_stored_and_named(
-    observer: Observer, host: Host, bench: Bench, store: Store
+    observer: Observer, host: Host, bench: StandIn, store: Store
 ) -> None:
     _, result = run(observer, goal(0.02, tolerance=1e-14))
     assert (result.error_code, result.recipes) == (ErrorCode.NOT_CONVERGED, 1)
@@ -150,7 +152,7 @@ def test_recipes_beyond_the_tolerance_are_stored_and_named(
     ],
 )
 def test_bad_goals_are_refused_and_nothing_moves(
-    observer: Observer, host: Host, bench: Bench, store: Store, fields: dict[str, Any], code: int, words: str
+    observer: Observer, host: Host, bench: StandIn, store: Store, fields: dict[str, Any], code: int, words: str
 ) -> None:
     status, result = run(observer, BuildRecipes.Goal(**fields))
     assert status == GoalStatus.STATUS_ABORTED
