@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize
+from scipy import ndimage
 
 from dm_common.errors import CodedError, ErrorCode
 
@@ -113,6 +113,8 @@ def _rim(region: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 def _fit_circle(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[Aperture, float]:
     """Robust circle through points, and the scatter of the points about it (median absolute distance, pixels)."""
+    from scipy import optimize  # here: a node whose aperture is configured starts without it
+
     # Algebraic fit (Kasa) as the start, then geometric distances under a loss that flattens first beyond 5 % of the
     # radius, then beyond one pixel.
     centre = np.array([x.mean(), y.mean()])
