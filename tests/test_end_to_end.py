@@ -197,6 +197,7 @@ def test_poke_check_tells_what_is_wired_wrongly(folder: Path) -> None:
     wiring = list(next(parameter for parameter in PARAMETERS if parameter.name == "wiring").default)
     wiring[2], wiring[6] = wiring[6], wiring[2]
     config["virtual_bench"]["wiring"] = wiring
+    config["virtual_bench"]["interferometer.pixels"] = 256  # bumps of actuators are large
     with (
         own_domain() as domain,
         Suite(config, folder / "miswired", domain),
