@@ -8,6 +8,7 @@ import resource
 import sys
 from collections.abc import Callable
 from dataclasses import fields
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from dm_calibration.map_files.datx import parse_datx
 from dm_calibration.map_files.surface_map import MAX_PIXELS, MapFileError
 from dm_calibration.store.hdf5_image import ImageError, parse_image
-from dm_calibration.store.hdf5_sandbox import CPU_BASE_S, CPU_PER_BYTE_S, fetch, receive, send, store
+from dm_calibration.store.hdf5_sandbox import CPU_BASE_S, CPU_PER_BYTE_S, receive, send
 
 #: Address space beyond what the process has at its start and the file itself: the largest map, and a copy in work.
 HYSTERESIS = 3 * 8 * MAX_PIXELS
@@ -62,24 +63,23 @@ _AT_START = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("S
 
 def main() -> int:
     """Serve until standard input ends."""
-    requests, answers, shared = sys.stdin.buffer, sys.stdout.buffer, int(sys.argv[1])
+    requests, answers, shared = sys.stdin.buffer, sys.stdout.buffer, FileIO(int(sys.argv[1]), "r+")
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     while (head := receive(requests)) is not None:
         limit(head["length"])
-        content = bytearray(head["length"])
-        fetch(shared, memoryview(content), 0)
+        shared.seek(0)
+        content = shared.read(head["length"])
         facts: dict[str, Any] = {}
         arrays: dict[str, np.ndarray] = {}
         error = kind = ""
         try:
-            facts, arrays = TASKS[head["task"]](bytes(content))
+            facts, arrays = TASKS[head["task"]](content)
         except (MapFileError, ImageError) as refusal:
             error, kind = str(refusal), type(refusal).__name__
-        arrays = {name: np.asarray(value, order="C") for name, value in arrays.items()}
-        listed = [(name, value.dtype.str, value.shape) for name, value in arrays.items()]
-        answer = {"facts": facts, "arrays": listed, "error": error, "error_kind": kind}
-        store(shared, [value.reshape(-1).view(np.uint8).data for value in arrays.values()])
-        send(answers, answer)
+        shared.seek(0)
+        for value in arrays.values():
+            np.save(shared, value, allow_pickle=False)
+        send(answers, {"facts": facts, "arrays": list(arrays), "error": error, "error_kind": kind})
     return 0
 
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import atexit
 import json
-import math
 import os
 import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from io import FileIO
 from typing import IO, Any
 
 import numpy as np
@@ -31,7 +31,6 @@ WALL_LIMIT_S = 60.0
 
 _LENGTH = struct.Struct("<Q")
 _HEAD_MAX = 1 << 26
-_ARRAY_MAX = 1 << 31
 #: Memory that the shared file may keep between two files, so that it need not be claimed anew [bytes].
 _KEPT = 1 << 24
 
@@ -73,36 +72,13 @@ def receive(stream: IO[bytes]) -> dict[str, Any] | None:
     return dict(json.loads(text)) if len(text) == length else None
 
 
-def store(descriptor: int, parts: Sequence[bytes | memoryview]) -> None:
-    """Put `parts` into the shared file, one after another from its beginning. A pipe would take longer."""
-    at = 0
-    for part in parts:
-        view = memoryview(part)
-        while view:
-            count = os.pwrite(descriptor, view, at)
-            view, at = view[count:], at + count
-
-
-def fetch(descriptor: int, view: memoryview, at: int) -> None:
-    """Fill `view` with what the shared file holds from byte `at` on.
-
-    Raises:
-        ValueError: it holds less.
-    """
-    while view:
-        count = os.preadv(descriptor, [view], at)
-        if count == 0:
-            raise ValueError("the shared file is shorter than announced")
-        view, at = view[count:], at + count
-
-
 class Hdf5Sandbox:
     """One helper process, started when it is first needed; several threads take turns."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._shared = -1  # a file in memory through which contents go
+        self._shared: FileIO | None = None  # in memory: contents go through it, for which a pipe would take longer
         atexit.register(self.close)
 
     def read(self, task: str, content: bytes) -> Answer:
@@ -112,24 +88,27 @@ class Hdf5Sandbox:
             SandboxError: the helper died of it, took too long, or could not be started.
         """
         with self._turn:
-            process = self._running()
+            process, shared = self._running()
             assert process.stdin is not None and process.stdout is not None
             # Killing the helper ends every read and write below.
             watchdog = threading.Timer(WALL_LIMIT_S, process.kill)
             watchdog.daemon = True
             watchdog.start()
             try:
-                store(self._shared, [content])
+                shared.seek(0)
+                shared.write(content)
                 send(process.stdin, {"task": task, "length": len(content)})
                 head = receive(process.stdout)
                 if head is not None:
-                    return self._answer(head)
-            except (OSError, ValueError, MemoryError):
+                    shared.seek(0)
+                    arrays = {name: np.load(shared, allow_pickle=False) for name in head.pop("arrays")}
+                    return Answer(arrays=arrays, **head)
+            except (OSError, ValueError, MemoryError, EOFError):
                 pass  # told below, from how the helper ended
             finally:
                 watchdog.cancel()
-                if self._shared >= 0 and os.fstat(self._shared).st_size > _KEPT:
-                    os.ftruncate(self._shared, 0)
+                if os.fstat(shared.fileno()).st_size > _KEPT:
+                    shared.truncate(0)
             raise SandboxError(self._end(process))
 
     def close(self) -> None:
@@ -138,17 +117,18 @@ class Hdf5Sandbox:
             if self._process is not None:
                 self._end(self._process)
 
-    def _running(self) -> subprocess.Popen[bytes]:
-        if self._process is None or self._process.poll() is not None:
+    def _running(self) -> tuple[subprocess.Popen[bytes], FileIO]:
+        if self._process is None or self._process.poll() is not None or self._shared is None:
             if self._process is not None:
                 self._end(self._process)
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry)}
             try:
-                self._shared = os.memfd_create("hdf5")
+                self._shared = FileIO(os.memfd_create("hdf5"), "r+")
+                descriptor = self._shared.fileno()
                 # A session of its own: Ctrl-C on the terminal is for the node, which ends the helper with itself.
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "dm_calibration.map_files.hdf5_process", str(self._shared)],
-                    pass_fds=[self._shared],
+                    [sys.executable, "-m", "dm_calibration.map_files.hdf5_process", str(descriptor)],
+                    pass_fds=[descriptor],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL,
@@ -156,36 +136,16 @@ class Hdf5Sandbox:
                     start_new_session=True,
                 )
             except OSError as error:
-                self._forget_shared()
                 raise SandboxError(f"the process that reads HDF5 files cannot be started: {error}") from error
-        return self._process
-
-    def _answer(self, head: dict[str, Any]) -> Answer:
-        arrays, at = {}, 0
-        for name, kind, shape in head["arrays"]:
-            if math.prod(shape) * np.dtype(kind).itemsize > _ARRAY_MAX:
-                raise ValueError(f"{name}: {shape}")
-            array = np.empty(shape, np.dtype(kind))
-            fetch(self._shared, array.reshape(-1).view(np.uint8).data, at)
-            at += array.nbytes
-            arrays[name] = array
-        return Answer(head["facts"], arrays, head["error"], head["error_kind"])
-
-    def _forget_shared(self) -> None:
-        descriptor, self._shared = self._shared, -1
-        if descriptor >= 0:
-            os.close(descriptor)
+        return self._process, self._shared
 
     def _end(self, process: subprocess.Popen[bytes]) -> str:
         """End the helper; returns how it ended."""
         self._process = None
-        self._forget_shared()
-        for stream in (process.stdin, process.stdout):
+        for stream in (process.stdin, process.stdout, self._shared):
             if stream is not None:
-                try:
+                with suppress(OSError):
                     stream.close()
-                except OSError:
-                    pass
         try:
             status = process.wait(1.0)
         except subprocess.TimeoutExpired:
