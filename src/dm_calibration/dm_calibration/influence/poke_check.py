@@ -235,33 +235,23 @@ def layout_symmetries(x: Floats, y: Floats) -> list[tuple[str, NDArray[np.int64]
 
     Layouts without hexagonal symmetry simply have fewer of them.
     """
-    centred = np.stack((x - x.mean(), y - y.mean()))
-    step = pitch(x, y)
+    place = x - x.mean() + 1j * (y - y.mean())
+    turned = "start of the numbering in the rings, or the mirror or the map is turned"
+    mirrored = "sense of the numbering in the rings, or a mirrored map"
+    # Mirror axes of a hexagon lie every 30 degrees, its turns every 60.
+    images = [
+        (f"turned by {angle} degrees counter-clockwise: {turned}", place * np.exp(1j * np.radians(angle)))
+        for angle in range(60, 360, 60)
+    ] + [
+        (f"mirrored about the axis at {angle} degrees: {mirrored}", place.conj() * np.exp(2j * np.radians(angle)))
+        for angle in range(0, 180, 30)
+    ]
     found = []
-    for mirrored in (False, True):
-        # Mirror axes of a hexagon lie every 30 degrees, its turns every 60.
-        for k in range(12 if mirrored else 6):
-            angle = np.radians(30.0 * k if mirrored else 60.0 * k)
-            cos, sin = np.cos(angle), np.sin(angle)
-            if mirrored:
-                angle_2 = 2.0 * angle
-                matrix = np.array([[np.cos(angle_2), np.sin(angle_2)], [np.sin(angle_2), -np.cos(angle_2)]])
-                text = (
-                    f"the whole pattern is mirrored about the axis at {30 * k} degrees: "
-                    "sense of the numbering in the rings, or a mirrored map"
-                )
-            else:
-                matrix = np.array([[cos, -sin], [sin, cos]])
-                text = (
-                    f"the whole pattern is turned by {60 * k} degrees counter-clockwise: "
-                    "start of the numbering in the rings, or the mirror or the map is turned"
-                )
-            if (k == 0 and not mirrored) or (mirrored and k >= 6):
-                continue
-            distance = cdist((matrix @ centred).T, centred.T)
-            permutation = distance.argmin(axis=1)
-            if distance.min(axis=1).max() < 0.1 * step and np.unique(permutation).size == x.size:
-                found.append((text, permutation))
+    for text, image in images:
+        distance = np.abs(image[:, np.newaxis] - place)
+        permutation = distance.argmin(axis=1)
+        if distance.min(axis=1).max() < 0.1 * pitch(x, y) and np.unique(permutation).size == x.size:
+            found.append((f"the whole pattern is {text}", permutation))
     return found
 
 

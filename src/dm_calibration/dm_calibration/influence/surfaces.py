@@ -136,14 +136,10 @@ def solve_shape(target: Floats, model: LinearModel, mirror: Mirror) -> tuple[Flo
     Returns:
         Signals (N,) and the rms sag that is left, m.
     """
-    root = np.sqrt(model.points.weight)[:, None]
+    matrix, damping = _damped(model)
     wanted = remove_piston_tilt((target - model.sag_offset)[None, :], model.points)[0]
-    matrix = root * remove_piston_tilt(model.influence_sag.T, model.points).T
-    damping = DAMPING * np.linalg.norm(matrix, 2)
-    programme = BoundedProgramme(
-        np.vstack((matrix, damping * np.eye(mirror.actuators))), Limits(mirror.limits.low, mirror.limits.high)
-    )
-    signals = programme.solve(np.concatenate((root[:, 0] * wanted, damping * mirror.rest)))
+    programme = BoundedProgramme(matrix, Limits(mirror.limits.low, mirror.limits.high))
+    signals = programme.solve(np.concatenate((np.sqrt(model.points.weight) * wanted, damping * mirror.rest)))
     left = wanted - remove_piston_tilt((model.influence_sag @ signals)[None, :], model.points)[0]
     return signals, float(rms(left, model.points.weight))
 
@@ -199,14 +195,17 @@ def model_surface(name: str, model: LinearModel, mirror: Mirror) -> Surface:
     return Surface(name, signals, nominal, remark, described)
 
 
+def _damped(model: LinearModel) -> tuple[Floats, float]:
+    """(P + N, N) the influence function in sag, weighted by area, over the weight of small signals; and that weight."""
+    matrix = np.sqrt(model.points.weight)[:, None] * remove_piston_tilt(model.influence_sag.T, model.points).T
+    damping = DAMPING * float(np.linalg.norm(matrix, 2))
+    return np.vstack((matrix, damping * np.eye(matrix.shape[1]))), damping
+
+
 def _unbounded(target: Floats, model: LinearModel) -> Floats:
-    root = np.sqrt(model.points.weight)[:, None]
-    matrix = root * remove_piston_tilt(model.influence_sag.T, model.points).T
-    damping = DAMPING * np.linalg.norm(matrix, 2)
-    stacked = np.vstack((matrix, damping * np.eye(matrix.shape[1])))
-    wanted = remove_piston_tilt(target[None, :], model.points)[0]
-    right = np.concatenate((root[:, 0] * wanted, np.zeros(matrix.shape[1])))
-    return np.asarray(np.linalg.lstsq(stacked, right)[0])
+    matrix, _ = _damped(model)
+    wanted = np.sqrt(model.points.weight) * remove_piston_tilt(target[None, :], model.points)[0]
+    return np.asarray(np.linalg.lstsq(matrix, np.concatenate((wanted, np.zeros(matrix.shape[1]))))[0])
 
 
 def _tilt_surface(name: str, unit: Floats, model: LinearModel, mirror: Mirror) -> Surface:

@@ -83,16 +83,9 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     check_storage(surface, len(content))
     extra = _extra_attributes(file, metadata)
 
-    wavelength = _number(surface, "Wavelength")
-    if wavelength is None:
-        wavelength = _extra_number(extra, "Wavelength")
-    if wavelength is None:
-        raise _missing(surface, "Wavelength")
-    check_wavelength(wavelength)
+    wavelength = check_wavelength(_required(surface, "Wavelength", _extra_number(extra, "Wavelength")))
     scale = _metres_per_unit(surface, extra, wavelength)
-    no_data = _number(surface, "No Data")
-    if no_data is None:
-        raise _missing(surface, "No Data")
+    no_data = _required(surface, "No Data")
     if not (math.isnan(no_data) or no_data >= _NO_DATA_LEAST):
         raise MapFileError(f"{surface.name}: No Data = {no_data:g}: must be NaN or at least {_NO_DATA_LEAST:g}")
     check_place(surface, content, no_data)
@@ -128,6 +121,14 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
 
 def _missing(where: Any, name: str) -> MapFileError:
     return MapFileError(f"{where.name}: the attribute '{name}' is missing")
+
+
+def _required(surface: h5py.Dataset, name: str, *otherwise: float | None) -> float:
+    """The number in the attribute `name`, or the first that is known of `otherwise`."""
+    for value in (_number(surface, name), *otherwise):
+        if value is not None:
+            return value
+    raise _missing(surface, name)
 
 
 def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
@@ -218,14 +219,8 @@ def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
     if unit.lower() != "fringes":
         remark = "; the data are no height map" if unit.lower() == "nounits" else ""
         raise MapFileError(f"{surface.name}: Unit = '{unit}': must be Fringes or a length such as NanoMeters{remark}")
-    scale_factor = _number(surface, "Interferometric Scale Factor")
-    if scale_factor is None:
-        raise _missing(surface, "Interferometric Scale Factor")
-    obliquity = _number(surface, "Obliquity Factor")
-    if obliquity is None:
-        obliquity = _extra_number(extra, "Obliquity")
-    if obliquity is None:
-        obliquity = 1.0
+    scale_factor = _required(surface, "Interferometric Scale Factor")
+    obliquity = _required(surface, "Obliquity Factor", _extra_number(extra, "Obliquity"), 1.0)
     return (
         check_factor("Interferometric Scale Factor", scale_factor)
         * check_factor("Obliquity Factor", obliquity)
@@ -236,11 +231,7 @@ def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: f
 def _converter_pitch(surface: h5py.Dataset, name: str) -> float | None:
     """Parameters[1] of a converter, m per pixel."""
     parameters = _converter(surface, name)
-    if parameters is None:
-        return None
-    if len(parameters) < 2:
-        raise MapFileError(f"{surface.name}: attribute '{name}': must hold category, unit and parameters")
-    return check_pitch(parameters[1])
+    return None if parameters is None else check_pitch(parameters[1])
 
 
 def _pitch(surface: h5py.Dataset, extra: dict[str, Any]) -> float | None:
@@ -288,6 +279,7 @@ def _converter(surface: h5py.Dataset, name: str) -> list[float] | None:
     if name not in surface.attrs:
         return None
     try:
-        return [float(value) for value in np.asarray(surface.attrs[name]).ravel()[0][2]]
+        first, second, *others = (float(value) for value in np.asarray(surface.attrs[name]).ravel()[0][2])
     except (IndexError, TypeError, ValueError):
         raise MapFileError(f"{surface.name}: attribute '{name}': must hold category, unit and parameters") from None
+    return [first, second, *others]

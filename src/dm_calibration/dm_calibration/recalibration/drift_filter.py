@@ -150,7 +150,7 @@ class DriftFilter:
         elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns)) / DAY_S
         prior = drift.covariance + elapsed * self._growth
         design = np.hstack((self._gain * effective, np.eye(self.reduction.size)))
-        changed = changed_fit(self._fit, self.reduction, drift)
+        changed = self.changed(drift)
         predicted_sag = changed.sag_offset + changed.influence_sag @ effective
         predicted = changed.zernike_offset + changed.influence_zernike @ effective
         filled = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0]
@@ -167,10 +167,7 @@ class DriftFilter:
         left = np.eye(len(prior)) - kalman @ design
         noise = expected - design @ shared
         covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
-        departure, weight = (
-            remove_piston_tilt((filled - predicted_sag)[None], self._fit.points)[0],
-            self._fit.points.weight,
-        )
+        departure = remove_piston_tilt((filled - predicted_sag)[None], self._fit.points)[0]
         updated = Drift(
             drift.gain + correction[:actuators],
             drift.offset + correction[actuators:],
@@ -179,14 +176,22 @@ class DriftFilter:
         )
         return Comparison(
             max_zernike=float(np.abs(coefficients - predicted)[PISTON_TILT:].max()),
-            rms=float(rms(departure, weight)),
+            rms=float(rms(departure, self._fit.points.weight)),
             surprise=_surprise(innovation, expected, factor),
             updated=updated,
         )
 
     def changed(self, drift: Drift) -> InfluenceFit:
-        """The influence function as it is now."""
-        return changed_fit(self._fit, self.reduction, drift)
+        """The influence function with gains and figure as `drift` has found them."""
+        fit = self._fit
+        coefficients, sag = self.reduction.expand(drift.offset)
+        return replace(
+            fit,
+            influence_zernike=fit.influence_zernike * (1.0 + drift.gain),
+            influence_sag=fit.influence_sag * (1.0 + drift.gain),
+            zernike_offset=fit.zernike_offset + coefficients,
+            sag_offset=fit.sag_offset + sag,
+        )
 
     def _scatter(self, maps: MapSet) -> Floats:
         """(R,) variance of the calibration's maps about the fit, m^2."""
@@ -211,18 +216,6 @@ class DriftFilter:
         growth[:actuators, :actuators] = 0.5 * rates.gain**2 * (np.eye(actuators) + 1.0)
         growth[actuators:, actuators:] = rates.figure**2 / values * np.eye(values)
         return growth
-
-
-def changed_fit(fit: InfluenceFit, reduction: Reduction, drift: Drift) -> InfluenceFit:
-    """`fit` with gains and figure as `drift` has found them."""
-    coefficients, sag = reduction.expand(drift.offset)
-    return replace(
-        fit,
-        influence_zernike=fit.influence_zernike * (1.0 + drift.gain),
-        influence_sag=fit.influence_sag * (1.0 + drift.gain),
-        zernike_offset=fit.zernike_offset + coefficients,
-        sag_offset=fit.sag_offset + sag,
-    )
 
 
 def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool]) -> float:
