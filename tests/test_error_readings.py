@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 from dm_calibration.influence.fit import fit_influence
-from dm_calibration.regression.stepwise import SelectionOptions, TooFewSamplesError
+from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import MODEL
 from dm_common.names import UnknownNameError
 from hysteretic_mirror import calibrated, calibrated_by_pokes
@@ -90,9 +91,9 @@ def test_bad_input_is_refused_in_words() -> None:
         regress_surface_errors(maps, fit, test_set=("p60",))
     with pytest.raises(UnknownNameError, match="test surface 'pz01'"):
         regress_surface_errors(maps, fit, test_set=("pz01",))
-    with pytest.raises(TooFewSamplesError, match="calibrate with the plan FULL"):
+    with pytest.raises(TooFewMapsError, match="calibrate with the plan FULL"):
         regress_surface_errors(*calibrated_by_pokes())
     few = np.array([not (label.startswith("p") and label[1:].isdigit() and int(label[1:]) > 9) for label in maps.label])
     kept = maps.select(few)
-    with pytest.raises(TooFewSamplesError, match=r"7 samples: .* measure more surfaces"):
+    with pytest.raises(TooFewMapsError, match=r"7 samples: .* measure more surfaces"):
         regress_surface_errors(kept, fit_influence(kept), Reading.LINEAR)

@@ -147,7 +147,7 @@ def regress_surface_errors(
 
     Raises:
         UnknownNameError: a name that is not one of p01-p58.
-        CollinearError, TooFewSamplesError: see :mod:`~dm_calibration.regression.stepwise`.
+        TooFewMapsError: see :mod:`~dm_calibration.regression.stepwise`.
         ValueError: constant errors, or a surface without data in some region.
     """
     for name in test_set:

@@ -11,16 +11,11 @@ from typing import Any
 
 import pytest
 
-from dm_calibration.acquisition.acquisition import (
-    Acquisition,
-    AcquisitionSettings,
-    AcquisitionStoppedError,
-    MapTimeoutError,
-    NothingToAcquireError,
-)
+from dm_calibration.acquisition.acquisition import Acquisition, AcquisitionSettings
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.trigger import TriggerError, run_trigger
 from dm_calibration.map_files import MapFileError
+from dm_common.errors import ErrorCode, Refusal, error_code
 from map_fixtures import dat_bytes, disc_counts
 
 MAP = dat_bytes(disc_counts(40))
@@ -128,7 +123,7 @@ def test_hanging_command_is_ended_with_its_children(tmp_path: Path) -> None:
 
 
 def test_command_that_writes_nothing(tmp_path: Path, bench: Any) -> None:
-    with pytest.raises(MapTimeoutError, match="did not appear in time"):
+    with pytest.raises(Refusal, match="did not appear in time"):
         bench(tmp_path, python("", "{path}")).acquisition.acquire(1.0)
 
 
@@ -165,13 +160,13 @@ def test_without_a_command_the_next_new_file_is_the_measurement(tmp_path: Path, 
 
 
 def test_no_new_file_in_time(tmp_path: Path, bench: Any) -> None:
-    with pytest.raises(MapTimeoutError, match="no new map file"):
+    with pytest.raises(Refusal, match="no new map file"):
         bench(tmp_path).acquisition.acquire(0.2)
 
 
 def test_folder_that_does_not_exist_is_reported_once_and_waited_for(tmp_path: Path, bench: Any) -> None:
     one = bench(tmp_path / "later")
-    with pytest.raises(MapTimeoutError, match="cannot be read: No such file"):
+    with pytest.raises(Refusal, match="cannot be read: No such file"):
         one.acquisition.acquire(0.3)
     assert len(one.troubles) == 1
     (tmp_path / "later").mkdir()
@@ -195,11 +190,11 @@ def test_stopping_ends_a_measurement(tmp_path: Path, bench: Any) -> None:
     time.sleep(0.2)
     one.acquisition.stop()
     thread.join(20)
-    assert [type(error) for error in errors] == [AcquisitionStoppedError]
+    assert [error_code(error) for error in errors] == [ErrorCode.INTERFEROMETER_INACTIVE]
 
 
 def test_settings_that_contradict_each_other(bench: Any) -> None:
     with pytest.raises(ValueError, match="trigger_command needs watch_folder"):
         bench(None, ["trigger"])
-    with pytest.raises(NothingToAcquireError, match="neither"):
+    with pytest.raises(Refusal, match="neither"):
         bench(None).acquisition.acquire(1)

@@ -9,9 +9,9 @@ import pytest
 
 from dm_calibration.hysteresis.features import play_features
 from dm_calibration.influence.fit import fit_influence
+from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.regression.predictor import fit_predictor
 from dm_calibration.regression.sag_history import RunHistory
-from dm_calibration.regression.stepwise import TooFewSamplesError
 from dm_calibration.regression.surface_samples import surface_errors, surface_weights
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.zernike import basis
@@ -43,12 +43,12 @@ def test_weights_of_surfaces_follow_eq_8() -> None:
 
 
 def test_what_cannot_be_regressed_is_refused() -> None:
-    with pytest.raises(TooFewSamplesError, match="calibrate with the plan FULL"):
+    with pytest.raises(TooFewMapsError, match="calibrate with the plan FULL"):
         fit_predictor(*calibrated_by_pokes())
     maps, _ = calibrated()
     few = np.array([not (label.startswith("p") and label[1:].isdigit() and int(label[1:]) > 9) for label in maps.label])
     kept = maps.select(few)
-    with pytest.raises(TooFewSamplesError, match=r"9 samples: .* measure more surfaces"):
+    with pytest.raises(TooFewMapsError, match=r"9 samples: .* measure more surfaces"):
         fit_predictor(kept, fit_influence(kept))
 
 

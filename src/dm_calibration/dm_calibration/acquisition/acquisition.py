@@ -15,28 +15,10 @@ from dm_calibration.acquisition.folder_watch import FileEvent, FolderWatch
 from dm_calibration.acquisition.inotify import ClosedFiles
 from dm_calibration.acquisition.trigger import PLACEHOLDER, TriggerError, run_trigger
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, SurfaceMap
-from dm_common.errors import CodedError, ErrorCode
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
 
 _POLL_OUTPUT_S = 0.01
-
-
-class MapTimeoutError(CodedError):
-    """No new map arrived in time."""
-
-    error_code = ErrorCode.MAP_TIMEOUT
-
-
-class AcquisitionStoppedError(CodedError):
-    """The node was deactivated during a measurement."""
-
-    error_code = ErrorCode.INTERFEROMETER_INACTIVE
-
-
-class NothingToAcquireError(CodedError):
-    """Neither a trigger command nor a watched folder is configured."""
-
-    error_code = ErrorCode.NOT_SUPPORTED
 
 
 @dataclass(frozen=True)
@@ -150,14 +132,15 @@ class Acquisition:
 
         Raises:
             TriggerError: the trigger command failed.
-            MapTimeoutError: no new map in time.
-            AcquisitionStoppedError: :meth:`stop` was called meanwhile.
             MapFileError and what else `read` raises: the file that arrived is no good.
-            NothingToAcquireError: neither a trigger command nor a folder is configured.
+            Refusal: MAP_TIMEOUT when no new map came in time, INTERFEROMETER_INACTIVE when :meth:`stop` was called
+                meanwhile, NOT_SUPPORTED when neither a trigger command nor a folder is configured.
         """
         watch = self._watch
         if watch is None:
-            raise NothingToAcquireError("neither trigger_command nor watch_folder is configured: use ingest_file")
+            raise Refusal(
+                ErrorCode.NOT_SUPPORTED, "neither trigger_command nor watch_folder is configured: use ingest_file"
+            )
         deadline = time.monotonic() + timeout_s
         if not self.settings.trigger_command:
             return Acquired(*self._next_file(watch, deadline, None))
@@ -186,12 +169,14 @@ class Acquisition:
 
     def _check_stopped(self) -> None:
         if self._stop.is_set():
-            raise AcquisitionStoppedError("the interferometer was deactivated during the measurement")
+            raise Refusal(
+                ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer was deactivated during the measurement"
+            )
 
     def _new_name(self, watch: FolderWatch) -> Path:
         """A file name not used before, kept out of the watch: the measurement that asks for it takes it, or nobody."""
         if not watch.folder.is_dir():
-            raise MapTimeoutError(f"watch_folder = {str(watch.folder)!r}: no such folder")
+            raise Refusal(ErrorCode.MAP_TIMEOUT, f"watch_folder = {str(watch.folder)!r}: no such folder")
         output = watch.folder / f"measure_{time.time_ns()}_{next(self._numbers)}{self.settings.trigger_suffix}"
         watch.ignore(output)
         return output
@@ -219,7 +204,9 @@ class Acquisition:
                 elif trouble is not None and now - since >= self.settings.stable_time:
                     raise trouble
             if now >= deadline:
-                raise trouble or MapTimeoutError(f"the trigger command ended, but {path} did not appear in time")
+                raise trouble or Refusal(
+                    ErrorCode.MAP_TIMEOUT, f"the trigger command ended, but {path} did not appear in time"
+                )
             time.sleep(_POLL_OUTPUT_S)
 
     def _next_file(
@@ -240,7 +227,7 @@ class Acquisition:
                 except queue.Empty:
                     if remaining <= 0:
                         reason = self.folder_trouble or f"no new map file in {watch.folder} in time"
-                        raise MapTimeoutError(reason) from None
+                        raise Refusal(ErrorCode.MAP_TIMEOUT, reason) from None
         finally:
             with self._handover:
                 self._waiting = None

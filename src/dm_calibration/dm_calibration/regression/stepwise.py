@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
-from dm_common.errors import ErrorCode
+from dm_calibration.influence.regression import TooFewMapsError
 
 Floats = NDArray[np.float64]
 
@@ -35,18 +35,6 @@ P_REMOVE = 0.10
 FREEDOM_MIN = 10
 
 
-class CollinearError(ValueError):
-    """Candidates that cannot be told apart, or from the constant; the message names them."""
-
-    error_code = ErrorCode.TOO_FEW_MAPS
-
-
-class TooFewSamplesError(ValueError):
-    """Fewer samples than a regression needs."""
-
-    error_code = ErrorCode.TOO_FEW_MAPS
-
-
 @dataclass(frozen=True)
 class SelectionOptions:
     """Thresholds of the selection.
@@ -54,12 +42,10 @@ class SelectionOptions:
     Attributes:
         p_enter: largest p value of a candidate that enters; above 0, below 1.
         p_remove: p value above which a variable leaves again; at least p_enter, below 1.
-        freedom_min: degrees of freedom to leave for the residual; at least 1.
     """
 
     p_enter: float = P_ENTER
     p_remove: float = P_REMOVE
-    freedom_min: int = FREEDOM_MIN
 
     def __post_init__(self) -> None:
         if not 0.0 < self.p_enter < 1.0:
@@ -69,8 +55,6 @@ class SelectionOptions:
                 f"p_remove = {self.p_remove:g}: must be at least p_enter = {self.p_enter:g} and below 1, or a variable "
                 f"could enter and leave for ever; {P_REMOVE:g} is usual"
             )
-        if self.freedom_min < 1:
-            raise ValueError(f"freedom_min = {self.freedom_min}: must be at least 1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +134,15 @@ def stepwise(
         weights: (n,) above 0, proportional to the inverse variance of each sample (WLS); None = OLS.
 
     Raises:
-        CollinearError: a constant candidate, two that are proportional up to a constant, or, with more samples than
+        TooFewMapsError: a constant candidate, two that are proportional up to a constant, or, with more samples than
             candidates, any that the others determine. (With fewer samples every set of candidates is dependent; the
-            selection then leaves out what the selected ones determine.)
-        TooFewSamplesError: no freedom left for one variable.
+            selection then leaves out what the selected ones determine.) Or no freedom left for one variable.
         ValueError: a constant response.
     """
     import statsmodels.api as sm  # here: with pandas and all that comes with it, it takes a third of a node's start
 
     options = options or SelectionOptions()
-    x, y, w = _samples(candidates, response, weights, options.freedom_min, 0)
+    x, y, w = _samples(candidates, response, weights, 0)
     _check_collinear(x, names)
     columns = _select(x, y, w, options)
     design = np.column_stack((np.ones(len(y)), x[:, columns]))
@@ -176,10 +159,10 @@ def leave_one_out(
     """(n,) response of each sample predicted by a model selected and fitted without it. Arguments and errors as above.
 
     Raises:
-        TooFewSamplesError: as :func:`stepwise`, for one sample fewer.
+        TooFewMapsError: as :func:`stepwise`, for one sample fewer.
     """
     options = options or SelectionOptions()
-    x, y, w = _samples(candidates, response, weights, options.freedom_min, 1)
+    x, y, w = _samples(candidates, response, weights, 1)
     predicted = np.empty(len(y))
     for row in range(len(y)):
         keep = np.arange(len(y)) != row
@@ -214,7 +197,7 @@ def _select(x: Floats, y: Floats, w: Floats, options: SelectionOptions) -> list[
         free = varies & (size > TOLERANCE * energy)
         free[selected] = False
         error = left @ left
-        if freedom < options.freedom_min or not free.any() or error <= floor:
+        if freedom < FREEDOM_MIN or not free.any() or error <= floor:
             break
         gain = np.zeros(len(size))
         gain[free] = (left @ rest[:, free]) ** 2 / size[free]
@@ -243,7 +226,7 @@ def _remove(columns: Floats, target: Floats, selected: list[int], options: Selec
 
 
 def _samples(
-    candidates: ArrayLike, response: ArrayLike, weights: ArrayLike | None, freedom_min: int, left_out: int
+    candidates: ArrayLike, response: ArrayLike, weights: ArrayLike | None, left_out: int
 ) -> tuple[Floats, Floats, Floats]:
     """Candidates, response and weights as arrays, of which a regression can be made, also with some `left_out`."""
     x, y = np.asarray(candidates, dtype=float), np.asarray(response, dtype=float)
@@ -251,10 +234,10 @@ def _samples(
         raise ValueError(
             "the response is the same for all samples, so there is nothing to explain: use samples that differ"
         )
-    if len(y) - left_out < freedom_min + 2:
-        raise TooFewSamplesError(
-            f"{len(y) - left_out} samples: a constant, one variable and {freedom_min} degrees of freedom for the "
-            f"residual need at least {freedom_min + 2}; measure more surfaces"
+    if len(y) - left_out < FREEDOM_MIN + 2:
+        raise TooFewMapsError(
+            f"{len(y) - left_out} samples: a constant, one variable and {FREEDOM_MIN} degrees of freedom for the "
+            f"residual need at least {FREEDOM_MIN + 2}; measure more surfaces"
         )
     return x, y, np.ones(len(y)) if weights is None else np.asarray(weights, dtype=float)
 
@@ -266,7 +249,7 @@ def _check_collinear(x: Floats, names: Sequence[str]) -> None:
     size = np.linalg.norm(centred, axis=0)
     constant = np.flatnonzero(size <= CONSTANT * np.maximum(np.linalg.norm(x, axis=0), np.finfo(float).tiny))
     if constant.size:
-        raise CollinearError(
+        raise TooFewMapsError(
             f"candidate {names[constant[0]]} is the same for all samples, which the constant says already: "
             "leave it out, or add samples in which it differs"
         )
@@ -275,7 +258,7 @@ def _check_collinear(x: Floats, names: Sequence[str]) -> None:
     alike = np.argwhere(likeness > 1.0 - 0.5 * TOLERANCE)
     if len(alike):
         one, other = alike[0]
-        raise CollinearError(
+        raise TooFewMapsError(
             f"candidates {names[one]} and {names[other]} are proportional over all samples: leave one of them out, or "
             "add samples in which they differ"
         )
@@ -285,6 +268,6 @@ def _check_collinear(x: Floats, names: Sequence[str]) -> None:
         dependent = order[diagonal < np.sqrt(TOLERANCE)]
         if dependent.size:
             listed = ", ".join(sorted(names[column] for column in dependent))
-            raise CollinearError(
+            raise TooFewMapsError(
                 f"the other candidates determine {listed}: leave out as many, or add samples that tell them apart"
             )

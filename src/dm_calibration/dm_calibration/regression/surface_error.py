@@ -90,7 +90,7 @@ def regress(
         train: (S,) the surfaces to train on; None = all.
 
     Raises:
-        CollinearError, TooFewSamplesError: see :mod:`~dm_calibration.regression.stepwise`.
+        TooFewMapsError: see :mod:`~dm_calibration.regression.stepwise`.
         ValueError: constant errors.
     """
     rows = slice(None) if train is None else train

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
-from dm_calibration.regression.stepwise import TooFewSamplesError
 from dm_common.optics.sample_regions import regional_rms
 
 Floats = NDArray[np.float64]
@@ -47,12 +47,12 @@ def surface_errors(maps: MapSet, fit: InfluenceFit) -> SurfaceErrors:
 
     Raises:
         EmptyRegionError: a surface has no sample in some region.
-        TooFewSamplesError: there is none of these surfaces.
+        TooFewMapsError: there is none of these surfaces.
         ValueError: other than 21 terms.
     """
     rows = np.array([k for k, label in enumerate(maps.label) if label in SURFACES and fit.used[k]], dtype=np.int64)
     if not rows.size:
-        raise TooFewSamplesError("none of the surfaces p01 to p58 is among the good maps: calibrate with the plan FULL")
+        raise TooFewMapsError("none of the surfaces p01 to p58 is among the good maps: calibrate with the plan FULL")
     labels = tuple(maps.label[row] for row in rows)
     error = surface_control_error(maps.sag[rows], maps.applied[rows], fit.influence_zernike, maps.points)
     return SurfaceErrors(rows, labels, maps.applied[rows], regional_rms(error, maps.points, labels=labels))

@@ -185,12 +185,8 @@ def _column(name: str, dataset: h5py.Dataset) -> Column:
 def _attribute(value: object) -> Attribute:
     if isinstance(value, np.ndarray):
         return tuple(text.decode() if isinstance(text, bytes) else str(text) for text in value)
-    if isinstance(value, np.bool_):
-        return bool(value)
-    if isinstance(value, np.integer):
-        return int(value)
-    if isinstance(value, np.floating):
-        return float(value)
+    if isinstance(value, np.bool_ | np.integer | np.floating):
+        return value.item()
     if isinstance(value, str):
         return value
     if isinstance(value, h5py.Empty):  # an empty list of texts
