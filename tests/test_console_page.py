@@ -43,6 +43,7 @@ class Bench:
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     folder = tmp_path_factory.mktemp("console")
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 3, 20.0)
+    config["virtual_bench"]["interferometer.pixels"] = 236
     with own_domain() as domain, served(domain, folder) as address:
         bench = Bench(config, folder, domain, address, Suite(config, folder, domain).__enter__())
         try:

@@ -8,11 +8,14 @@ from typing import Any
 
 
 def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:
-    """Return the first true value of `condition()`; fail the test when there is none in time."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
+    """Return the first true value of `condition()`; fail the test when there is none in time.
+
+    What takes long is asked for ever more rarely, at least ten times a second, so that waiting costs little.
+    """
+    began = time.monotonic()
+    while (waited := time.monotonic() - began) < timeout_s:
         value = condition()
         if value:
             return value
-        time.sleep(0.01)
+        time.sleep(min(0.01 + 0.02 * waited, 0.1))
     raise AssertionError(f"not within {timeout_s:g} s: {what or condition}")
