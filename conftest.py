@@ -1,6 +1,7 @@
 """Which tests start processes, in what order and portions the workers get them, and what skipped tests need.
 
-The fixtures of the tests across packages are in tests/conftest.py.
+Fixtures that every test may use are in src/dm_common/test/ros_fixtures.py, those of the tests across packages in
+tests/conftest.py.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import pytest
 from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 
-#: Fixtures of tests/conftest.py that start nodes or take a ROS domain.
+pytest_plugins = ("ros_fixtures",)
+
+#: Fixtures that start nodes or take a ROS domain.
 PROCESS_FIXTURES = {"domain", "observer", "start"}
 #: Modules in the order in which the workers take them: those that take longest first, so that all workers end together
 #: (`./dm test --durations=0` measures). The others follow as they were collected.

@@ -8,21 +8,7 @@ from typing import Any
 
 import pytest
 
-from support import NodeProcess, Observer, own_domain
-
-
-@pytest.fixture
-def domain() -> Iterator[int]:
-    """A ROS domain of the test's own."""
-    with own_domain() as number:
-        yield number
-
-
-@pytest.fixture
-def observer(domain: int) -> Iterator[Observer]:
-    """A node in the test process on the test's domain."""
-    with Observer(domain) as node:
-        yield node
+from support import NodeProcess
 
 
 @pytest.fixture

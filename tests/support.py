@@ -1,4 +1,4 @@
-"""What the cross-package tests share: nodes as separate processes over real DDS, and an observer to talk to them."""
+"""What the cross-package tests share: nodes as separate processes over real DDS."""
 
 from __future__ import annotations
 
@@ -6,24 +6,17 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 
-from dm_bringup.suite import own_domain
-from dm_common.ros.action_client import ThreadedActionClient
-from dm_common.ros.executor import BackgroundExecutor
-from dm_common.ros.worker import answers_arrive
-from waiting import wait_until
+from ros_fixtures import Observer, wait_until
 
-__all__ = ["NodeProcess", "Observer", "bench_figures", "own_domain", "wait_until"]
+__all__ = ["NodeProcess", "Observer", "bench_figures", "wait_until"]
 
 
 def bench_figures(node: Node, timeout_s: float = 60.0) -> dict[str, str]:
@@ -88,63 +81,3 @@ class NodeProcess:
             raise AssertionError(f"the node did not end on signal {number}:\n{self.output}") from None
         finally:
             self._output.close()
-
-
-class Observer:
-    """A node in the test process: publishes, records topics, calls services and actions. Use as a context manager."""
-
-    def __init__(self, domain: int, name: str = "observer") -> None:
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
-        rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node(name)
-        self._clients: dict[str, Any] = {}
-
-    def __enter__(self) -> Observer:
-        self._background = BackgroundExecutor(self.node)
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self._background.destroy_node()
-        rclpy.try_shutdown()
-
-    def record(self, message_type: Any, topic: str, qos: QoSProfile | int = 10) -> list[Any]:
-        """Return a list to which every message on `topic` is appended."""
-        received: list[Any] = []
-        self.node.create_subscription(message_type, topic, received.append, qos)
-        return received
-
-    def call(self, service_type: Any, name: str, request: Any = None, timeout_s: float = 30.0) -> Any:
-        """Call a service and return its response."""
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(service_type, name)
-        client = self._clients[name]
-        wait_until(lambda: answers_arrive(client, client.service_is_ready), max(timeout_s, 60.0), f"service {name}")
-        message = request if request is not None else service_type.Request()
-        future = client.call_async(message)
-        try:
-            wait_until(future.done, timeout_s, f"answer of {name}")
-        except AssertionError:
-            # On a busy machine discovery can take longer than `answers_arrive` allows; that answer is lost.
-            future = client.call_async(message)
-            wait_until(future.done, timeout_s, f"second answer of {name}")
-        return future.result()
-
-    def send_goal(
-        self, action_type: Any, name: str, goal: Any, feedback: Callable[[Any], None] | None = None
-    ) -> tuple[Any, Any]:
-        """Send a goal; return (goal handle, future of the result)."""
-        if name not in self._clients:
-            self._clients[name] = ThreadedActionClient(self.node, action_type, name)
-        client = self._clients[name]
-        wait_until(lambda: answers_arrive(client, client.server_is_ready), 60, f"action {name}")
-        accepted = client.send_goal_async(goal, feedback_callback=feedback)
-        wait_until(accepted.done, 60, f"acceptance by {name}")
-        handle = accepted.result()
-        return handle, handle.get_result_async() if handle.accepted else None
-
-    def run_goal(self, action_type: Any, name: str, goal: Any, timeout_s: float = 120.0) -> Any:
-        """Send a goal and wait for its result (the whole GetResult response: .status, .result)."""
-        handle, result = self.send_goal(action_type, name, goal)
-        assert handle.accepted, f"{name} refused the goal"
-        wait_until(result.done, timeout_s, f"result of {name}")
-        return result.result()

@@ -15,11 +15,11 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dm_common.errors import Refusal
+from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import WorkerActionServer
 from dm_tools.console import console_node
 from dm_tools.console.console_node import ConsoleNode
-from support import own_domain
 
 pytestmark = pytest.mark.processes
 

@@ -16,7 +16,8 @@ from selenium.webdriver.common.keys import Keys
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from console_stand_in import StandIn
 from dm_common.geometry import hexagonal_positions
-from support import Observer, own_domain, wait_until
+from dm_common.ros.domains import own_domain
+from support import Observer, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
 

@@ -22,8 +22,9 @@ from selenium.webdriver.common.keys import Keys
 
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from dm_bringup.suite import Suite
+from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
-from support import own_domain, wait_until
+from support import wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
 

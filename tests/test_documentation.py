@@ -26,8 +26,9 @@ import typer
 import yaml
 
 import documentation as told
-from dm_bringup.suite import load_config, own_domain, save_config
+from dm_bringup.suite import load_config, save_config
 from dm_client import DeformableMirrorClient
+from dm_common.ros.domains import own_domain
 from dm_tools.cli import app
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters

@@ -22,10 +22,11 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, ErrorCode, ZernikeCoefficients
 from std_srvs.srv import SetBool
 
-from dm_bringup.suite import Suite, own_domain, save_config
+from dm_bringup.suite import Suite, save_config
 from dm_calibration.map_files import read_map
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.domains import own_domain
 from dm_controller.planning.target import FocusTarget
 from dm_simulation.parameters import PARAMETERS
 from dm_tools.demo.demo_bench import bench_config

@@ -13,12 +13,13 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode
 from scipy.optimize import lsq_linear
 
-from dm_bringup.suite import Suite, own_domain
+from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
+from dm_common.ros.domains import own_domain
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs

@@ -9,8 +9,9 @@ from xml.etree import ElementTree as xml
 import pytest
 from typer.testing import CliRunner
 
-from dm_bringup.suite import Suite, own_domain
+from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient
+from dm_common.ros.domains import own_domain
 from dm_tools.cli import app
 from dm_tools.console.console_node import ConsoleNode
 from dm_tools.demo.demo_bench import bench_config

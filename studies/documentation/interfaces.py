@@ -107,7 +107,8 @@ def nodes_and_offers() -> dict[str, list[Offer]]:
     import rclpy
 
     from dm_bringup.nodes import NODES
-    from dm_bringup.suite import own_domain, save_config
+    from dm_bringup.suite import save_config
+    from dm_common.ros.domains import own_domain
     from dm_tools.demo.demo_bench import bench_config
 
     result: dict[str, list[Offer]] = {}

@@ -87,7 +87,7 @@ def faults(
     json: JsonOption = None,
 ) -> None:
     """Inject faults into real processes, damage files, run for long; exit status 1 when anything was harmed or lost."""
-    from dm_bringup.suite import own_domain
+    from dm_common.ros.domains import own_domain
     from fault_injection.fault import run_faults
     from fault_injection.faults.registry import OTHERS, select
     from fault_injection.fuzz.fuzz import fuzz_all

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any
+from typing import Any
 
 import yaml
 
@@ -55,26 +53,6 @@ def save_config(config: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """Write a ROS 2 parameter file that applies in any namespace."""
     content = {f"/**/{name}": {"ros__parameters": dict(values)} for name, values in config.items()}
     path.write_text(yaml.safe_dump(content, sort_keys=False))
-
-
-@contextlib.contextmanager
-def own_domain() -> Iterator[int]:
-    """Lend a ROS domain that no other demo or test on this machine uses at the same time."""
-    folder = Path(tempfile.gettempdir()) / f"dm-domains-{os.getuid()}"
-    folder.mkdir(exist_ok=True)
-    for domain in range(1, 100):
-        handle: IO[str] = (folder / str(domain)).open("w")
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            handle.close()
-            continue
-        try:
-            yield domain
-        finally:
-            handle.close()
-        return
-    raise RuntimeError("no free ROS domain: 99 runs at once?")
 
 
 def stop_processes(processes: Collection[subprocess.Popen[bytes]], timeout_s: float = 15.0) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from dm_bringup.suite import Suite, own_domain
+from dm_bringup.suite import Suite
 from dm_client import STARTING_S, DeformableMirrorClient
+from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
 from studies.benchmarks.timing import Effort
 

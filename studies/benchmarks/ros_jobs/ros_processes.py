@@ -18,7 +18,8 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from dm_bringup.suite import own_domain, save_config, stop_processes
+from dm_bringup.suite import save_config, stop_processes
+from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import make_executor
 
 

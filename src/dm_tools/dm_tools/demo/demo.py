@@ -191,8 +191,8 @@ def demo(
         return
     from dm_msgs.action import Calibrate
 
-    from dm_bringup.suite import own_domain
     from dm_client import DeformableMirrorClient
+    from dm_common.ros.domains import own_domain
     from dm_tools.demo.figures import save_sweep_figure
     from dm_tools.verbs.calibrate import figures_of, run_calibration, show_result
 

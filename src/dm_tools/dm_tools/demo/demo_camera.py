@@ -182,8 +182,8 @@ def demo_camera(
     from dm_msgs.action import Calibrate
 
     from dm_autofocus import CameraFocusClient
-    from dm_bringup.suite import own_domain
     from dm_client import DeformableMirrorClient
+    from dm_common.ros.domains import own_domain
     from dm_tools.demo.pictures import save_animation, save_contact_sheet
     from dm_tools.verbs.calibrate import figures_of as calibration_figures
     from dm_tools.verbs.calibrate import run_calibration, show_result

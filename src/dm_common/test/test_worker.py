@@ -1,33 +1,20 @@
-"""The runtime the nodes share: executor, worker services and actions, calls from threads, declared parameters."""
+"""Worker services and actions, and calls from threads, beside an executor that goes on."""
 
 from __future__ import annotations
 
-import gc
-import math
-import signal
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import MoveFocus
 from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import Flatten, SetSignals
-from rclpy.action import ActionClient
-from rclpy.node import Node
-from rclpy.parameter import Parameter as RosParameter
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Int32
 
 from dm_common.ros.action_client import ThreadedActionClient
-from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, declare, real, reals, text, whole
 from dm_common.ros.worker import (
     ServiceCallError,
     WorkerActionServer,
@@ -37,7 +24,7 @@ from dm_common.ros.worker import (
     never_silent,
     sleep,
 )
-from support import Observer, wait_until
+from ros_fixtures import Observer, wait_until
 
 
 def _longer(received: list[Any], count: int) -> bool:
@@ -230,134 +217,3 @@ def test_call_gives_up_on_a_silent_server_and_on_cancel(observer: Observer) -> N
 def test_sleep_ends_early_when_cancelled(observer: Observer) -> None:
     assert sleep(observer.node.get_clock(), 0.05)
     assert not sleep(observer.node.get_clock(), 60.0, cancelled=lambda: True)
-
-
-TABLE = (
-    Parameter("serial", text(REQUIRED), "serial number of the mirror"),
-    Parameter("gain", real(2.0, 0.0, 100.0, "V/V"), "gain of the amplifier", live=True),
-    Parameter("count", whole(3, 1, 5), "how many"),
-    Parameter("kind", text("a", choices=("a", "b")), "which kind"),
-    Parameter("positions", reals([], -1.0, 1.0, "m"), "where"),
-)
-
-
-def node_with(observer: Observer, name: str, **values: Any) -> Node:
-    return Node(name, parameter_overrides=[RosParameter(key, value=value) for key, value in values.items()])
-
-
-def test_parameters_take_defaults_and_given_values(observer: Observer) -> None:
-    node = node_with(observer, "given", serial="S1", positions=[0.5, -0.5])
-    values = declare(node, TABLE)
-    assert values == {"serial": "S1", "gain": 2.0, "count": 3, "kind": "a", "positions": [0.5, -0.5]}
-    node.destroy_node()
-
-
-def test_missing_required_parameters_are_named(observer: Observer) -> None:
-    node = node_with(observer, "missing")
-    with pytest.raises(ParameterError, match="serial"):
-        declare(node, TABLE)
-    node.destroy_node()
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
-        ("gain", 101.0, "0 to 100 V/V"),
-        ("gain", math.nan, "0 to 100"),
-        ("count", 9, "1 to 5"),
-        ("kind", "c", "one of a, b"),
-        ("positions", [2.0], "-1 to 1 m"),
-    ],
-)
-def test_values_out_of_range_are_refused_with_the_range(observer: Observer, name: str, value: Any, words: str) -> None:
-    node = node_with(observer, "wrong", serial="S1", **{name: value})
-    with pytest.raises((ParameterError, Exception)) as caught:
-        declare(node, TABLE)
-    assert name in str(caught.value)
-    node.destroy_node()
-    with pytest.raises(ParameterError) as refused:
-        next(parameter for parameter in TABLE if parameter.name == name).check(value)
-    assert words in str(refused.value)
-
-
-def test_live_parameters_are_checked_and_applied_on_set(observer: Observer) -> None:
-    node = node_with(observer, "live", serial="S1")
-    changes: list[Any] = []
-    values = declare(node, TABLE, on_change=changes.append)
-    assert not node.set_parameters([RosParameter("gain", value=-1.0)])[0].successful
-    assert values["gain"] == 2.0
-    assert node.set_parameters([RosParameter("gain", value=5.0)])[0].successful
-    assert values["gain"] == 5.0
-    assert changes == [{"gain": 5.0}]
-    assert not node.set_parameters([RosParameter("serial", value="S2")])[0].successful
-    node.destroy_node()
-
-
-NODE_SCRIPT = """
-import sys, time
-from dm_common.ros.executor import run_node
-from rclpy.node import Node
-
-class Careful(Node):
-    def __init__(self):
-        super().__init__("careful")
-        print("ready", flush=True)
-    def make_safe(self):
-        time.sleep(0.5)
-        print("safe", flush=True)
-
-sys.exit(run_node(Careful))
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_is_made_safe_on_signals_even_when_hit_twice(domain: int, tmp_path: Path, number: int) -> None:
-    script = tmp_path / "careful.py"
-    script.write_text(NODE_SCRIPT)
-    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    time.sleep(0.3)
-    process.send_signal(number)
-    time.sleep(0.2)
-    process.send_signal(number)
-    output, errors = process.communicate(timeout=15)
-    assert output == "safe\n"
-    assert "Traceback" not in errors
-    assert process.returncode == 0
-
-
-@pytest.fixture
-def watcher(domain: int) -> Iterator[Node]:
-    """A participant of its own, which sees of others what DDS tells it."""
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("watcher", context=context)
-    yield node
-    node.destroy_node()
-    context.try_shutdown()
-
-
-@pytest.mark.parametrize("kind", ["service", "action server", "action client", "all, used"])
-def test_nothing_of_a_client_stays_in_the_graph(kind: str, domain: int, watcher: Node) -> None:
-    def served(_goal: Any) -> tuple[str, Any]:
-        return "succeed", MoveFocus.Result()
-
-    # Circles of references must not decide how long a node is seen.
-    gc.collect()
-    gc.disable()
-    try:
-        with Observer(domain) as observer:
-            if kind in ("service", "all, used"):
-                WorkerService(observer.node, Flatten, "flatten", lambda _request, response: response)
-            if kind in ("action server", "all, used"):
-                WorkerActionServer(observer.node, MoveFocus, "move", served)
-            if kind == "action client":
-                ActionClient(observer.node, MoveFocus, "move")
-            if kind == "all, used":
-                observer.call(Flatten, "flatten")
-                observer.run_goal(MoveFocus, "move", MoveFocus.Goal())
-            wait_until(lambda: "observer" in watcher.get_node_names())
-        wait_until(lambda: "observer" not in watcher.get_node_names(), 60, "the node is still in the graph")
-    finally:
-        gc.enable()

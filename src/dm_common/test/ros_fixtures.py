@@ -1,0 +1,107 @@
+"""A ROS domain of a test's own, and a node in the test process that talks to what runs there."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+
+from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.domains import own_domain
+from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.worker import answers_arrive
+
+
+def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:
+    """Return the first true value of `condition()`; fail the test when there is none in time.
+
+    What takes long is asked for ever more rarely, at least ten times a second, so that waiting costs little.
+    """
+    began = time.monotonic()
+    while (waited := time.monotonic() - began) < timeout_s:
+        value = condition()
+        if value:
+            return value
+        time.sleep(min(0.01 + 0.02 * waited, 0.1))
+    raise AssertionError(f"not within {timeout_s:g} s: {what or condition}")
+
+
+class Observer:
+    """A node in the test process: publishes, records topics, calls services and actions. Use as a context manager."""
+
+    def __init__(self, domain: int, name: str = "observer") -> None:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node(name)
+        self._clients: dict[str, Any] = {}
+
+    def __enter__(self) -> Observer:
+        self._background = BackgroundExecutor(self.node)
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._background.destroy_node()
+        rclpy.try_shutdown()
+
+    def record(self, message_type: Any, topic: str, qos: QoSProfile | int = 10) -> list[Any]:
+        """Return a list to which every message on `topic` is appended."""
+        received: list[Any] = []
+        self.node.create_subscription(message_type, topic, received.append, qos)
+        return received
+
+    def call(self, service_type: Any, name: str, request: Any = None, timeout_s: float = 30.0) -> Any:
+        """Call a service and return its response."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_type, name)
+        client = self._clients[name]
+        wait_until(lambda: answers_arrive(client, client.service_is_ready), max(timeout_s, 60.0), f"service {name}")
+        message = request if request is not None else service_type.Request()
+        future = client.call_async(message)
+        try:
+            wait_until(future.done, timeout_s, f"answer of {name}")
+        except AssertionError:
+            # On a busy machine discovery can take longer than `answers_arrive` allows; that answer is lost.
+            future = client.call_async(message)
+            wait_until(future.done, timeout_s, f"second answer of {name}")
+        return future.result()
+
+    def send_goal(
+        self, action_type: Any, name: str, goal: Any, feedback: Callable[[Any], None] | None = None
+    ) -> tuple[Any, Any]:
+        """Send a goal; return (goal handle, future of the result)."""
+        if name not in self._clients:
+            self._clients[name] = ThreadedActionClient(self.node, action_type, name)
+        client = self._clients[name]
+        wait_until(lambda: answers_arrive(client, client.server_is_ready), 60, f"action {name}")
+        accepted = client.send_goal_async(goal, feedback_callback=feedback)
+        wait_until(accepted.done, 60, f"acceptance by {name}")
+        handle = accepted.result()
+        return handle, handle.get_result_async() if handle.accepted else None
+
+    def run_goal(self, action_type: Any, name: str, goal: Any, timeout_s: float = 120.0) -> Any:
+        """Send a goal and wait for its result (the whole GetResult response: .status, .result)."""
+        handle, result = self.send_goal(action_type, name, goal)
+        assert handle.accepted, f"{name} refused the goal"
+        wait_until(result.done, timeout_s, f"result of {name}")
+        return result.result()
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """A ROS domain of the test's own."""
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def observer(domain: int) -> Iterator[Observer]:
+    """A node in the test process on the test's domain."""
+    with Observer(domain) as node:
+        yield node

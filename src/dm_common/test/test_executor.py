@@ -1,0 +1,92 @@
+"""A node's end: made safe on signals, and nothing of it left in the graph."""
+
+from __future__ import annotations
+
+import gc
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from dm_msgs.action import MoveFocus
+from dm_msgs.srv import Flatten
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from dm_common.ros.worker import WorkerActionServer, WorkerService
+from ros_fixtures import Observer, wait_until
+
+NODE_SCRIPT = """
+import sys, time
+from dm_common.ros.executor import run_node
+from rclpy.node import Node
+
+class Careful(Node):
+    def __init__(self):
+        super().__init__("careful")
+        print("ready", flush=True)
+    def make_safe(self):
+        time.sleep(0.5)
+        print("safe", flush=True)
+
+sys.exit(run_node(Careful))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_is_made_safe_on_signals_even_when_hit_twice(domain: int, tmp_path: Path, number: int) -> None:
+    script = tmp_path / "careful.py"
+    script.write_text(NODE_SCRIPT)
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(0.3)
+    process.send_signal(number)
+    time.sleep(0.2)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=15)
+    assert output == "safe\n"
+    assert "Traceback" not in errors
+    assert process.returncode == 0
+
+
+@pytest.fixture
+def watcher(domain: int) -> Iterator[Node]:
+    """A participant of its own, which sees of others what DDS tells it."""
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("watcher", context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize("kind", ["service", "action server", "action client", "all, used"])
+def test_nothing_of_a_client_stays_in_the_graph(kind: str, domain: int, watcher: Node) -> None:
+    def served(_goal: Any) -> tuple[str, Any]:
+        return "succeed", MoveFocus.Result()
+
+    # Circles of references must not decide how long a node is seen.
+    gc.collect()
+    gc.disable()
+    try:
+        with Observer(domain) as observer:
+            if kind in ("service", "all, used"):
+                WorkerService(observer.node, Flatten, "flatten", lambda _request, response: response)
+            if kind in ("action server", "all, used"):
+                WorkerActionServer(observer.node, MoveFocus, "move", served)
+            if kind == "action client":
+                ActionClient(observer.node, MoveFocus, "move")
+            if kind == "all, used":
+                observer.call(Flatten, "flatten")
+                observer.run_goal(MoveFocus, "move", MoveFocus.Goal())
+            wait_until(lambda: "observer" in watcher.get_node_names())
+        wait_until(lambda: "observer" not in watcher.get_node_names(), 60, "the node is still in the graph")
+    finally:
+        gc.enable()
