@@ -21,7 +21,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.weights import surface_control_error
-from dm_calibration.regression.surface_samples import SURFACES
+from dm_calibration.regression.surface_error import SURFACES
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.limits import Limits
 from dm_common.optics.zernike import basis

@@ -20,10 +20,9 @@ import numpy as np
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import FitOptions, fit_influence
-from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import SURFACE
 from dm_calibration.influence.region_weighting import choose_weighting
-from dm_calibration.influence.regression import make_design
+from dm_calibration.influence.regression import make_design, regress, usable_sag
 from dm_calibration.procedure.procedure import Progress
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits

@@ -25,17 +25,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.influence.gaps import usable_sag
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.regression import usable_sag
 from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.stepwise import SelectionOptions, StepwiseFit
 from dm_calibration.regression.surface_error import (
     MODEL,
+    SURFACES,
+    SurfaceErrors,
     held_out_errors,
     model_candidates,
     regress,
+    surface_errors,
 )
-from dm_calibration.regression.surface_samples import SURFACES, SurfaceErrors, surface_errors
 from dm_common.names import unknown_name
 from dm_common.optics.piston_tilt import fill_gaps
 from dm_common.optics.zernike import TERM_RMS, basis

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
 from dm_calibration.regression.stepwise import leave_one_out, stepwise
-from dm_calibration.regression.surface_samples import surface_errors
+from dm_calibration.regression.surface_error import surface_errors
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.paper.readings import Reading, ReadRegression, regress_surface_errors
 from studies.paper.reported import MODELS, TEST_SURFACES

@@ -12,7 +12,7 @@ from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.regression.predictor import fit_predictor
 from dm_calibration.regression.sag_history import RunHistory
-from dm_calibration.regression.surface_samples import surface_errors, surface_weights
+from dm_calibration.regression.surface_error import surface_errors, surface_weights
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.zernike import basis
 from hysteretic_mirror import calibrated, calibrated_by_pokes, lagging_bench

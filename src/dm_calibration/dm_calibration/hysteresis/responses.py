@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.influence.gaps import usable_sag
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.regression import usable_sag
 from dm_common.optics.piston_tilt import fill_gaps
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 

@@ -15,11 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence import quality, screening
-from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GradeOptions
 from dm_calibration.influence.region_weighting import choose_weighting, weighted_coefficients
-from dm_calibration.influence.regression import METHODS, Design, Regression, TooFewMapsError, least_squares, make_design
+from dm_calibration.influence.regression import (
+    METHODS,
+    Design,
+    Regression,
+    TooFewMapsError,
+    least_squares,
+    make_design,
+    regress,
+    usable_sag,
+)
 from dm_calibration.influence.screening import ScreeningOptions
 from dm_calibration.influence.weights import check_epsilon
 from dm_common.names import unknown_name

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence import quality
-from dm_calibration.influence.gaps import regress, usable_sag
 from dm_calibration.influence.maps import SURFACE, MapSet
-from dm_calibration.influence.regression import Design, TooFewMapsError, make_design
+from dm_calibration.influence.regression import Design, TooFewMapsError, make_design, regress, usable_sag
 from dm_calibration.influence.weights import (
     coefficient_operator,
     region_weights,

@@ -8,14 +8,11 @@ import stat
 from pathlib import Path
 
 from dm_calibration.map_files import dat
-from dm_calibration.map_files.asc import parse_asc
 from dm_calibration.map_files.dat import is_dat, parse_dat
 from dm_calibration.map_files.datx import is_datx
 from dm_calibration.map_files.datx_structure import check_end
 from dm_calibration.map_files.surface_map import MapFileError, NoValidPixelsError, SurfaceMap
-from dm_calibration.map_files.text_header import XYZ_TITLE, is_text
-from dm_calibration.map_files.xyz import UNITS as XYZ_UNITS
-from dm_calibration.map_files.xyz import parse_xyz
+from dm_calibration.map_files.text_maps import XYZ_TITLE, XYZ_UNITS, is_text, parse_asc, parse_xyz
 from dm_calibration.store.hdf5_sandbox import SandboxError, read_in_sandbox
 
 __all__ = ["XYZ_UNITS", "MapFileError", "NoValidPixelsError", "SurfaceMap", "is_complete", "read_map"]

@@ -20,8 +20,7 @@ from dm_calibration.influence.surfaces import MODEL_NAMES
 from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory, SagModel
 from dm_calibration.regression.stepwise import SelectionOptions
-from dm_calibration.regression.surface_error import ErrorRegression, model_candidates, regress
-from dm_calibration.regression.surface_samples import surface_errors
+from dm_calibration.regression.surface_error import ErrorRegression, model_candidates, regress, surface_errors
 from dm_common.optics.piston_tilt import rms
 
 Floats = NDArray[np.float64]
@@ -79,7 +78,7 @@ def fit_predictor(maps: MapSet, influence: InfluenceFit, options: SelectionOptio
     """A predictor from all surfaces p01-p58 of a calibration; its held-out error is the leave-one-out one.
 
     Raises:
-        As :func:`~dm_calibration.regression.surface_samples.surface_errors` and
+        As :func:`~dm_calibration.regression.surface_error.surface_errors` and
         :func:`~dm_calibration.regression.surface_error.regress`.
     """
     errors = surface_errors(maps, influence)

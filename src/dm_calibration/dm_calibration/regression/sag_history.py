@@ -18,9 +18,8 @@ from scipy.optimize import nnls
 
 from dm_calibration.hysteresis.features import crept, play_features
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of
-from dm_calibration.influence.gaps import usable_sag
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import drift_columns
+from dm_calibration.influence.regression import drift_columns, usable_sag
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.optics.piston_tilt import fill_gaps
 

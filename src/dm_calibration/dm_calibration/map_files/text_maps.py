@@ -1,4 +1,4 @@
-"""The fourteen header lines that ZYGO's text formats `.asc` and `.xyz` share.
+"""ZYGO's text formats `.asc` and `.xyz`, which share fourteen header lines (docs/map-files.md).
 
 Fields are found by line number and position: quotes around texts can be damaged in real files.
 """
@@ -11,7 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.map_files.surface_map import MapFileError, SurfaceMap, check_pitch
+from dm_calibration.map_files.surface_map import (
+    MapFileError,
+    SurfaceMap,
+    check_heights,
+    check_pitch,
+    check_size,
+    check_wavelength,
+    no_valid_pixels,
+    sag_from_counts,
+    sag_per_count,
+)
 
 ASC_TITLE = b"Zygo ASCII Data File"
 XYZ_TITLE = b"Zygo XYZ Data File"
@@ -126,3 +136,86 @@ def numbers(text: bytes, name: str, expected: int, dtype: type) -> NDArray[Any]:
         return np.array(tokens, dtype=np.bytes_).astype(dtype)
     except (ValueError, OverflowError) as error:
         raise MapFileError(f"{name}: {error}") from None
+
+
+def _phase_section(header: TextHeader, body: bytes) -> bytes:
+    """The text between the `#` before the phase data and the `#` after them."""
+    before, *sections, after = body.split(b"#")
+    if before.strip() or after.strip():
+        raise MapFileError("the phase data do not end with '#'; the file is truncated")
+    if len(sections) == 2:
+        numbers(sections[0], "intensity data", header.intensities, np.int64)
+        return sections[1]
+    if len(sections) == 1 and header.intensities == 0:  # the intensity section may be left out when it is empty
+        return sections[0]
+    raise MapFileError(
+        f"{len(sections)} data sections between '#' marks: must be intensity and phase; the file is truncated"
+    )
+
+
+def parse_asc(content: bytes) -> SurfaceMap:
+    """Parse a whole `.asc` file ("Zygo ASCII Data File - Format 2").
+
+    Raises:
+        MapFileError: not a whole, meaningful map; the message names the field.
+    """
+    header, body = split_header(content)
+    pixels = check_size(header.width, header.height)
+    metres_per_count = sag_per_count(
+        header.scale_factor, header.wavelength, header.obliquity, header.phase_resolution, header.data_sign
+    )
+    counts = numbers(_phase_section(header, body), "phase data", pixels, np.int64)
+    sag = sag_from_counts(counts.reshape(header.height, header.width), metres_per_count)
+    return header.surface_map(sag, header.wavelength, "asc")
+
+
+#: Units the value column may be in, as m; None = waves of the file's wavelength.
+XYZ_UNITS: dict[str, float | None] = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10, "waves": None}
+
+
+def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
+    """Parse a whole `.xyz` file: after the header one line `column row value` per pixel.
+
+    Args:
+        unit: of the value column, one of XYZ_UNITS. The file does not tell it and nothing can guess it.
+
+    Raises:
+        MapFileError: no unit given, or not a whole, meaningful map; the message names the field.
+    """
+    if unit not in XYZ_UNITS:
+        what = "not given" if not unit else f"{unit!r}"
+        raise MapFileError(
+            f"xyz_unit = {what}: an .xyz file does not tell the unit of its values; must be one of "
+            f"{', '.join(XYZ_UNITS)}"
+        )
+    header, body = split_header(content)
+    pixels = check_size(header.width, header.height)
+    wavelength = check_wavelength(header.wavelength)
+    rows, mark, rest = body[1:].partition(b"#")
+    if rest.strip():
+        raise MapFileError("text after the '#' that ends the data")
+    if not mark and not rows.endswith(b"\n"):
+        raise MapFileError("the last line is not ended; the file is truncated")
+    table = numbers(rows.replace(b"No Data", b"nan"), "data lines (column, row, value)", 3 * pixels, np.float64)
+    column, row, value = table.reshape(pixels, 3).T
+    pixel = _grid_indices(row, header.origin[1], header.height, "row") * header.width
+    pixel += _grid_indices(column, header.origin[0], header.width, "column")
+    if (np.bincount(pixel, minlength=pixels) != 1).any():
+        raise MapFileError("data lines: some pixel is missing and another appears twice")
+    sag = np.empty((header.height, header.width))
+    sag.ravel()[pixel] = value
+    if not np.isfinite(sag).any():
+        raise no_valid_pixels(sag.shape)
+    metres = XYZ_UNITS[unit]
+    sag *= wavelength if metres is None else metres
+    check_heights(sag)
+    return header.surface_map(sag, wavelength, "xyz")
+
+
+def _grid_indices(position: NDArray[np.float64], origin: int, size: int, name: str) -> NDArray[np.intp]:
+    """Map indices from column or row numbers, which count from the camera's corner or from the map's."""
+    first, last = position.min(), position.max()
+    for start in (origin, 0):
+        if first == start and last == start + size - 1 and (position == np.rint(position)).all():
+            return (position - start).astype(np.intp)
+    raise MapFileError(f"{name} numbers {first:g} to {last:g}: must be integers from {origin} to {origin + size - 1}")
