@@ -12,7 +12,15 @@ from typer.testing import CliRunner
 from dm_simulation.mirror.hysteresis import LAWS
 from studies.comparison import drawn_mirrors
 from studies.comparison.drawn_mirrors import draw_mirror
-from studies.comparison.population import ANY_ORDER, POWER_CUT, RECIPES, RESTARTED, PopulationOptions, judge_population
+from studies.comparison.population import (
+    ANY_ORDER,
+    CHECKED,
+    POWER_CUT,
+    RECIPES,
+    RESTARTED,
+    PopulationOptions,
+    judge_population,
+)
 from studies.verbs.compare import compare as command
 from studies.verbs.compare_mirrors import figures_of, row_of
 
@@ -33,11 +41,11 @@ def test_a_mirror_is_judged_and_its_figures_are_told() -> None:
     options = PopulationOptions(requests=5, maps=90, recipes=2, pixels=100)
     (outcome,) = judge_population([3], options)
     assert not outcome.failure
-    assert outcome.groups.keys() == {ANY_ORDER, RECIPES, RESTARTED, POWER_CUT}
+    assert outcome.groups.keys() == {ANY_ORDER, RECIPES, RESTARTED, CHECKED, POWER_CUT}
     low, high = outcome.curvatures
     assert low < 0 < high
     asked = outcome.groups[ANY_ORDER]
-    assert len(asked.error) + asked.refused == options.requests
+    assert len(asked.error) + len(asked.refusals) == options.requests
     assert np.all(asked.error < 1e-7)
     row = json.loads(json.dumps(row_of(outcome), allow_nan=False))
     assert row["seed"] == 3

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+
+from dm_calibration.procedure.applied_history import SettledState
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.creep_hold import PERIOD_S
@@ -37,6 +40,19 @@ class DrivenMirror:
         for report in self.bench.reports[self._seen :]:
             self._tracker.observe(report)
         self._seen = len(self.bench.reports)
+
+    def under(self, planner: Planner) -> DrivenMirror:
+        """The same mirror from here on with another planner of the same hysteresis model."""
+        other = copy.copy(self)
+        other._planner = planner
+        return other
+
+    def settled(self) -> SettledState:
+        """What stands at the mirror now, as maps are compared with."""
+        self._follow()
+        state, law = self._tracker.state, self._planner.law
+        assert state is not None
+        return SettledState(law.effective(law.advance(state, self.bench.time)), self.bench.reports[-1].time)
 
     def plan(self, target: FocusTarget) -> Move:
         """The move to `target` from where the mirror stands, or by a recipe after a degauss, which is carried out."""

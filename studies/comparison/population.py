@@ -8,13 +8,18 @@ as on the bench, with the calibration as the message says it.
 from __future__ import annotations
 
 import multiprocessing
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_common.errors import Refusal
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
@@ -39,8 +44,8 @@ from studies.comparison.true_surface import TrueSurface
 DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
 #: A shape is held for so long before the electronics are switched off, for so long, s.
 HELD_S, OFF_S = 86400.0, 600.0
-#: Requests after a restart, and requests by recipes for each recipe.
-FIRST_REQUESTS, PER_RECIPE = 6, 2
+#: Requests after a restart, maps that then check the calibration, and requests by recipes for each recipe.
+FIRST_REQUESTS, CHECK_MAPS, PER_RECIPE = 6, 3, 2
 
 Progress = Callable[[str], None]
 
@@ -70,9 +75,9 @@ class Outcome:
         law: what the calibration found.
         held_out: m, 95th percentile of the largest coefficient error that it told.
         curvatures: 1/m, range of spheres that was told.
-        groups: requests by what preceded them: `any order`, `recipes`, `restarted`, `power cut`.
+        groups: requests by what preceded them: ANY_ORDER etc.
         failure: the reason why it could not be judged; "" = it was.
-        seconds: wall time, of the calibration, and of everything.
+        seconds: of processor time, of the calibration, and of everything.
     """
 
     mirror: DrawnMirror
@@ -84,26 +89,28 @@ class Outcome:
     seconds: tuple[float, float] = (0.0, 0.0)
 
 
-ANY_ORDER, RECIPES, RESTARTED, POWER_CUT = "any order", "recipes", "restarted", "power cut"
+#: Kinds of requests: from the calibration on, by recipes after a degauss, after a day's hold and a restart, then after
+#: maps that checked the calibration, after a power cut during a move.
+ANY_ORDER, RECIPES, RESTARTED, CHECKED, POWER_CUT = "any order", "recipes", "restarted", "checked", "power cut"
 
 
-def _recipes(bench: SimulatedBench, active: ActiveCalibration, curvatures: Floats) -> tuple[RecipeBook, int]:
-    """Recipes of these curvatures, and how many of them could not be built."""
+def _recipes(bench: SimulatedBench, active: ActiveCalibration, curvatures: Floats) -> tuple[RecipeBook, list[str]]:
+    """Recipes of these curvatures, and why others of them could not be built."""
     tracker = HysteresisTracker(active.planner.law)
     for report in bench.reports:
         tracker.observe(report)
     options = BuildOptions(settle_time=bench.config.settle_time)
     builder = RecipeBuilder(active.planner, bench, lambda: bench.time, options, state=tracker.state)
-    recipes = []
+    recipes, refusals = [], []
     for curvature in curvatures:
         try:
             recipes.append(builder.build(FocusTarget(float(curvature))))
-        except UnreachableError:  # counted: the told range said otherwise
-            continue
+        except UnreachableError as error:  # the told range said otherwise
+            refusals.append(str(error))
     if not recipes:
-        return NO_RECIPES, len(curvatures)
+        return NO_RECIPES, refusals
     book = recipe_book(recipes, active.planner, bench.config.degauss_steps, round(1e9 * bench.time))
-    return book, len(curvatures) - len(recipes)
+    return book, refusals
 
 
 def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -> None:
@@ -123,9 +130,26 @@ def _restarted(bench: SimulatedBench, active: ActiveCalibration, off: float) -> 
     return DrivenMirror(bench, active.planner, seen=seen)
 
 
+def _checked(
+    bench: SimulatedBench, calibration: Calibration, driven: DrivenMirror, targets: Sequence[FocusTarget]
+) -> ActiveCalibration:
+    """The calibration in use after a map of each of these shapes."""
+    with tempfile.TemporaryDirectory() as folder:
+        updates = RecalibrationManager(Path(folder), UpdateOptions)
+        updates.begin(calibration)
+        for target in targets:
+            driven.hold(driven.go(driven.plan(target)), bench.config.settle_time)
+            updates.take(bench.measure("check"), driven.settled())
+        message = calibration_message(calibration, None, "mirror", 1.0)
+        found, fit = updates.updates, updates.changed_fit()
+        assert found is not None and fit is not None
+        put_updates(message, found, fit, [], updates.mirror_changed)
+    return active_of(bench, message)
+
+
 def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lambda step: None) -> Outcome:
     """Draw, calibrate and judge one mirror."""
-    began = time.monotonic()
+    began = time.process_time()
     mirror = draw_mirror(seed, options.pixels)
     rng = np.random.default_rng([seed, 15])
     bench = SimulatedBench(mirror.simulation)
@@ -136,16 +160,16 @@ def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lam
     progress(f"seed {seed}: calibration")
     try:
         calibration = bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps))
-        active = active_of(bench, calibration)
+        active = active_of(bench, calibration_message(calibration, None, "mirror", 1.0))
     except (Refusal, ValueError) as error:
         return Outcome(mirror, failure=str(error))
-    calibrated = time.monotonic() - began
+    calibrated = time.process_time() - began
     hysteresis = calibration.hysteresis
     assert hysteresis is not None
     surface = TrueSurface(bench)
     low, high = active.reachable_range(FocusTarget(0.0), REACHABLE_TOLERANCE)
     groups: dict[str, Requests] = {}
-    book, unreachable = NO_RECIPES, 0
+    book, unreachable = NO_RECIPES, list[str]()
     if options.recipes:
         progress(f"seed {seed}: recipes")
         curvatures = np.linspace(max(low, -CURVATURE_MAX), min(high, CURVATURE_MAX), options.recipes)
@@ -173,8 +197,12 @@ def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lam
     driven.hold(driven.go(driven.plan(first[0])), HELD_S)
     driven = _restarted(other, active, OFF_S)
     groups[RESTARTED] = judge_requests(driven, active, surface, first[1:], short)
+    progress(f"seed {seed}: check maps")
+    checked = _checked(other, calibration, driven, draw_targets(active, CHECK_MAPS, rng))
+    first = draw_targets(checked, FIRST_REQUESTS, rng)
+    groups[CHECKED] = judge_requests(driven.under(checked.planner), checked, surface, first, short)
 
-    groups[RECIPES] = Requests(np.empty(0), np.empty(0), np.empty(0), unreachable)
+    groups[RECIPES] = Requests.none(unreachable)
     if book.recipes:
         progress(f"seed {seed}: by recipes")
         asked = [recipe.curvature for recipe in book.recipes]
@@ -182,14 +210,14 @@ def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lam
         targets = [FocusTarget(float(curvature)) for curvature in rng.permutation(asked)]
         driven = DrivenMirror(bench.fork(), active.planner, book=book)
         judged = judge_requests(driven, active, surface, targets, np.resize(DWELLS[:4], len(targets)))
-        groups[RECIPES] = replace(judged, refused=judged.refused + unreachable)
+        groups[RECIPES] = replace(judged, refusals=(*judged.refusals, *unreachable))
     return Outcome(
         mirror,
         hysteresis.name,
         hysteresis.held_out_max_zernike,
         (low, high),
         groups,
-        seconds=(calibrated, time.monotonic() - began),
+        seconds=(calibrated, time.process_time() - began),
     )
 
 

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from dm_msgs.msg import MirrorInfo
+from dm_msgs.msg import Calibration, MirrorInfo
 
-from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_messages import calibration_message
 from dm_common.errors import Refusal
 from dm_common.messages import doubles
 from dm_common.mirror import APERTURE_TOLERANCE
@@ -37,13 +35,18 @@ class Requests:
     Attributes:
         error, upper: (R,) m, largest coefficient error of the true surface, and its bound told beforehand.
         dwell: (R,) s.
-        refused: requests inside the told range that controller or driver refused.
+        refusals: of requests inside the told range that controller or driver refused.
     """
 
     error: Floats
     upper: Floats
     dwell: Floats
-    refused: int
+    refusals: tuple[str, ...] = ()
+
+    @classmethod
+    def none(cls, refusals: Sequence[str]) -> Requests:
+        """All were refused."""
+        return cls(np.empty(0), np.empty(0), np.empty(0), tuple(refusals))
 
     @property
     def coverage(self) -> float:
@@ -56,7 +59,7 @@ class Requests:
 
 
 def active_of(bench: SimulatedBench, calibration: Calibration) -> ActiveCalibration:
-    """The calibration as the focus controller takes it from the messages on `calibration` and `mirror_info`."""
+    """What the focus controller makes of this message on `calibration`, and of `mirror_info` of the bench."""
     mirror, limits = bench.mirror, bench.limits
     info = MirrorInfo(
         name=mirror.name,
@@ -72,7 +75,7 @@ def active_of(bench: SimulatedBench, calibration: Calibration) -> ActiveCalibrat
         neighbour_difference_max=limits.neighbour_difference,
         slew_rate_max=bench.slew_rate,
     )
-    return active_calibration(calibration_message(calibration, None, "mirror", 1.0), info, APERTURE_TOLERANCE)
+    return active_calibration(calibration, info, APERTURE_TOLERANCE)
 
 
 def draw_targets(active: ActiveCalibration, count: int, rng: np.random.Generator) -> list[FocusTarget]:
@@ -104,21 +107,21 @@ def judge_requests(
     dwells: Floats,
 ) -> Requests:
     """Carry the requests out in order."""
-    served, kept, upper, stands, refused = [], [], [], [], 0
+    served, kept, upper, stands, refusals = [], [], [], [], []
     for target, dwell in zip(targets, dwells, strict=True):
         try:
             move = driven.plan(target)
             check_reachable(move, active, REACHABLE_TOLERANCE)
             driven.go(move)
             driven.hold(move, float(dwell))
-        except (Refusal, RecipeError):
-            refused += 1
+        except (Refusal, RecipeError) as error:
+            refusals.append(str(error))
             continue
         served.append(target)
         kept.append(dwell)
         upper.append(move.plan.max_zernike_upper)
         stands.append(driven.bench.true_displacement)
     if not served:
-        return Requests(np.empty(0), np.empty(0), np.empty(0), refused)
+        return Requests.none(refusals)
     errors, _ = surface.errors(np.array(stands), served)
-    return Requests(np.abs(errors).max(axis=1), np.array(upper), np.array(kept), refused)
+    return Requests(np.abs(errors).max(axis=1), np.array(upper), np.array(kept), tuple(refusals))
