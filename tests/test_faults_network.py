@@ -41,8 +41,9 @@ def wire() -> Iterator[tuple[Netem, socket.socket, socket.socket]]:
         pytest.skip(str(reason))
 
 
-def received(end: socket.socket) -> int:
-    end.settimeout(1.0)
+def received(end: socket.socket, wait_s: float = 1.0) -> int:
+    """Datagrams until none comes for so long."""
+    end.settimeout(wait_s)
     count = 0
     try:
         while end.recv(10):
@@ -59,7 +60,8 @@ def test_the_cable_loses_the_share_it_is_told(wire: tuple[Netem, socket.socket, 
     for _ in range(20):
         for _ in range(DATAGRAMS // 20):
             left.sendto(b"x", ("10.77.0.2", 5000))
-        got += received(right)
+        got += received(right, 0.25)
+    got += received(right)  # those that a busy machine delivers late
     assert 1.0 - got / DATAGRAMS == pytest.approx(0.05, abs=0.02)  # four standard deviations
 
 
