@@ -11,7 +11,7 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import doubles
 from dm_common.ros.parameters import declare
-from dm_controller.focus_actions import LOOP_PARAMETERS, serve_loops
+from dm_controller.focus_actions import LOOP_PARAMETERS, LoopHost, serve_loops
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
@@ -49,11 +49,11 @@ def mirror_info() -> MirrorInfo:
     )  # fmt: skip
 
 
-class Host(Node):
+class Host(Node, LoopHost):
     """What the focus controller does to host the action."""
 
     def __init__(self) -> None:
-        super().__init__("converge_host")
+        Node.__init__(self, "converge_host")
         self.refuse = False
         self.calibration: Calibration | None = calibration()
         self.values = declare(self, LOOP_PARAMETERS)

@@ -11,6 +11,7 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.limits import Limits
 from dm_controller.creep_hold import PERIOD_S, CreepHold
+from dm_controller.focus_types import CommandedShape, SendCommand, Sent
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.target import FocusTarget
@@ -36,8 +37,12 @@ class Shape:
         move = self.planner.plan(FocusTarget(0.03), state, 0.0, known, ahead=0.05)
         self.estimate = ActuatorEstimate(law.move(state, move.plan.signals, 0.0), "" if known else "a test says so")
         self.signals, self.effective = move.plan.signals, move.effective
-        self.hold.begin(self.planner, move.effective, self.signals, 0.0, known)
-        self.hold.driver_requested(self.signals, 0.0)
+        sent = Sent(SendCommand(self.signals, 0), None, 0.0, 0.0, confirmed=True)
+        self.commanded = self.hold.shape = CommandedShape(move, self.planner, sent, held=True, checked=0.0)
+
+    def send(self, signals: np.ndarray, now: float, confirmed: bool) -> None:
+        """A correction goes out."""
+        self.commanded.sent = Sent(SendCommand(signals, 0), None, now, now, confirmed)
 
     def correct(self, now: float) -> np.ndarray | None:
         """The correction due at `now`, carried out at once."""
@@ -47,8 +52,7 @@ class Shape:
             self.estimate = ActuatorEstimate(
                 self.planner.law.move(self.estimate.state, signals, now), self.estimate.unknown
             )
-            self.hold.sent(signals, now)
-            self.hold.driver_requested(signals, now)
+            self.send(signals, now, confirmed=True)
         return signals
 
 
@@ -88,7 +92,7 @@ def test_no_correction_before_the_driver_has_taken_the_last() -> None:
     shape = Shape()
     signals = shape.hold.correction(shape.estimate, 100.0)
     assert signals is not None
-    shape.hold.sent(signals, 100.0)
+    shape.send(signals, 100.0, confirmed=False)
     assert shape.hold.correction(shape.estimate, 200.0) is None
 
 
@@ -103,7 +107,7 @@ def test_a_command_that_the_driver_never_reports_ends_it() -> None:
     shape = Shape()
     signals = shape.hold.correction(shape.estimate, 100.0)
     assert signals is not None
-    shape.hold.sent(signals, 100.0)
+    shape.send(signals, 100.0, confirmed=False)
     shape.hold.driver_requested(shape.signals, 100.5)  # on its way
     assert shape.hold.active
     shape.hold.driver_requested(shape.signals, 101.5)
@@ -118,10 +122,6 @@ def test_a_history_that_gets_lost_ends_it() -> None:
 
 def test_a_shape_set_from_an_unknown_history_is_held_too() -> None:
     assert Shape(known=False).correct(100.0) is not None
-
-
-def test_a_mirror_without_creep_is_not_held() -> None:
-    assert not Shape(creep_rate=0.0).hold.active
 
 
 def test_it_is_checked_ever_more_rarely() -> None:

@@ -13,6 +13,7 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_controller.driver_monitor import DriverMonitor
 from dm_controller.focus_types import Order
 from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.choice import Degauss
 
 #: Half-swings that the driver does when it is not told how many, as far as can be known from here.
 STEPS_ASSUMED = 100
@@ -21,7 +22,7 @@ REPORT_S = 2.0
 
 
 @dataclass
-class _Run:
+class Run:
     """A degauss under way.
 
     Attributes:
@@ -44,24 +45,15 @@ class Conditioning:
     """At most one degauss at a time, and the order that waits for its end.
 
     Attributes:
+        run: the degauss under way; None = there is none.
         order: that waits; None = none does.
     """
 
     def __init__(self) -> None:
+        self.run: Run | None = None
         self.order: Order | None = None
-        self._run: _Run | None = None
         self._number = 0
         self._learnt: dict[int, float] = {}
-
-    @property
-    def busy(self) -> bool:
-        """Whether a degauss is under way."""
-        return self._run is not None
-
-    @property
-    def steps(self) -> int:
-        """Half-swings of the degauss under way; 0 = as configured in the driver."""
-        return self._run.steps if self._run is not None else 0
 
     def duration(self, steps: int, active: ActiveCalibration) -> float:
         """Time in s that a degauss of `steps` half-swings (0 = as the driver does) takes; 0 = not known.
@@ -77,19 +69,20 @@ class Conditioning:
             return 0.0
         return (0.5 * active.span * (steps or STEPS_ASSUMED) + active.span) / active.slew_rate
 
-    def prospect(self, active: ActiveCalibration, configured: int, now: float) -> tuple[int, bool, float]:
-        """Half-swings of the next degauss to end, whether it has begun, and s until it ends if it has."""
-        run = self._run
+    def prospect(self, active: ActiveCalibration, configured: int, now: float) -> Degauss:
+        """The next degauss to end: the one under way, or one of as many half-swings as `configured`."""
+        run = self.run
         if run is None:
-            return active.degauss_steps(configured), False, 0.0
-        return run.steps, True, max(0.0, self.duration(run.steps, active) - (now - run.began))
+            steps = active.degauss_steps(configured)
+            return Degauss(steps, False, self.duration(steps, active))
+        return Degauss(run.steps, True, max(0.0, self.duration(run.steps, active) - (now - run.began)))
 
     def begin(self, steps: int, monitor: DriverMonitor, now: float) -> int:
         """A degauss begins; returns the number of the run."""
         self._number += 1
         report = monitor.latest
         degausses = report.applied.degausses if report is not None else 0
-        self._run = _Run(self._number, steps, now, degausses, monitor.starts)
+        self.run = Run(self._number, steps, now, degausses, monitor.starts)
         return self._number
 
     def wait(self, order: Order) -> Order | None:
@@ -107,21 +100,21 @@ class Conditioning:
 
     def answered(self, number: int, duration: float, now: float) -> None:
         """The driver has answered run `number`, which took `duration` s, as done."""
-        run = self._run
+        run = self.run
         if run is not None and run.number == number:
             run.answered = now
             self._learnt[run.steps] = duration
 
     def reported(self, monitor: DriverMonitor) -> bool:
         """Whether the driver has answered and reported the degauss as complete."""
-        run, report = self._run, monitor.latest
+        run, report = self.run, monitor.latest
         if run is None or run.answered is None or report is None:
             return False
         return report.applied.degausses > run.degausses
 
     def failure(self, monitor: DriverMonitor, timeout: float, now: float) -> Refusal | None:
         """The reason why the degauss under way will not end as it should; None = it may."""
-        run = self._run
+        run = self.run
         if run is None:
             return None
         if run.answered is not None:
@@ -134,13 +127,9 @@ class Conditioning:
             gone = f"degauss: no answer within {timeout:g} s"
         return Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"conditioning: {gone}") if gone else None
 
-    def is_run(self, number: int) -> bool:
-        """Whether run `number` is under way."""
-        return self._run is not None and self._run.number == number
-
     def end(self) -> Order | None:
         """The degauss has ended; returns the order that waited for it."""
-        order, self.order, self._run = self.order, None, None
+        order, self.order, self.run = self.order, None, None
         if order is not None:
             order.pending = False
         return order

@@ -13,16 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import ActuatorEstimate
-from dm_controller.driver_monitor import SAME_SIGNAL
-from dm_controller.planning.planner import Planner
+from dm_controller.driver_monitor import same_signals
+from dm_controller.focus_types import CommandedShape
 
 Floats = NDArray[np.float64]
 
@@ -35,99 +33,74 @@ CHECK_SHARE = 0.1
 CONFIRM_S = 1.0
 
 
-@dataclass
-class _Held:
-    planner: Planner
-    effective: Floats
-    known: bool
-    signals: Floats
-    sent: float
-    checked: float
-    confirmed: bool = False
-
-
 class CreepHold:
-    """At most one shape.
+    """Keeps the shape that was commanded last.
 
     Args:
         values: parameters `hold.*`, live.
 
     Attributes:
+        shape: that was commanded last; None = none was yet.
         corrections: sent so far.
         ended: the reason why the last hold ended.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
-        self._held: _Held | None = None
+        self.shape: CommandedShape | None = None
         self.corrections = 0
         self.ended = ""
 
     @property
     def active(self) -> bool:
-        return self._held is not None
+        """Whether a shape is held."""
+        return self.shape is not None and self.shape.held
 
     @property
     def next_check(self) -> float:
         """When a correction can be due, s; infinite without a shape to hold."""
-        held = self._held
-        if held is None:
+        shape = self.shape
+        if shape is None or not shape.held:
             return math.inf
-        return max(held.sent + self._values["hold.period"], held.checked + CHECK_SHARE * (held.checked - held.sent))
-
-    def would_keep(self, law: HysteresisModel) -> bool:
-        """Whether a shape under `law` will be held."""
-        return bool(self._values["hold.enable"]) and law.creep_rate > 0.0
-
-    def begin(self, planner: Planner, effective: Floats, signals: Floats, now: float, known: bool) -> None:
-        """Hold `effective` (N,) after the command `signals` (N,) sent at `now` (s)."""
-        self._held = None
-        if self.would_keep(planner.law):
-            self._held = _Held(planner, effective, known, signals, now, now)
+        sent = shape.sent.time
+        return max(sent + self._values["hold.period"], shape.checked + CHECK_SHARE * (shape.checked - sent))
 
     def end(self, reason: str) -> None:
         """Leave the shape as it stands."""
-        if self._held is not None:
-            self._held, self.ended = None, reason
+        if self.shape is not None and self.shape.held:
+            self.shape.held, self.ended = False, reason
 
     def driver_requested(self, requested: Floats, now: float) -> None:
         """What the driver reports as its last request (N,): the hold ends when it is another's."""
-        held = self._held
-        if held is None:
+        shape = self.shape
+        if shape is None or same_signals(requested, shape.sent.command.signals):
             return
-        if requested.shape == held.signals.shape and np.abs(requested - held.signals).max() <= SAME_SIGNAL:
-            held.confirmed = True
-        elif held.confirmed or now - held.sent > CONFIRM_S:
+        if shape.sent.confirmed or now - shape.sent.time > CONFIRM_S:
             self.end("another command came")
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
         """The next command (N,) at `now` (s), the mirror being at rest in the state `estimate`; None = not yet."""
-        held, values = self._held, self._values
-        if held is None or estimate.state is None or not held.confirmed:
+        shape, values = self.shape, self._values
+        if shape is None or not shape.held or estimate.state is None or not shape.sent.confirmed:
             return None
-        if held.known and not estimate.known:
+        planner, effective, sent = shape.planner, shape.move.effective, shape.sent
+        if shape.move.known and not estimate.known:
             self.end(f"the history of the actuators was lost: {estimate.unknown}")
             return None
         if not values["hold.enable"]:
             self.end("hold.enable is false")
             return None
-        held.sent, held.checked = min(held.sent, now), min(held.checked, now)  # the clock was set back
+        sent.time, shape.checked = min(sent.time, now), min(shape.checked, now)  # the clock was set back
         if now < self.next_check:
             return None
-        held.checked = now
-        if held.planner.drift(estimate.state, now, held.effective) <= values["hold.tolerance"]:
+        shape.checked = now
+        if planner.drift(estimate.state, now, effective) <= values["hold.tolerance"]:
             return None
         # The interval to come is about as long as the one that ends; the shape is to be right in its middle.
-        ahead = 0.5 * (now - held.sent)
-        change = held.planner.hold(estimate.state, now, held.effective, ahead) - estimate.state.signals
+        ahead = 0.5 * (now - sent.time)
+        change = planner.hold(estimate.state, now, effective, ahead) - estimate.state.signals
         largest = float(np.abs(change).max())
         if largest < 0.5 * values["hold.resolution"]:
             return None
+        self.corrections += 1
         return estimate.state.signals + change * min(1.0, values["hold.slew"] / largest)
-
-    def sent(self, signals: Floats, now: float) -> None:
-        """A correction went out."""
-        held = self._held
-        if held is not None:
-            held.signals, held.sent, held.confirmed = signals, now, False
-            self.corrections += 1

@@ -6,16 +6,17 @@ old here, by the steady clock, and a command that no report confirms is told of.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from dm_msgs.msg import ActuatorState
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_controller.focus_types import DriverReport, Floats, Order, Progress, SendCommand
+from dm_controller.focus_types import CommandedShape, DriverReport, Floats, Order, Progress
 
 #: A message's constants are properties of its class, which take longer to look up.
 _ACTIVE = ActuatorState.STATE_ACTIVE
@@ -31,10 +32,9 @@ SAME_SIGNAL = 1e-9
 SUPERSEDED = Progress(failed=Refusal(ErrorCode.PREEMPTED, "another command took over"))
 
 
-class _Sent(NamedTuple):
-    command: SendCommand
-    order: Order | None
-    at: float
+def same_signals(one: Floats, other: Floats) -> bool:
+    """Whether two commands are the same one."""
+    return one.shape == other.shape and float(np.abs(one - other).max(initial=0.0)) <= SAME_SIGNAL
 
 
 class DriverMonitor:
@@ -44,19 +44,19 @@ class DriverMonitor:
         values: parameters `driver_timeout` and `move_timeout`.
 
     Attributes:
+        shape: that was commanded last; None = none was yet.
         latest: the driver's last report; None before the first.
         starts: how often the driver was activated anew, as far as reports tell.
+        trusted_until: s, until when the driver counts as one that takes commands; after it ask `check`.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
+        self.shape: CommandedShape | None = None
         self.latest: DriverReport | None = None
         self.starts = 0
+        self.trusted_until = -math.inf
         self._heard = 0.0
-        self._sent: _Sent | None = None
-        self._asked: Floats = np.zeros(0)  # signals of the last order's command; empty = its shape is not to be kept
-        self._last: Floats = np.zeros(0)  # signals of the last command: those, or with creep corrected
-        self._awaited: SendCommand | None = None
         self._latencies: deque[float] = deque(maxlen=MOVES)
 
     @property
@@ -69,24 +69,20 @@ class DriverMonitor:
         before, self.latest, self._heard = self.latest, report, now
         if before is not None and report.sequence < before.sequence:
             self.starts += 1
-        sent = self._sent
-        if sent is not None and np.array_equal(report.requested, sent.command.signals):
-            self._sent = None
-        command = self._awaited
-        if command is None or not np.array_equal(report.requested, command.signals):
+        self._trust()
+        if self.shape is None or self.shape.sent.confirmed:
             return False
-        self._awaited = None
-        seconds = 1e-9 * (report.stamp_ns - command.stamp_ns)
-        if not 0.0 <= seconds <= LATENCY_MAX_S:
+        sent = self.shape.sent
+        sent.confirmed = same_signals(report.requested, sent.command.signals)
+        seconds = 1e-9 * (report.stamp_ns - sent.command.stamp_ns)
+        if not sent.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
             return False
         self._latencies.append(seconds)
         return len(self._latencies) == 1
 
-    def sent(self, command: SendCommand, order: Order | None, now: float) -> None:
-        """This command went out, for `order` or, None, to correct the shape of the last one or to stop its move."""
-        self._sent, self._awaited, self._last = _Sent(command, order, now), command, command.signals
-        if order is not None:
-            self._asked = command.signals
+    def _trust(self) -> None:
+        active = self.latest is not None and self.latest.driver_state == _ACTIVE
+        self.trusted_until = self._heard + (self._values["driver_timeout"] or math.inf) if active else -math.inf
 
     def silent(self, now: float) -> str:
         """That the driver does not report any more, as a sentence; "" = it does, or never did."""
@@ -116,25 +112,20 @@ class DriverMonitor:
 
     def keeps(self, order: Order) -> bool:
         """Whether the last command is to keep the shape of `order`, be it corrected for creep."""
-        move = order.outcome.move if order.outcome is not None else None
-        if move is None or move.signals.shape != self._asked.shape:
+        move, shape = order.outcome.move, self.shape
+        if move is None or shape is None or not shape.kept:
             return False
-        return bool(np.allclose(move.signals, self._asked, rtol=0.0, atol=SAME_SIGNAL))
-
-    def release(self) -> None:
-        """The last order's shape is not to be kept any more."""
-        self._asked = np.zeros(0)
+        return same_signals(move.signals, shape.move.signals)
 
     def progress(self, order: Order, now: float) -> Progress:
         """How far the driver is with `order`."""
-        assert order.outcome is not None
         if order.outcome.refusal is not None:
             return Progress(failed=order.outcome.refusal)
         assert order.outcome.move is not None
         if order.pending:
             expected = order.outcome.move.duration
             return Progress(True, min(1.0, (now - order.began) / expected) if expected > 0.0 else 0.0)
-        if not self.keeps(order):
+        if self.shape is None or not self.keeps(order):
             return SUPERSEDED
         signals = order.outcome.move.signals
         report = self.latest
@@ -148,7 +139,7 @@ class DriverMonitor:
             gap = float(np.abs(report.applied.signals - signals).max())
             order.gap = max(order.gap, gap)
             share = 1.0 - gap / order.gap if order.gap else 1.0
-            ours = any(np.allclose(report.requested, own, rtol=0.0, atol=SAME_SIGNAL) for own in (signals, self._last))
+            ours = any(same_signals(report.requested, own) for own in (signals, self.shape.sent.command.signals))
             if ours and not report.applied.moving:
                 return Progress(share=1.0, remaining=gap, stands=True)
             if order.taken and not ours:
@@ -164,10 +155,14 @@ class DriverMonitor:
 
         None = there is none. A command that went out later is the one that counts: the latest wins at the driver too.
         """
-        sent, limit = self._sent, self._values["driver_timeout"]
-        if sent is None or not limit or now - sent.at <= limit:
+        self._trust()  # the parameter may have changed
+        limit = self._values["driver_timeout"]
+        if self.shape is None or not limit:
             return None
-        self._sent = None
+        sent = self.shape.sent
+        if sent.confirmed or sent.given_up or now - sent.steady <= limit:
+            return None
+        sent.given_up = True
         text = f"the driver has not taken the command within {limit:g} s"
         try:
             self.check(now)

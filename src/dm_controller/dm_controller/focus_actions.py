@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from dm_msgs.action import BuildRecipes, Converge, MoveFocus
 from dm_msgs.msg import FocusRequest
@@ -20,10 +20,12 @@ from dm_common.measurement import Measurement
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.parameters import Parameter, real, whole
 from dm_common.ros.worker import WorkerActionServer, sleep
-from dm_controller.focus_host import FocusHost
 from dm_controller.focus_types import Order
 from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import FocusTarget, Request
+
+if TYPE_CHECKING:
+    from dm_controller.focus_controller_node import FocusControllerNode
 
 #: Parameters that the hosting node declares beside its own.
 LOOP_PARAMETERS = (
@@ -57,20 +59,33 @@ LOOP_PARAMETERS = (
 )
 
 
-class LoopHost(Protocol):
-    """What the hosting node offers; every method may be called from any thread."""
+class LoopHost:
+    """What closed loops ask of the focus controller, from any thread."""
+
+    def __init__(self, node: FocusControllerNode) -> None:
+        self._node = node
 
     def target(self, request: FocusRequest) -> FocusTarget:
-        """The target of a request that could be carried out; else raises Refusal."""
+        """The target of a request that could be carried out. Raises Refusal."""
+        with self._node.controller() as (controller, now):
+            return controller.judge(Request.from_message(request), now).target
 
     def active_calibration(self) -> ActiveCalibration:
-        """The calibration in use; raises Refusal when there is none."""
+        """The calibration in use. Raises Refusal."""
+        with self._node.controller() as (controller, _now):
+            if controller.active is None:
+                raise controller.not_calibrated
+            return controller.active
 
     def hysteresis(self) -> HysteresisState | None:
         """What is known of the actuators; None = nothing."""
+        with self._node.controller() as (controller, now):
+            return controller.observer.estimate(now.time).state
 
     def reserve(self, text: str) -> None:
         """Refuse requests from now on, with this sentence as the reason; "" = serve them again."""
+        with self._node.controller() as (controller, _now):
+            controller.reserved = text
 
 
 class LoopBench(BenchServices):
@@ -162,13 +177,12 @@ class MoveFocusAction:
     """Serves `move_focus` in worker threads; the newest goal pre-empts.
 
     Args:
-        node: hosts the action.
-        host: carries the requests out.
+        node: hosts the action and carries the requests out.
         settle_time: s, for goals that name none.
     """
 
-    def __init__(self, node: Node, host: FocusHost, settle_time: float) -> None:
-        self._clock, self._host, self._settle_time = node.get_clock(), host, settle_time
+    def __init__(self, node: FocusControllerNode, settle_time: float) -> None:
+        self._node, self._settle_time = node, settle_time
         self._server = WorkerActionServer(node, MoveFocus, "move_focus", self._run, exclusive="preempt")
 
     def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
@@ -179,13 +193,13 @@ class MoveFocusAction:
 
     def _carry_out(self, handle: ServerGoalHandle, result: MoveFocus.Result) -> tuple[str, int, str]:
         """Outcome, ErrorCode and message of a goal; fills the state of `result`."""
-        goal, host = handle.request, self._host
+        goal, node = handle.request, self._node
         # Goals that wait for their turn may get it in another order than they came in.
         if self._to_stop(handle):
             return self._stopped(handle, None)
         handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_PLAN))
         if goal.tolerance > 0.0:
-            preview = host.state(host.order(goal.request, dry_run=True))
+            preview = node.state(node.order(goal.request, dry_run=True).outcome)
             if preview.error_code == ErrorCode.OK and preview.predicted_max_zernike > goal.tolerance:
                 result.state = preview
                 return (
@@ -194,15 +208,17 @@ class MoveFocusAction:
                     f"tolerance = {goal.tolerance * 1e9:.2f} nm: the predicted largest coefficient error is "
                     f"{preview.predicted_max_zernike * 1e9:.2f} nm; nothing moved",
                 )
-        order = host.order(goal.request)
+        order = node.order(goal.request)
         ended = self._follow(handle, order)
-        result.state = host.state(order)
+        result.state = node.state(order.outcome)
         if ended is not None:
             return ended
         handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))
-        if not sleep(self._clock, goal.settle_time or self._settle_time, lambda: self._to_stop(handle)):
+        if not sleep(node.get_clock(), goal.settle_time or self._settle_time, lambda: self._to_stop(handle)):
             return self._stopped(handle, order)
-        if not host.keeps(order):
+        with node.controller() as (controller, _now):
+            keeps = controller.monitor.keeps(order)
+        if not keeps:
             return "abort", ErrorCode.PREEMPTED, "another command took over"
         return "succeed", ErrorCode.OK, f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
 
@@ -210,7 +226,8 @@ class MoveFocusAction:
         """Wait until the shape of `order` stands; None when it does."""
         next_feedback = 0.0
         while True:
-            progress = self._host.progress(order)
+            with self._node.controller() as (controller, now):
+                progress = controller.monitor.progress(order, now.steady)
             if progress.stands:
                 return None
             if progress.failed is not None:
@@ -234,13 +251,14 @@ class MoveFocusAction:
         On cancel the mirror holds the shape it has, unless it is under way to one that was asked for since; a newer
         goal goes on from there by itself.
         """
-        waited = order is not None and self._host.withdraw(order)
+        with self._node.controller() as (controller, _now):
+            waited = order is not None and controller.conditioning.withdraw(order)
         if not handle.is_cancel_requested:
             return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
         if order is None:
             return "canceled", ErrorCode.CANCELED, "canceled before anything moved"
         if waited:
             return "canceled", ErrorCode.CANCELED, "canceled; the degauss under way ends at mid range"
-        if self._host.stop(order):
+        if self._node.stop(order):
             return "canceled", ErrorCode.CANCELED, "canceled; the mirror holds the shape it had reached"
         return "canceled", ErrorCode.CANCELED, "canceled; the mirror follows a newer request"

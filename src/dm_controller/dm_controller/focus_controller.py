@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dm_msgs.msg import ActuatorState
+from dm_msgs.msg import ActuatorState, FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.hysteresis.observer import HysteresisObserver
+from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
 from dm_controller.conditioning import Conditioning
 from dm_controller.creep_hold import CreepHold
 from dm_controller.driver_monitor import DriverMonitor
 from dm_controller.focus_types import (
+    CommandedShape,
     DriverReport,
     Effect,
     Floats,
@@ -28,15 +29,16 @@ from dm_controller.focus_types import (
     PublishCapabilities,
     PublishState,
     SendCommand,
+    Sent,
     StartDegauss,
 )
 from dm_controller.planning.active_calibration import NO_CALIBRATION, ActiveCalibration, active_calibration
-from dm_controller.planning.choice import PlanningContext, check_reachable, choose_move
+from dm_controller.planning.choice import Degauss, PlanningContext, check_reachable, choose_move
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import Request
 
 #: A message's constants are properties of its class, which take longer to look up.
-_ACTIVE = ActuatorState.STATE_ACTIVE
+_ACTIVE, _CONDITIONED = ActuatorState.STATE_ACTIVE, FocusRequest.MODE_CONDITIONED
 #: How often a held shape is checked while no correction can be due sooner, s.
 SLOW_PERIOD_S = 1.0
 
@@ -66,6 +68,7 @@ class FocusController:
         self.observer, self.monitor, self.hold = HysteresisObserver(), DriverMonitor(values), CreepHold(values)
         self.conditioning = Conditioning()
         self._reported: tuple[object, ...] = ()  # what the last capabilities said of the driver
+        self._at_rest: ActuatorEstimate | None = None  # what a mirror at rest holds until its next report
         self.requests = self.refused = 0
         self.degauss_offered = False
         self.reserved = ""
@@ -87,7 +90,7 @@ class FocusController:
             elif not before.planner.law.same_as(active.planner.law):
                 self.hold.end("the hysteresis model changed")
             self.observer.use(active.planner.law, active.middle)
-            self.active = active
+            self.active, self._at_rest = active, None
             effects.append(Log("info", f"using calibration {active.calibration.id} of {mirror.serial}"))
         except Refusal as refusal:
             self.active, self.not_calibrated = None, refusal
@@ -107,9 +110,9 @@ class FocusController:
             self.hold.end("the driver is not active")
         elif self.hold.active:
             self.hold.driver_requested(report.requested, now.time)
-        state = self.observer.state
-        if self.active is not None and state is not None and not report.applied.moving:
-            self.active.planner.prepare(state)
+        self._at_rest = None if report.applied.moving else self.observer.estimate(now.time)
+        if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
+            self.active.planner.prepare(self._at_rest.state)
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
         known = report.driver_state, self.observer.unknown
         if latency_learnt or self._reported != known:
@@ -125,7 +128,7 @@ class FocusController:
         The newest request wins.
         """
         self.requests += 1
-        return self._attempt(Order(request, began=now.steady), now, dry_run)
+        return self._attempt(Order(request, Outcome(request, now.ns), began=now.steady), now, dry_run)
 
     def judge(self, request: Request, now: Moment, degaussed: int | None = None) -> Move:
         """The move that a request asks for, from the mirror as it is.
@@ -142,20 +145,14 @@ class FocusController:
             raise Refusal(ErrorCode.STALE, f"header.stamp: the request is {age:.3f} s old; allowed: {limit:g} s")
         if active is None:
             raise self.not_calibrated
-        steps, begun, wait = degaussed, degaussed is not None, 0.0
-        if steps is None:
-            steps, begun, wait = self.conditioning.prospect(active, values["condition.degauss_steps"], now.steady)
-        context = PlanningContext(
-            active,
-            self.observer.estimate(now.time, active.slew_rate),
-            now.time,
-            values["settle_time"],
-            steps,
-            begun,
-            wait,
-            self.conditioning.duration(steps, active),
-        )
-        return choose_move(request, values["time_budget"], context)
+        time_budget, degauss = values["time_budget"], None
+        if degaussed is not None:
+            degauss = Degauss(degaussed, True, 0.0)
+        elif self.conditioning.run is not None or request.mode == _CONDITIONED or request.time_budget or time_budget:
+            degauss = self.conditioning.prospect(active, values["condition.degauss_steps"], now.steady)
+        estimate = self._at_rest or self.observer.estimate(now.time, active.slew_rate)
+        context = PlanningContext(active, estimate, now.time, values["settle_time"], degauss)
+        return choose_move(request, time_budget, context)
 
     def _attempt(
         self, order: Order, now: Moment, dry_run: bool = False, degaussed: int | None = None
@@ -168,10 +165,11 @@ class FocusController:
             assert self.active is not None
             check_reachable(move, self.active, self._values["reachable_tolerance"])
             if not dry_run:
-                self.monitor.check(now.steady)
+                if now.steady > self.monitor.trusted_until:
+                    self.monitor.check(now.steady)
                 if self.reserved:
                     raise Refusal(ErrorCode.BUSY, f"{self.reserved}; cancel it first")
-                if degaussed is not None or (move.degauss is None and not self.conditioning.busy):
+                if degaussed is not None or (move.degauss is None and self.conditioning.run is None):
                     effects.append(self._go(order, move, now))
                     applied = True
                 else:
@@ -185,8 +183,8 @@ class FocusController:
             move,
             applied=applied,
             pending=order.pending,
-            unknown=self.observer.unknown,
-            creep_held=self.active is not None and self.hold.would_keep(self.active.planner.law),
+            unknown=(self._at_rest or self.observer).unknown,
+            creep_held=self._holds(),
             refusal=refusal,
         )
         if refusal is not None:
@@ -203,16 +201,22 @@ class FocusController:
         return [Log("warning", f"refused: {refusal}"), PublishState(order.outcome)]
 
     def _go(self, order: Order, move: Move, now: Moment) -> SendCommand:
-        """The command of `move`, whose shape is held from now on."""
+        """The command of `move`, whose shape is to stand from now on."""
         assert self.active is not None
         order.began = now.steady
-        self.hold.begin(self.active.planner, move.effective, move.signals, now.time, move.known)
-        return self._send(move.signals, now, order)
+        sent = Sent(SendCommand(move.signals, now.ns), order, now.time, now.steady)
+        shape = CommandedShape(move, self.active.planner, sent, self._holds(), now.time)
+        self.monitor.shape = self.hold.shape = shape
+        return sent.command
 
-    def _send(self, signals: Floats, now: Moment, order: Order | None = None, expected_turns: int = 0) -> SendCommand:
-        command = SendCommand(signals, now.ns, expected_turns)
-        self.monitor.sent(command, order, now.steady)
-        return command
+    def _holds(self) -> bool:
+        """Whether shapes are corrected for creep."""
+        return self.active is not None and self._values["hold.enable"] and self.active.planner.law.creep_rate > 0.0
+
+    def _send_on(self, shape: CommandedShape, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
+        """Another command for the shape that was commanded last."""
+        shape.sent = Sent(SendCommand(signals, now.ns, expected_turns), None, now.time, now.steady)
+        return shape.sent.command
 
     # --- a degauss on the way ---
 
@@ -227,7 +231,7 @@ class FocusController:
             before.pending = False
             refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
             effects += self._refuse(before, refusal, now)
-        if not self.conditioning.busy:
+        if self.conditioning.run is None:
             steps = move.degauss or 0
             effects.append(StartDegauss(self.conditioning.begin(steps, self.monitor, now.steady), steps))
         return effects
@@ -236,7 +240,7 @@ class FocusController:
         self, number: int, now: Moment, duration: float = 0.0, refusal: Refusal | None = None
     ) -> list[Effect]:
         """The driver has answered the degauss of run `number`: done in `duration` s, or refused."""
-        if not self.conditioning.is_run(number):
+        if self.conditioning.run is None or self.conditioning.run.number != number:
             return []
         if refusal is not None:
             return self._degauss_ended(now, refusal)
@@ -245,13 +249,12 @@ class FocusController:
         return [PublishCapabilities(), *ended]
 
     def _degauss_ended(self, now: Moment, refusal: Refusal | None) -> list[Effect]:
-        steps = self.conditioning.steps
-        order = self.conditioning.end()
+        run, order = self.conditioning.run, self.conditioning.end()
         if order is None:
             return []
         if refusal is not None:
             return self._refuse(order, refusal, now)
-        return self._attempt(order, now, degaussed=steps)[1]
+        return self._attempt(order, now, degaussed=run.steps if run is not None else 0)[1]
 
     # --- time ---
 
@@ -271,11 +274,11 @@ class FocusController:
 
     def quick_ticks(self, now: Moment) -> bool:
         """Whether something can be due before `SLOW_PERIOD_S` has passed."""
-        return self.conditioning.busy or self.hold.next_check - now.time <= SLOW_PERIOD_S
+        return self.conditioning.run is not None or self.hold.next_check - now.time <= SLOW_PERIOD_S
 
     def _compensate_creep(self, now: Moment) -> list[Effect]:
-        report = self.monitor.latest
-        if not self.hold.active or report is None or report.applied.moving:
+        report, shape = self.monitor.latest, self.hold.shape
+        if shape is None or not shape.held or report is None or report.applied.moving:
             return []
         if self.reserved:
             self.hold.end(self.reserved)
@@ -283,16 +286,15 @@ class FocusController:
         signals = self.hold.correction(self.observer.estimate(now.time), now.time)
         if signals is None:
             return []
-        self.hold.sent(signals, now.time)
-        return [self._send(signals, now, expected_turns=report.applied.turns)]
+        return [self._send_on(shape, signals, now, expected_turns=report.applied.turns)]
 
     def stop(self, order: Order, now: Moment) -> list[Effect] | None:
         """Leave the move of `order` where it is; None = another shape was asked for since, and nothing is sent."""
-        if not self.monitor.keeps(order):
+        report, shape = self.monitor.latest, self.monitor.shape
+        if shape is None or not self.monitor.keeps(order):
             return None
         self.hold.end("the move was cancelled")
-        self.monitor.release()
-        report = self.monitor.latest
+        shape.kept = False
         if report is None or not report.applied.signals.size:
             return []
-        return [self._send(report.applied.signals, now)]
+        return [self._send_on(shape, report.applied.signals, now)]

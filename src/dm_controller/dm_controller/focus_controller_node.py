@@ -6,50 +6,104 @@ Translates messages, parameters and time; what happens is decided in `dm_control
 from __future__ import annotations
 
 import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from dm_msgs.msg import ActuatorState, Calibration, FocusRequest, MirrorInfo
+from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
 from dm_msgs.srv import Flatten, SetFocus
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from dm_common.errors import Refusal
+from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import never_silent
-from dm_controller.focus_actions import MoveFocusAction, serve_loops
-from dm_controller.focus_host import FocusHost
+from dm_controller.degauss_client import DegaussClient
+from dm_controller.focus_actions import LoopHost, MoveFocusAction, serve_loops
+from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
+from dm_controller.focus_messages import capabilities_message, driver_report_from, health, state_message
 from dm_controller.focus_parameters import PARAMETERS
+from dm_controller.focus_types import (
+    Effect,
+    Moment,
+    Order,
+    Outcome,
+    PublishCapabilities,
+    PublishState,
+    SendCommand,
+    StartDegauss,
+)
+from dm_controller.forecast import ForecastClient
+from dm_controller.planning.target import Request
+
+#: How often silence of the driver is noticed, s of wall time.
+STEADY_PERIOD_S = 0.5
+#: `focus_state` is worked out so much after its command, s: else it would take the core that the driver is woken up on.
+STATE_DELAY_S = 1e-3
 
 
 class FocusControllerNode(Node):
-    """See README for the interfaces."""
+    """Subscriptions, services and timers run in the executor, actions in threads of their own. See README."""
 
     def __init__(self, **keywords: Any) -> None:
         super().__init__("focus_controller", **keywords)
-        values = declare(self, PARAMETERS, on_change=lambda _changes: self._host.publish_capabilities())
-        self._host = host = FocusHost(self, values)
+        self._values = values = declare(self, PARAMETERS, on_change=lambda _changes: self._publish_capabilities())
+        self._lock, self._controller = threading.Lock(), FocusController(values)
         self._mirror: MirrorInfo | None = None
         self._calibration: Calibration | None = None
-        self._diagnostics = diagnostics.Diagnostics(self, "", host.health)
-        self._actions = MoveFocusAction(self, host, values["settle_time"]), *serve_loops(self, values, host)
+        self._outcomes: list[Outcome] = []
+        self._command = self.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
+        self._focus_state = self.create_publisher(FocusState, "focus_state", qos.STATE)
+        self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.LATCHED)
+        self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._quick = self.create_timer(values["hold.period"], self._tick)
+        self._states_due = self.create_timer(STATE_DELAY_S, self._publish_states, clock=steady, autostart=False)
+        self.create_timer(SLOW_PERIOD_S, self._tick)
+        self.create_timer(STEADY_PERIOD_S, self._tick, clock=steady)
+        self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
+        self._actions = MoveFocusAction(self, values["settle_time"]), *serve_loops(self, values, LoopHost(self))
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
-        self.create_subscription(ActuatorState, "actuator_state", host.driver_report, qos.STATE)
-        self.create_subscription(FocusRequest, "focus_request", self._on_focus_request, qos.COMMAND)
+        self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
+        self.create_subscription(FocusRequest, "focus_request", self.order, qos.COMMAND)
         for kind, name, answer in ((SetFocus, "set_focus", self._on_set_focus), (Flatten, "flatten", self._on_flatten)):
             self.create_service(kind, name, never_silent(self, name, answer), qos_profile=qos.SERVICE)
-        host.publish_capabilities()
+        self._publish_capabilities()
+
+    @contextmanager
+    def controller(self) -> Iterator[tuple[FocusController, Moment]]:
+        """The controller, for one thread at a time, and what time it is."""
+        with self._lock:
+            clock = self.get_clock()  # without a simulator its time is the system's, which costs a tenth
+            ns = int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
+            yield self._controller, Moment(ns, 1e-9 * ns, time.monotonic())
+
+    # --- what comes in ---
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror, self._diagnostics.hardware_id = message, message.serial
-        self._host.use(self._calibration, self._mirror)
+        self._use()
 
     def _on_calibration(self, message: Calibration) -> None:
         self._calibration = message
-        self._host.use(self._calibration, self._mirror)
+        self._use()
 
-    def _on_focus_request(self, message: FocusRequest) -> None:
-        self._host.order(message)
+    def _use(self) -> None:
+        with self.controller() as (controller, now):
+            self._do(controller.use(self._calibration, self._mirror), now)
+            self._forecast.use(controller.active, self._values["reachable_tolerance"])
+
+    def _on_actuator_state(self, message: ActuatorState) -> None:
+        report = driver_report_from(message)
+        with self.controller() as (controller, now):
+            controller.degauss_offered = self._degauss.offered
+            self._do(controller.driver_report(report, now), now)
 
     def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
         return self._answer(request.request, request.dry_run, response)
@@ -58,9 +112,83 @@ class FocusControllerNode(Node):
         return self._answer(FocusRequest(), request.dry_run, response)
 
     def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
-        response.state = self._host.state(self._host.order(request, dry_run))
+        response.state = self.state(self.order(request, dry_run).outcome)
         response.error_code, response.message = response.state.error_code, response.state.message
         return response
+
+    def _tick(self) -> None:
+        with self.controller() as (controller, now):
+            controller.degauss_offered = self._degauss.offered
+            self._degauss.retry()
+            self._do(controller.tick(now), now)
+
+    def _degauss_ended(self, number: int, duration: float, refusal: Refusal | None) -> None:
+        with self.controller() as (controller, now):
+            self._do(controller.degauss_answered(number, now, duration, refusal), now)
+
+    # --- what goes out ---
+
+    def _do(self, effects: Iterable[Effect], now: Moment) -> None:
+        for effect in effects:
+            if isinstance(effect, SendCommand):
+                command = ActuatorCommand(signals=doubles(effect.signals), expected_turns=effect.expected_turns)
+                command.header.stamp = time_message(effect.stamp_ns)
+                self._command.publish(command)
+            elif isinstance(effect, PublishState):
+                self._outcomes.append(effect.outcome)
+                if self._states_due.is_canceled():
+                    self._states_due.reset()
+            elif isinstance(effect, PublishCapabilities):
+                self._publish_capabilities()
+            elif isinstance(effect, StartDegauss):
+                self._degauss.start(effect)
+            # One line per severity: rclpy ties a severity to the line that logs.
+            elif effect.level == "info":
+                self.get_logger().info(effect.text)
+            elif effect.level == "warning":
+                self.get_logger().warning(effect.text, throttle_duration_sec=1.0)
+            else:
+                self.get_logger().error(effect.text)
+        # Tick quickly only while something can be due soon.
+        if not self._controller.quick_ticks(now):
+            self._quick.cancel()
+        elif self._quick.is_canceled():
+            self._quick.reset()
+
+    def _publish_states(self) -> None:
+        self._states_due.cancel()
+        while self._outcomes:
+            self._focus_state.publish(self.state(self._outcomes.pop(0)))
+
+    def state(self, outcome: Outcome) -> FocusState:
+        """What came of a request."""
+        self._forecast.use(self._controller.active, self._values["reachable_tolerance"])
+        return state_message(outcome, self._values, self._forecast.share)
+
+    def _publish_capabilities(self) -> None:
+        now_ns = int(self.get_clock().now().nanoseconds)
+        self._capabilities.publish(capabilities_message(self._controller, self._mirror, self._values, now_ns))
+
+    def _health(self) -> diagnostics.Health:
+        with self.controller() as (controller, now):
+            return health(controller, self._values, now)
+
+    # --- requests, and what the actions ask for, from any thread ---
+
+    def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
+        """Judge a request and, unless it is refused or a dry run, carry it out."""
+        request = Request.from_message(message)
+        with self.controller() as (controller, now):
+            order, effects = controller.request(request, now, dry_run)
+            self._do(effects, now)
+        return order
+
+    def stop(self, order: Order) -> bool:
+        """Leave the move of an order where it is; False = another shape was asked for since."""
+        with self.controller() as (controller, now):
+            effects = controller.stop(order, now)
+            self._do(effects or (), now)
+        return effects is not None
 
 
 def main() -> int:

@@ -7,28 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorCommand, ActuatorState, Capabilities, FocusRequest, FocusState, MirrorInfo
+from dm_msgs.msg import ActuatorState, Capabilities, FocusState, MirrorInfo
 
 from dm_common.errors import Refusal
 from dm_common.hysteresis.observer import CURE
 from dm_common.messages import applied_from, doubles, stamp_ns, time_message
+from dm_common.ros import diagnostics
 from dm_controller.focus_controller import FocusController
-from dm_controller.focus_types import DriverReport, Moment, Outcome, SendCommand
+from dm_controller.focus_types import DriverReport, Moment, Outcome
 from dm_controller.forecast import HysteresisShare
 from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.target import FocusTarget, Request
-
-
-def request_from(message: FocusRequest) -> Request:
-    """What a dm_msgs/FocusRequest asks for."""
-    return Request(
-        message.curvature,
-        message.conic_constant,
-        tuple(message.zernike),
-        message.mode,
-        message.time_budget,
-        stamp_ns(message.header.stamp),
-    )
+from dm_controller.planning.target import FocusTarget
 
 
 def driver_report_from(message: ActuatorState) -> DriverReport:
@@ -44,13 +33,6 @@ def driver_report_from(message: ActuatorState) -> DriverReport:
         message.error_code,
         message.message,
     )
-
-
-def command_message(command: SendCommand) -> ActuatorCommand:
-    """A command to publish."""
-    message = ActuatorCommand(signals=doubles(command.signals), expected_turns=command.expected_turns)
-    message.header.stamp = time_message(command.stamp_ns)
-    return message
 
 
 def state_message(outcome: Outcome, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:
@@ -115,8 +97,21 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
     return remarks(controller.active, controller.observer.unknown, values, now.ns)
 
 
+def health(controller: FocusController, values: Mapping[str, Any], now: Moment) -> diagnostics.Health:
+    """The health of the node whose parameters are `values`."""
+    figures = {
+        "requests": controller.requests,
+        "refused": controller.refused,
+        "history": controller.observer.unknown or "known",
+        "held": controller.hold.active,
+        "corrections": controller.hold.corrections,
+    }
+    text = trouble(controller, values, now)
+    return diagnostics.Health(diagnostics.WARN if text else diagnostics.OK, text or "ready", figures)
+
+
 def capabilities_message(
-    controller: FocusController, mirror: MirrorInfo | None, values: Mapping[str, Any], now: Moment
+    controller: FocusController, mirror: MirrorInfo | None, values: Mapping[str, Any], now_ns: int
 ) -> Capabilities:
     """What the mirror can do now.
 
@@ -124,11 +119,11 @@ def capabilities_message(
         controller: of the mirror.
         mirror: None = not known.
         values: parameters of the node.
-        now: for the header.
+        now_ns: for the header.
     """
     active, unknown, tolerance = controller.active, controller.observer.unknown, values["reachable_tolerance"]
     message = Capabilities(residual_tolerance=tolerance, latency=controller.monitor.latency)
-    message.header.stamp = time_message(now.ns)
+    message.header.stamp = time_message(now_ns)
     if mirror is not None and mirror.slew_rate_max > 0.0:
         # From the first write to the settled shape over the full range.
         message.settling = (mirror.signal_max - mirror.signal_min) / mirror.slew_rate_max
@@ -139,7 +134,7 @@ def capabilities_message(
     sentences = [f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
     if unknown and active.planner.hysteresis is not None:
         sentences.append(f"wider error bound: {unknown}")
-    if stale := active.stale(now.ns, values["calibration_age_max"]):
+    if stale := active.stale(now_ns, values["calibration_age_max"]):
         sentences.append(stale)
     message.calibration_id, message.quality = active.calibration.id, active.calibration.quality
     message.curvature_min, message.curvature_max = low, high

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dm_common.errors import Refusal
 from dm_common.hysteresis.observer import Applied
 from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.planner import Move
+from dm_controller.planning.planner import Move, Planner
 from dm_controller.planning.target import Request
 
 Floats = NDArray[np.float64]
@@ -22,16 +22,13 @@ class Moment(NamedTuple):
 
     Attributes:
         ns: ROS time, that commands, reports and creep go by; a simulator may let it run fast, or stop it.
+        time: the same in s.
         steady: s, of a clock that goes on whatever ROS time does: silence and patience go by it.
     """
 
     ns: int
+    time: float
     steady: float
-
-    @property
-    def time(self) -> float:
-        """ROS time, s."""
-        return 1e-9 * self.ns
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +93,7 @@ class Order:
     """
 
     request: Request
-    outcome: Outcome | None = None
+    outcome: Outcome
     pending: bool = False
     began: float = 0.0
     taken: bool = False
@@ -161,6 +158,49 @@ class Log(NamedTuple):
 
     level: str
     text: str
+
+
+# --- what was commanded ---
+
+
+@dataclass(eq=False)
+class Sent:
+    """A command that went out.
+
+    Attributes:
+        order: that it answers; None = it corrects a shape for creep, or stops its move.
+        time, steady: s, when.
+        confirmed: the driver reported it as its own.
+        given_up: the driver did not in time, and that was said.
+    """
+
+    command: SendCommand
+    order: Order | None
+    time: float
+    steady: float
+    confirmed: bool = False
+    given_up: bool = False
+
+
+@dataclass(eq=False)
+class CommandedShape:
+    """The shape that was commanded last: `DriverMonitor` watches it come about, `CreepHold` keeps it.
+
+    Attributes:
+        move: to it.
+        planner: of the move.
+        sent: the last command for it.
+        held: it is corrected for creep.
+        checked: s, ROS time, when creep was looked at last.
+        kept: its move was not stopped.
+    """
+
+    move: Move
+    planner: Planner
+    sent: Sent
+    held: bool
+    checked: float
+    kept: bool = True
 
 
 Effect = SendCommand | StartDegauss | PublishState | PublishCapabilities | Log

@@ -11,8 +11,9 @@ from dm_msgs.msg import ActuatorState
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.observer import Applied
 from dm_controller.driver_monitor import DriverMonitor
-from dm_controller.focus_types import DriverReport, Order, SendCommand
-from dm_controller.planning.target import Request
+from dm_controller.focus_types import CommandedShape, DriverReport, Order, Outcome, SendCommand, Sent
+from dm_controller.planning.planner import Move
+from dm_controller.planning.target import FocusTarget, Request
 
 TIMEOUT = 2.0
 HERE, THERE = np.full(37, 0.1), np.full(37, 0.2)
@@ -26,10 +27,19 @@ def report(requested: np.ndarray = HERE, sequence: int = 1, **fields: Any) -> Dr
     return DriverReport(applied, requested, fields.pop("stamp_ns", 0), sequence=sequence, **fields)
 
 
+def command(driver: DriverMonitor, signals: np.ndarray, order: Order | None) -> None:
+    """A command goes out, one second after the epoch."""
+    none: Any = None  # neither prediction nor planner
+    move = Move(FocusTarget(0.01), signals, signals, 0.0, True, 0.0, none)
+    sent = Sent(SendCommand(signals, 10**9), order, 1.0, BEGAN)
+    driver.shape = CommandedShape(move, none, sent, held=False, checked=1.0)
+
+
 def monitor(timeout: float = TIMEOUT) -> DriverMonitor:
     made = DriverMonitor({"driver_timeout": timeout})
     made.observe(report(), BEGAN)
-    made.sent(SendCommand(THERE, 10**9), Order(Request(curvature=0.01)), BEGAN)
+    request = Request(curvature=0.01)
+    command(made, THERE, Order(request, Outcome(request, 0)))
     return made
 
 
@@ -95,6 +105,6 @@ def test_the_latency_is_from_the_command_to_its_first_write() -> None:
     assert driver.latency == 0.0
     assert driver.observe(report(THERE, stamp_ns=10**9 + 2_000_000), BEGAN)
     assert driver.latency == pytest.approx(2e-3)
-    driver.sent(SendCommand(HERE, 10**9), None, BEGAN)
+    command(driver, HERE, None)
     assert not driver.observe(report(HERE, stamp_ns=10**9 + 4_000_000), BEGAN)
     assert driver.latency == pytest.approx(3e-3)

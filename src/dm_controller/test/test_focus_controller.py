@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -133,7 +134,7 @@ class Bench:
 
     @property
     def now(self) -> Moment:
-        return Moment(round(1e9 * self.time), self.time)
+        return Moment(round(1e9 * self.time), self.time, self.time)
 
     def do(self, effects: Iterable[Effect]) -> None:
         for effect in effects:
@@ -224,6 +225,13 @@ def test_a_request_becomes_a_command_and_then_a_state(bench: Bench) -> None:
     assert bench.controller.monitor.latency == 0.0
     bench.time += 0.05
     assert bench.error(move_of(order).effective) < 1e-6
+
+
+def test_a_mirror_without_creep_is_not_held(bench: Bench) -> None:
+    bench.do(bench.controller.use(calibration("other", replace(LAW, creep_rate=0.0)), MIRROR))
+    bench.ask()
+    assert bench.outcomes[-1].applied and not bench.outcomes[-1].creep_held
+    assert not bench.controller.hold.active
 
 
 def test_a_dry_run_changes_nothing(bench: Bench) -> None:
@@ -334,7 +342,7 @@ def test_a_withdrawn_order_leaves_the_mirror_degaussed(bench: Bench) -> None:
     assert not bench.controller.conditioning.withdraw(order)
     bench.degauss()
     bench.do(bench.controller.degauss_answered(bench.degauss_runs[0].number, bench.now, 0.2))
-    assert bench.commands == [] and not bench.controller.conditioning.busy
+    assert bench.commands == [] and bench.controller.conditioning.run is None
 
 
 def stopped(bench: Bench) -> None:

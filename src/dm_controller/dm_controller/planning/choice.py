@@ -21,6 +21,20 @@ _MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CO
 _AUTO, _DIRECT, _CONDITIONED = _MODES
 
 
+class Degauss(NamedTuple):
+    """The degauss that a move can begin with.
+
+    Attributes:
+        steps: half-swings, 0 = as the driver does.
+        begun: it is under way or has just ended.
+        wait: s until it ends, from its beginning if it has not begun; 0 = it has ended, or not known.
+    """
+
+    steps: int
+    begun: bool
+    wait: float
+
+
 class PlanningContext(NamedTuple):
     """What a move depends on beside the request.
 
@@ -29,20 +43,14 @@ class PlanningContext(NamedTuple):
         estimate: the actuators now.
         now: s, ROS time.
         settle: s after the way at which the shape is to be right.
-        steps: half-swings of the degauss that conditions, 0 = as the driver does.
-        degaussed: such a degauss is under way or has just ended.
-        wait: s until it ends.
-        degauss_time: s that a whole one takes; 0 = not known.
+        degauss: None = there is no time for one.
     """
 
     active: ActiveCalibration
     estimate: ActuatorEstimate
     now: float
     settle: float
-    steps: int
-    degaussed: bool
-    wait: float
-    degauss_time: float
+    degauss: Degauss | None
 
 
 def choose_move(request: Request, time_budget: float, context: PlanningContext) -> Move:
@@ -60,24 +68,29 @@ def choose_move(request: Request, time_budget: float, context: PlanningContext) 
         )
     try:
         target = FocusTarget(request.curvature, request.conic_constant, request.zernike)
-        if mode == _DIRECT:
+        if context.degauss is None:
             return _direct(target, context)
         if mode == _CONDITIONED:
-            return _conditioned(target, context)
-        return _best(target, budget or time_budget, context)
+            return _conditioned(target, context, context.degauss)
+        if mode == _DIRECT:
+            return _unconditioned(target, context, context.degauss)
+        return _best(target, budget or time_budget, context, context.degauss)
     except TargetError as error:
         raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
 
 
 def _direct(target: FocusTarget, context: PlanningContext) -> Move:
-    """From where the mirror stands, or will stand after the degauss under way."""
-    if context.degaussed:
-        return _after_degauss(target, context, None)
+    """From where the mirror stands."""
     estimate, planner = context.estimate, context.active.planner
-    return planner.plan(target, estimate.state, context.now, estimate.known, ahead=context.settle)
+    return planner.plan(target, estimate.state, context.now, not estimate.unknown, ahead=context.settle)
 
 
-def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
+def _unconditioned(target: FocusTarget, context: PlanningContext, degauss: Degauss) -> Move:
+    """From where the mirror stands, or will stand after the degauss under way."""
+    return _after_degauss(target, context, degauss, None) if degauss.begun else _direct(target, context)
+
+
+def _conditioned(target: FocusTarget, context: PlanningContext, degauss: Degauss) -> Move:
     """A degauss, then the recipe.
 
     Raises:
@@ -88,45 +101,44 @@ def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
         raise Refusal(
             ErrorCode.NOT_SUPPORTED, "mode CONDITIONED: this calibration holds no recipes; use AUTO or DIRECT"
         )
-    if context.steps != book.degauss_steps:
+    if degauss.steps != book.degauss_steps:
         raise Refusal(
             ErrorCode.CALIBRATION_MISMATCH,
             f"mode CONDITIONED: the recipes begin with a degauss of {book.degauss_steps} half-swings, not of "
-            f"{context.steps} (condition.degauss_steps): build them again, or set it to 0",
+            f"{degauss.steps} (condition.degauss_steps): build them again, or set it to 0",
         )
     try:
         recipe = find(book, target)
     except RecipeError as error:
         raise Refusal(ErrorCode.OUT_OF_RANGE, f"mode CONDITIONED: {error}") from error
-    return replace(_after_degauss(target, context, recipe), mode=_CONDITIONED)
+    return replace(_after_degauss(target, context, degauss, recipe), mode=_CONDITIONED)
 
 
-def _best(target: FocusTarget, budget: float, context: PlanningContext) -> Move:
+def _best(target: FocusTarget, budget: float, context: PlanningContext, degauss: Degauss) -> Move:
     """The way with the smallest bound of its error among those within `budget` s."""
-    direct = _direct(target, context)
-    if not context.degaussed and not 0.0 < context.degauss_time <= budget:
-        return direct
-    ways = [direct]
-    if not context.degaussed and not direct.known:
-        # Even where the model cannot say by how much, a mirror whose history is known repeats better.
-        fresh = _after_degauss(target, context, None)
-        if fresh.duration <= budget:
-            ways = [fresh]
+    ways = [_unconditioned(target, context, degauss)]
+    if not degauss.begun:
+        if not 0.0 < degauss.wait <= budget:
+            return ways[0]
+        if not ways[0].known:
+            # Even where the model cannot say by how much, a mirror whose history is known repeats better.
+            fresh = _after_degauss(target, context, degauss, None)
+            if fresh.duration <= budget:
+                ways = [fresh]
     try:
-        recipe = _conditioned(target, context)
-        if context.degaussed or recipe.duration <= budget:
+        recipe = _conditioned(target, context, degauss)
+        if degauss.begun or recipe.duration <= budget:
             ways.append(recipe)
     except Refusal:
         pass  # none serves: the other ways remain
     return min(ways, key=lambda way: way.plan.max_zernike_upper)
 
 
-def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundRecipe | None) -> Move:
+def _after_degauss(target: FocusTarget, context: PlanningContext, degauss: Degauss, recipe: FoundRecipe | None) -> Move:
     """The move after the degauss that is under way, has just ended, or has to begin first."""
     active, estimate = context.active, context.estimate
-    wait = context.wait if context.degaussed else context.degauss_time
-    begin = context.now + wait
-    if not context.degaussed or wait > 0.0:
+    begin = context.now + degauss.wait
+    if not degauss.begun or degauss.wait > 0.0:
         estimate = estimate.after_degauss(active.planner.law, active.calibration.actuators, begin, active.middle)
     move = active.planner.plan(
         target,
@@ -137,7 +149,7 @@ def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundR
         ahead=context.settle,
         error=recipe.error if recipe is not None else None,
     )
-    return replace(move, duration=wait + move.duration, degauss=None if context.degaussed else context.steps)
+    return replace(move, duration=degauss.wait + move.duration, degauss=None if degauss.begun else degauss.steps)
 
 
 def check_reachable(move: Move, active: ActiveCalibration, tolerance: float) -> None:

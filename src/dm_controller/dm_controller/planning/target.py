@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from dm_msgs.msg import FocusRequest
 from numpy.typing import NDArray
 
+from dm_common.messages import stamp_ns
 from dm_common.optics.conic import conic_coefficients, conic_sag
 from dm_common.optics.zernike import TERMS, basis
 
@@ -89,3 +91,14 @@ class Request:
     mode: int = 0
     time_budget: float = 0.0
     stamp_ns: int = 0
+
+    @classmethod
+    def from_message(cls, message: FocusRequest) -> Request:
+        return cls(
+            message.curvature,
+            message.conic_constant,
+            tuple(message.zernike),
+            message.mode,
+            message.time_budget,
+            stamp_ns(message.header.stamp),
+        )
