@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dm_calibration.report.document import Picture, Section
-from dm_calibration.report.html_page import PNG_DPI, html_page
+from dm_calibration.report.html_page import html_page
 from dm_calibration.report.pdf_pages import pdf_pages
 from studies.paper.page import content, content_coefficients, content_control, content_regressions, content_sampling
 from studies.paper.results import Results
@@ -48,7 +48,7 @@ def write_html(folder: Path, title: str, sections: Sequence[Section]) -> Path:
 
     def place(picture: Picture) -> str:
         file = f"{picture.name}.png"
-        (folder / file).write_bytes(picture.png(PNG_DPI))
+        (folder / file).write_bytes(picture.png)
         return file
 
     page = folder / "index.html"

@@ -9,8 +9,6 @@ from string import Template
 
 from dm_calibration.report.document import Picture, Section, Table
 
-PNG_DPI = 110
-
 _PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -57,7 +55,7 @@ def one_html(title: str, sections: Sequence[Section]) -> str:
     return html_page(
         title,
         sections,
-        lambda picture: f"data:image/png;base64,{base64.b64encode(picture.png(PNG_DPI)).decode('ascii')}",
+        lambda picture: f"data:image/png;base64,{base64.b64encode(picture.png).decode('ascii')}",
     )
 
 

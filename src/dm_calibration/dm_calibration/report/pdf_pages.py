@@ -31,8 +31,6 @@ from reportlab.platypus import (
 
 from dm_calibration.report.document import Picture, Section, Table
 
-#: Of pictures on paper, dots per inch.
-DPI = 200
 #: Lengths in points, 1/72 inch.
 MARGIN = 48.0
 WIDTH = A4[0] - 2 * MARGIN
@@ -91,7 +89,7 @@ def _picture(picture: Picture) -> Flowable:
     """A picture as wide as the text, or as high as a page, with its caption below it on the same page."""
     width, height = (72.0 * length for length in picture.figure.get_size_inches())
     scale = min(WIDTH / width, HEIGHT / height)
-    image = Image(io.BytesIO(picture.png(DPI * scale)), width * scale, height * scale)
+    image = Image(io.BytesIO(picture.png), width * scale, height * scale)
     return KeepTogether([image, _paragraph(picture.caption, CAPTION)])
 
 
