@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, PreisachHysteresis, skew_density
+from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, skew_density
 from dm_simulation.mirror.piezo import DRAWN, PiezoActuators, PiezoConfig
 from dm_simulation.mirror.preisach import PreisachOperator, drawn_density
 
@@ -18,6 +20,16 @@ Array = NDArray[np.float64]
 HYSTERETIC = ("prandtl_ishlinskii", "preisach", "bouc_wen", "drawn_preisach", "drawn_bouc_wen")
 RETURN_POINT = ("prandtl_ishlinskii", "preisach", "drawn_preisach")
 signal = st.floats(-1, 1, allow_nan=False)
+
+
+@cache
+def made(law: str) -> Hysteresis:
+    return Hysteresis(law, 0.1, 1)
+
+
+def fresh(law: str) -> Hysteresis:
+    """One actuator with a loop of a tenth that has not moved yet."""
+    return copy.deepcopy(made(law))
 
 
 def drive(law: Hysteresis, *signals: float) -> Array:
@@ -47,7 +59,7 @@ def test_without_hysteresis_the_law_is_a_straight_line() -> None:
 @settings(max_examples=25, deadline=None)
 @given(history=st.lists(signal, max_size=8), start=signal, stop=signal)
 def test_branches_are_monotone(law: str, history: list[float], start: float, stop: float) -> None:
-    hysteresis = Hysteresis(law, 0.1, 1)
+    hysteresis = fresh(law)
     branch = drive(hysteresis, *history, *np.linspace(start, stop, 40))[len(history) :]
     assert np.all(np.diff(branch) * np.sign(stop - start) >= -1e-12)
 
@@ -57,7 +69,7 @@ def test_branches_are_monotone(law: str, history: list[float], start: float, sto
 @given(turns=st.lists(signal, min_size=1, max_size=8), cuts=st.integers(2, 9))
 def test_rate_independence(law: str, turns: list[float], cuts: int) -> None:
     """Only the turning points count, not in how many steps a move is made."""
-    at_once, in_steps = Hysteresis(law, 0.1, 1), Hysteresis(law, 0.1, 1)
+    at_once, in_steps = fresh(law), fresh(law)
     last = 0.0
     for turn in turns:
         whole = drive(at_once, turn)[-1]
@@ -73,7 +85,7 @@ def test_rate_independence(law: str, turns: list[float], cuts: int) -> None:
 def test_return_point_memory(law: str, history: list[float], low: float, high: float, inner: float) -> None:
     """A minor loop closes exactly, and wipes itself out: what follows is as if it had not been."""
     high, low = max(high, low), min(high, low)
-    disturbed, plain = Hysteresis(law, 0.1, 1), Hysteresis(law, 0.1, 1)
+    disturbed, plain = fresh(law), fresh(law)
     before = drive(disturbed, *history, low, high)[-1]
     turn = high - inner * (high - low)
     after = drive(disturbed, turn, high)[-1]
@@ -95,7 +107,7 @@ def test_minor_loops_between_the_same_signals_are_congruent(law: str) -> None:
     """Congruency holds for Preisach and Prandtl-Ishlinskii: the loops differ by a constant only."""
     loops = []
     for history in ([1.0], [-1.0], [1.0, -0.4], [-1.0, 0.9, -0.3]):
-        hysteresis = Hysteresis(law, 0.1, 1)
+        hysteresis = fresh(law)
         drive(hysteresis, *history, 0.1)
         drive(hysteresis, 0.5, 0.1)
         loop = drive(hysteresis, *np.linspace(0.1, 0.5, 21), *np.linspace(0.5, 0.1, 21))
@@ -107,7 +119,7 @@ def test_minor_loops_between_the_same_signals_are_congruent(law: str) -> None:
 
 def major_loop_asymmetry(law: str) -> float:
     """How far the loop is from its own point reflection."""
-    hysteresis = Hysteresis(law, 0.1, 1)
+    hysteresis = fresh(law)
     grid = np.linspace(-1, 1, 201)
     for _ in range(4):
         rising, falling = drive(hysteresis, *grid), drive(hysteresis, *grid[::-1])
@@ -125,7 +137,7 @@ def test_preisach_equals_a_crowd_of_relays() -> None:
     radii, centres = 128, 1200
     r = (np.arange(radii) + 0.5) / radii
     v = (np.arange(centres) + 0.5) / centres * 4 - 2
-    law = PreisachHysteresis(1, skew_density)
+    law = PreisachOperator(1, skew_density)
     weight = skew_density(v[None, :], r[:, None]) * (4 / centres) / radii
     up = np.repeat((v < 0)[None, :], radii, axis=0)
     start = (weight * up).sum()

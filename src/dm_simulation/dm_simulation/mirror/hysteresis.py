@@ -9,11 +9,11 @@ vendors state hysteresis.
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
+from typing import Protocol
 
 import numpy as np
 
-from dm_simulation.mirror.preisach import PreisachOperator, Relays, drawn_density
+from dm_simulation.mirror.preisach import PreisachOperator, drawn_density
 from dm_simulation.mirror.zernike import Array
 
 #: Bouc-Wen laws are integrated in steps of at most so much of a signal.
@@ -22,15 +22,14 @@ BOUC_WEN_STEP = 0.02
 SWEEP_POINTS, SWEEP_CYCLES = 61, 2
 
 
-class HysteresisLaw(ABC):
-    """The part of the response that depends on the past. `move(u)` takes signals (N,) and returns m (N,)."""
+class HysteresisLaw(Protocol):
+    """The part of the response that depends on the past."""
 
-    @abstractmethod
     def move(self, u: Array) -> Array:
-        """Go monotonically from the last signals to `u`."""
+        """Go monotonically from the last signals to `u` (N,) and return m (N,)."""
 
 
-class NoHysteresis(HysteresisLaw):
+class NoHysteresis:
     """A linear actuator."""
 
     def __init__(self, count: int) -> None:
@@ -38,16 +37,6 @@ class NoHysteresis(HysteresisLaw):
 
     def move(self, u: Array) -> Array:
         return self._zero
-
-
-class PreisachHysteresis(HysteresisLaw):
-    """A Preisach operator whose density of relays is that of every actuator, or each actuator's own."""
-
-    def __init__(self, count: int, relays: Relays) -> None:
-        self._operator = PreisachOperator(count, relays)
-
-    def move(self, u: Array) -> Array:
-        return self._operator.move(u)
 
 
 def prandtl_ishlinskii_density(v: Array, r: Array) -> Array:
@@ -60,7 +49,7 @@ def skew_density(v: Array, r: Array) -> Array:
     return np.exp(-r / 0.3) * (1 + 0.45 * v - 0.12 * v * v)
 
 
-class BoucWenHysteresis(HysteresisLaw):
+class BoucWenHysteresis:
     """Bouc-Wen of any order n, the lag -z: along the way dz/d|u| = 1 - onward |z|^n, with onward = -back against it.
 
     The generalised law of [20] with three constants: z saturates earlier on falling than on rising moves where the two
@@ -99,7 +88,7 @@ class BoucWenHysteresis(HysteresisLaw):
         return -self._z
 
 
-class MixedHysteresis(HysteresisLaw):
+class MixedHysteresis:
     """A weighted sum of two laws."""
 
     def __init__(self, parts: tuple[tuple[Array | float, HysteresisLaw], ...]) -> None:
@@ -107,10 +96,6 @@ class MixedHysteresis(HysteresisLaw):
 
     def move(self, u: Array) -> Array:
         return np.sum([weight * law.move(u) for weight, law in self._parts], axis=0)
-
-
-def _drawn_preisach(count: int, rng: np.random.Generator) -> HysteresisLaw:
-    return PreisachHysteresis(count, drawn_density(count, rng))
 
 
 def _drawn_bouc_wen(count: int, rng: np.random.Generator) -> HysteresisLaw:
@@ -124,7 +109,10 @@ def _drawn_mixed(count: int, rng: np.random.Generator) -> HysteresisLaw:
     """Both in parts that differ between the actuators, each law alone with a loop of the same opening."""
     share = np.clip(rng.uniform(0.2, 0.8) + 0.1 * rng.standard_normal(count), 0.0, 1.0)
     parts = []
-    for law, part in ((_drawn_preisach(count, rng), share), (_drawn_bouc_wen(count, rng), 1 - share)):
+    for law, part in (
+        (PreisachOperator(count, drawn_density(count, rng)), share),
+        (_drawn_bouc_wen(count, rng), 1 - share),
+    ):
         rising, falling = _full_loop(law, count)
         parts.append((part / np.max(falling - rising, axis=0), law))
     return MixedHysteresis(tuple(parts))
@@ -135,16 +123,16 @@ def _make(law: str, count: int, rng: np.random.Generator) -> HysteresisLaw:
         case "none":
             return NoHysteresis(count)
         case "prandtl_ishlinskii":
-            return PreisachHysteresis(count, prandtl_ishlinskii_density)
+            return PreisachOperator(count, prandtl_ishlinskii_density)
         case "preisach":
-            return PreisachHysteresis(count, skew_density)
+            return PreisachOperator(count, skew_density)
         case "bouc_wen":
             return BoucWenHysteresis(count, 1.0, 2.2, 2.2, 1.0)
         case "mixed":
             bouc_wen = BoucWenHysteresis(count, 2.0, 2.0, 3.2, 0.8)
-            return MixedHysteresis(((4.0, PreisachHysteresis(count, skew_density)), (0.5, bouc_wen)))
+            return MixedHysteresis(((4.0, PreisachOperator(count, skew_density)), (0.5, bouc_wen)))
         case "drawn_preisach":
-            return _drawn_preisach(count, rng)
+            return PreisachOperator(count, drawn_density(count, rng))
         case "drawn_bouc_wen":
             return _drawn_bouc_wen(count, rng)
         case "drawn_mixed":
