@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import statsmodels.api as sm
 
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.regression.stepwise import FREEDOM_MIN, SelectionOptions, leave_one_out, stepwise
@@ -14,11 +13,19 @@ from dm_calibration.regression.stepwise import FREEDOM_MIN, SelectionOptions, le
 NAMES = [f"x{k}" for k in range(58)]
 
 
+@pytest.fixture
+def sm() -> Any:
+    """Not when the tests are collected, of whose time it took a tenth in every worker."""
+    import statsmodels.api
+
+    return statsmodels.api
+
+
 def candidates(seed: int, n: int = 50, count: int = 58) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((n, count))
 
 
-def test_finds_the_variables_that_matter_and_agrees_with_statsmodels() -> None:
+def test_finds_the_variables_that_matter_and_agrees_with_statsmodels(sm: Any) -> None:
     x = candidates(1)
     # Scales as apart as signals (1) and coefficients (1e-6 m).
     x[:, 40] *= 1e-6
@@ -49,7 +56,7 @@ def test_a_variable_made_superfluous_by_later_ones_leaves_again() -> None:
     assert set(fit.variables) == {"x0", "x1"}
 
 
-def test_weights_are_those_of_weighted_least_squares() -> None:
+def test_weights_are_those_of_weighted_least_squares(sm: Any) -> None:
     rng = np.random.default_rng(4)
     x = candidates(4, n=400, count=3)
     weights = rng.uniform(0.05, 1.0, 400)
