@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -34,6 +35,7 @@ def name_of(path: Path, home: str) -> str:
 MODULES = {name_of(path, home): path for home in HOMES for path in sorted(HOMES[home].rglob("*.py"))}
 
 
+@cache
 def imports(module: str) -> set[str]:
     """Modules of this project that a module imports, anywhere in its text."""
     found: set[str] = set()
@@ -43,9 +45,6 @@ def imports(module: str) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
     return (found & MODULES.keys()) - {module}
-
-
-IMPORTS = {module: imports(module) for module in MODULES}
 
 
 def is_package(module: str) -> bool:
@@ -60,13 +59,13 @@ def folder(module: str) -> str:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_what_is_installed_needs_nothing_of_the_checkout(package: str) -> None:
     for module in (name for name in MODULES if name.split(".")[0] == package):
-        others = {name for name in IMPORTS[module] if name.split(".")[0] in CHECKOUT}
+        others = {name for name in imports(module) if name.split(".")[0] in CHECKOUT}
         assert not others, f"{module} imports {others}"
 
 
 def test_studies_do_not_need_the_fault_injection() -> None:
     for module in (name for name in MODULES if name.startswith("studies")):
-        assert not {name for name in IMPORTS[module] if name.startswith("fault_injection")}, module
+        assert not {name for name in imports(module) if name.startswith("fault_injection")}, module
 
 
 def loaded(module: str) -> set[str]:
@@ -78,7 +77,7 @@ def loaded(module: str) -> set[str]:
         if name in found or name not in MODULES:
             continue
         found.add(name)
-        waiting += [*IMPORTS[name], name.rpartition(".")[0]]
+        waiting += [*imports(name), name.rpartition(".")[0]]
     return found
 
 
@@ -100,7 +99,7 @@ def test_folders_side_by_side_import_in_no_circle(home: str) -> None:
     needs: dict[str, set[str]] = {}
     for module in (name for name in MODULES if name.split(".")[0] == home):
         here = folder(module)
-        others = {folder(other) for other in IMPORTS[module] if other.split(".")[0] == home}
+        others = {folder(other) for other in imports(module) if other.split(".")[0] == home}
         needs.setdefault(here, set()).update(x for x in others if not x.startswith(here) and not here.startswith(x))
     TopologicalSorter(needs).prepare()  # raises CycleError, which names the circle
 
@@ -118,7 +117,7 @@ def test_modules_can_be_read_at_one_sitting(home: str) -> None:
 
 
 def test_small_modules_serve_more_than_one() -> None:
-    importers = Counter(other for module in MODULES for other in IMPORTS[module])
+    importers = Counter(other for module in MODULES for other in imports(module))
     small = {
         name
         for name, path in MODULES.items()
