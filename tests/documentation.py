@@ -107,6 +107,7 @@ PARSED = {
     "./dm demo": _LONG + "test_end_to_end.py runs it",
     "./dm demo --camera": _LONG + "its parts run in test_autofocus_node.py",
     "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
+    "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
     "./dm test": "would run this test again",
     "./dm test --fast": "would run tests within a test",
     "./dm test src/dm_common/test/test_zernike_terms.py": "would run tests within a test",
@@ -167,6 +168,7 @@ PRELUDES = {
 PYTHON_ELSEWHERE = {
     ("camera.md", 1): "is examples/camera_focus.py, which test_autofocus_node.py runs",
     ("calibrate.md", 1): "is the beginning of examples/calibrate_folder.py, which test_calibrate.py runs",
+    ("calibrate.md", 2): "is the beginning of examples/compare_laws.py, which test_any_measurement.py runs",
 }
 
 

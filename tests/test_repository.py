@@ -103,7 +103,7 @@ def test_packages_declare_what_they_import(package: str) -> None:
     assert {KEYS.get(name, name) for name in used} <= declared
 
 
-@pytest.mark.parametrize("name", ["bench.yaml", "hardware.yaml", "mirror_19.yaml"])
+@pytest.mark.parametrize("name", ["bench.yaml", "hardware.yaml", "mirror_19.yaml", "membrane_37.yaml"])
 def test_shipped_configurations_name_only_parameters_that_exist(name: str) -> None:
     config = load_config(SOURCE / "dm_bringup" / "config" / name)
     for node, values in config.items():

@@ -1,4 +1,7 @@
-"""Interferometer map ingest and calibration of deformable mirrors: `calibrate` makes a calibration of maps."""
+"""Interferometer map ingest and calibration of deformable mirrors.
+
+`calibrate` makes a calibration of maps, `identify_response` compares laws on any linear measurement.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dm_calibration.calibrator import calibrate
+    from dm_calibration.hysteresis.response_fit import identify_response
 
-__all__ = ["calibrate"]
+__all__ = ["calibrate", "identify_response"]
 
 
 def __getattr__(name: str) -> Any:
@@ -16,4 +20,8 @@ def __getattr__(name: str) -> Any:
         from dm_calibration.calibrator import calibrate
 
         return calibrate
+    if name == "identify_response":
+        from dm_calibration.hysteresis.response_fit import identify_response
+
+        return identify_response
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -54,6 +54,8 @@ def identify(
     test: Rows | None = None,
     candidates: Sequence[Candidate] = CANDIDATES,
     folds: int = 4,
+    blocks: int = 1,
+    slope_min: float = SLOPE_MIN,
     progress: Callable[[str], None] = lambda step: None,
 ) -> Identification:
     """Find the law that predicts best.
@@ -62,7 +64,9 @@ def identify(
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
         candidates: in this order; the first has no hysteresis to invert, an own one follows common ones and counts
             only where the best of them has hysteresis as it has.
-        folds: contiguous parts of the run that are predicted from the others.
+        folds: parts of the run that are predicted from the others.
+        blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
+        slope_min: smallest slope of a law over the signals of the run.
 
     Raises:
         ExcitationError: the run does not show hysteresis.
@@ -74,7 +78,7 @@ def identify(
     train = usable & ~test
     scatter = _scatter(run, train)
     part = np.zeros(len(usable), dtype=int)
-    part[train] = np.arange(train.sum()) * folds // train.sum()
+    part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
@@ -86,7 +90,7 @@ def identify(
         progress(name)
         whole = problem.fit(train)
         slope = whole.law.slope_min(*reach)
-        if slope < SLOPE_MIN:
+        if slope < slope_min:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
             return
         held_out = np.full_like(whole.residual, np.nan)

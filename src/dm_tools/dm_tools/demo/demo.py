@@ -52,7 +52,15 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
     }
 
 
-def best_possible(calibration: Any, mirror: Any) -> float:
+def curvatures_of(capabilities: Any) -> tuple[float, ...]:
+    """Curvatures [1/m] of the sweep: the article's, or eleven over the range of a mirror that does not reach those."""
+    low, high = capabilities.curvature_min, capabilities.curvature_max
+    if low <= CURVATURES[0] and CURVATURES[-1] <= high:
+        return CURVATURES
+    return tuple(round(low + (high - low) * (0.02 + 0.096 * step), 4) for step in range(11))
+
+
+def best_possible(calibration: Any, mirror: Any, ends: tuple[float, float]) -> float:
     """Rms sag [m] that the best command inside the limits leaves at the ends of the sweep, as the model says."""
     from dm_common.messages import limits_from
     from dm_controller.planning.active_calibration import model_of
@@ -60,7 +68,7 @@ def best_possible(calibration: Any, mirror: Any) -> float:
     from dm_controller.planning.target import FocusTarget
 
     calibrated = CalibratedMirror(model_of(calibration), limits_from(mirror))
-    return max(calibrated.plan(FocusTarget(curvature)).rms for curvature in (CURVATURES[0], CURVATURES[-1]))
+    return max(calibrated.plan(FocusTarget(curvature)).rms for curvature in ends)
 
 
 def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
@@ -70,10 +78,10 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
     from dm_controller.planning.target import FocusTarget
     from dm_tools.verify import map_of, surface_error
 
-    rows = []
+    rows, curvatures = [], curvatures_of(client.capabilities)
     with progress_bar() as progress:
-        task = progress.add_task("focus", total=len(CURVATURES))
-        for curvature in CURVATURES:
+        task = progress.add_task("focus", total=len(curvatures))
+        for curvature in curvatures:
             prediction = client.focus(curvature, dry_run=True)
             client.move_focus(curvature, settle_time=settle)
             measurement, image = client.measure_map(f"focus {curvature:+.3f}")
@@ -110,8 +118,8 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
         table.add_column(heading, justify="right")
     for row in rows:
         table.add_row(
-            f"{row['curvature']:+.2f}",
-            f"{2 * row['curvature']:+.2f}",
+            f"{row['curvature']:+.3f}",
+            f"{2 * row['curvature']:+.3f}",
             f"{nanometres(row['prediction'].predicted_rms):.1f}",
             f"{nanometres(row['error'].rms):.1f}",
             f"{nanometres(row['error'].max_zernike):.2f}",
@@ -121,7 +129,7 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
     console.print(table)
     worst = max(row["error"].max_zernike for row in rows)
     console.print(
-        f"fitting limit of this mirror at 0.05 1/m: {nanometres(fitting_limit):.1f} nm rms; "
+        f"fitting limit of this mirror at the ends of the sweep: {nanometres(fitting_limit):.1f} nm rms; "
         f"largest coefficient error of the sweep: {nanometres(worst):.2f} nm ({as_wavelengths(worst)})"
     )
 
@@ -217,9 +225,10 @@ def demo(
             wait_for_calibration(client, result.id)
             console.print(f"reachable: {client.capabilities.message}")
             mirror = client.mirror_info
-            fitting_limit = best_possible(client.latest("calibration"), mirror)
             settle = float(config["calibration"]["settle_time"])
             rows, without_hysteresis = sweep(client, settle), []
+            ends = rows[0]["curvature"], rows[-1]["curvature"]
+            fitting_limit = best_possible(client.latest("calibration"), mirror, ends)
             if hysteresis_maps and (hysteresis is not Hysteresis.off or actual_creep):
                 show_sweep(rows, fitting_limit, "influence function alone")
                 without_hysteresis = rows

@@ -1,0 +1,142 @@
+"""The law of a mirror from any linear measurement of it: sag, Zernike coefficients, slopes of a wavefront sensor.
+
+Records of other laboratories, of mirrors by any principle, need neither ROS nor map files: commands, what was measured
+and times are enough to see which law predicts best, and by how much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
+from dm_calibration.hysteresis.features import follow
+from dm_calibration.hysteresis.identify import identify
+from dm_calibration.hysteresis.responses import Responses
+from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S
+from dm_common.hysteresis.model import HysteresisModel
+
+Floats = NDArray[np.float64]
+
+#: Laws that are compared: those of a calibration, and squares of the signal between straight and cubic.
+LAWS = (CANDIDATES[0], Candidate("squares", 0, 2, 0), *CANDIDATES[1:])
+#: Size that all measurements are brought to, m, that of a deformation: thresholds of the fit are made for it.
+_SIZE = 1e-6
+#: Blocks of rows that make each part left out.
+_BLOCKS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseFit:
+    """What a record says of its mirror. D are the numbers of one measurement, in their own unit.
+
+    Attributes:
+        name: class of the law that predicts best; of nearly equal ones the simplest.
+        law: of the actuators, from the whole record.
+        influence: (N, D) what a unit of each effective signal does.
+        figure: (D,) what was measured at effective signals 0, in the mean over the record.
+        drift: (D,) change of that from the first measurement to the last.
+        held_out: error of each law on parts of the record that it was not fitted to, relative to the signal: rms over
+            all numbers, divided by their standard deviation over the record.
+        measurements: number of rows used.
+    """
+
+    name: str
+    law: HysteresisModel
+    influence: Floats
+    figure: Floats
+    drift: Floats
+    held_out: dict[str, float]
+    measurements: int
+
+    def predict(self, commands: ArrayLike, times: ArrayLike | None = None) -> Floats:
+        """(M, D) what `commands` (M, N) from a degauss, or from rest, at `times` (M,) s, lead to."""
+        signals = np.asarray(commands, dtype=np.float64)
+        return np.asarray(self.figure + _effective(self.law, signals, _seconds(times, len(signals))) @ self.influence)
+
+    def __str__(self) -> str:
+        """The laws side by side, the best marked."""
+        width = max(len(name) for name in self.held_out)
+        rows = [f"{'law':<{width}}  held-out error, % of the signal ({self.measurements} measurements)"]
+        rows += [
+            f"{name:<{width}}  {100 * error:.2f}{' <' * (name == self.name)}" for name, error in self.held_out.items()
+        ]
+        return "\n".join(rows)
+
+
+def identify_response(
+    commands: ArrayLike,
+    measured: ArrayLike,
+    times: ArrayLike | None = None,
+    *,
+    candidates: Sequence[Candidate] = LAWS,
+) -> ResponseFit:
+    """Fit each law to a record and compare what they predict of its parts left out.
+
+    Parameters
+    ----------
+    commands : array_like (M, N)
+        Signals that stood at the mirror, normalised to -1..+1, in order: some hundred random ones, from a degauss or,
+        where there is no hysteresis, from anywhere.
+    measured : array_like (M, D)
+        What was measured, of equal uncertainty and linear in the surface: sag or slopes at points, coefficients. Take
+        off first what is not the mirror's, such as a tilt that differs from map to map. Rows with NaN do not count.
+    times : array_like (M,), optional
+        When, s. Creep and drift need them; one second apart where not given.
+    candidates
+        Laws to compare, as for :func:`~dm_calibration.hysteresis.identify.identify`.
+
+    Raises
+    ------
+    ExcitationError
+        Too few measurements, or actuators that hardly move or turn.
+    ValueError
+        Arrays that do not belong together, measurements that never change, or times that run backwards.
+    """
+    signals, values = (np.asarray(array, dtype=np.float64) for array in (commands, measured))
+    if signals.ndim != 2 or not np.isfinite(signals).all():
+        raise ValueError(f"commands has the shape {signals.shape}: must be (measurements, actuators) finite numbers")
+    if values.ndim != 2 or len(values) != len(signals):
+        raise ValueError(f"measured has the shape {values.shape}: must be ({len(signals)}, numbers of a measurement)")
+    if np.abs(signals).max() > 1.0 + 1e-9:
+        raise ValueError(f"commands reach {np.abs(signals).max():g}: must be normalised to -1 to 1")
+    seconds = _seconds(times, len(signals))
+    usable: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
+    size = float(values[usable].std(axis=0).max()) if usable.any() else 0.0
+    if not size > 0.0:
+        raise ValueError("measured: nothing in it changes")
+    brought = np.where(usable[:, None], values, 0.0) * (_SIZE / size)
+    if brought.shape[1] > len(brought):
+        # Fewer numbers a row, of the same sums of squares.
+        brought = np.asarray(np.linalg.qr(brought.T, mode="r"), dtype=np.float64).T
+    run = Run(signals, seconds, Responses(brought, brought.shape[1], usable), -BEFORE_FIRST_MAP_S)
+    found = identify(run, candidates=candidates, blocks=_BLOCKS, slope_min=-np.inf)
+    signal = np.sqrt(np.mean(brought[usable].var(axis=0)))
+    error = float(np.sqrt(np.nanmean(np.square(found.held_out))) / signal)
+    law = found.fit.law
+    middle = seconds - seconds.mean()
+    design = np.column_stack((np.ones(len(signals)), middle / np.ptp(middle), _effective(law, signals, seconds)))
+    solution = np.linalg.lstsq(design[usable], values[usable], rcond=1e-10)[0]
+    return ResponseFit(
+        name=found.fit.candidate.name,
+        law=law,
+        influence=solution[2:],
+        figure=solution[0],
+        drift=solution[1],
+        held_out={name: error * score for name, score in found.scores.items()},
+        measurements=int(usable.sum()),
+    )
+
+
+def _seconds(times: ArrayLike | None, count: int) -> Floats:
+    seconds = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, dtype=np.float64)
+    if seconds.shape != (count,) or not np.isfinite(seconds).all():
+        raise ValueError(f"times has the shape {seconds.shape}: must be ({count},) finite numbers, s")
+    return seconds - seconds[0]
+
+
+def _effective(law: HysteresisModel, signals: Floats, seconds: Floats) -> Floats:
+    return follow(law, law.demagnetised(signals.shape[1], -BEFORE_FIRST_MAP_S), signals, seconds)[0]

@@ -1,0 +1,113 @@
+"""Laws from Shack-Hartmann slopes of a simulated membrane mirror, without ROS, with the example."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dm_calibration import identify_response
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
+from dm_calibration.hysteresis.identify import ExcitationError
+from dm_simulation.mirror.membrane import Membrane, MembraneConfig
+
+Floats = NDArray[np.float64]
+
+pytestmark = pytest.mark.slow
+
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "compare_laws.py"
+STATIC = (CANDIDATES[0], Candidate("squares", 0, 2, 0), Candidate("static", 0, 3, 0))
+LENSLETS, APERTURE, STEP = 8, 0.010, 1e-5  # a side; m; m
+NOISE = 4e-7  # rad, of a slope
+
+
+@cache
+def record(squared: bool, drift: float = 0.0, count: int = 300) -> tuple[Floats, Floats, Floats]:
+    """Commands (M, 19), slopes (M, 2 lenslets) rad and times (M,) s of random volts, or random volts squared."""
+    config = MembraneConfig(actuators=19, pitch=2.6e-3, electrode_diameter=2.4e-3, drift=drift, drift_time=2e3)
+    rng = np.random.default_rng(1919)
+    membrane = Membrane(config, rng)
+    grid = (np.arange(LENSLETS) + 0.5) / LENSLETS - 0.5
+    x, y = (axis.ravel() * APERTURE for axis in np.meshgrid(grid, grid))
+    inside = np.hypot(x, y) < APERTURE / 2
+    x, y = x[inside], y[inside]
+    slopes = np.concatenate(
+        [
+            (membrane.influence_at(x + dx, y + dy) - membrane.influence_at(x - dx, y - dy)) / (2 * STEP)
+            for dx, dy in ((STEP, 0.0), (0.0, STEP))
+        ]
+    )
+    commands = rng.uniform(-1.0, 1.0, (count, 19))
+    times = 5.0 * np.arange(count, dtype=np.float64)
+    measured = np.empty((count, len(slopes)))
+    for row, (signals, time) in enumerate(zip(commands, times, strict=True)):
+        share = 0.5 * (signals + 1.0)
+        membrane.apply(200.0 * np.sqrt(share) if squared else 100.0 + 100.0 * share, float(time))
+        measured[row] = slopes @ membrane.displacement
+    return commands, measured + NOISE * rng.standard_normal(measured.shape), times
+
+
+def test_volts_need_squares_and_volts_squared_do_not() -> None:
+    volts = identify_response(*record(False), candidates=STATIC)
+    assert volts.name != "linear"
+    assert volts.held_out["linear"] > 3.0 * volts.held_out["squares"]
+    assert volts.held_out["static"] < 1.03 * volts.held_out["squares"]
+    squared = identify_response(*record(True), candidates=STATIC)
+    assert squared.held_out["linear"] < 1.2 * squared.held_out["squares"]  # what is left is the gap that narrows
+    assert squared.held_out["linear"] < 0.5 * volts.held_out["linear"]
+    assert not squared.law.remembers
+
+
+def test_a_zero_that_drifts_is_part_of_the_fit() -> None:
+    still = identify_response(*record(True), candidates=STATIC[:1])
+    _, steady, _ = record(True)
+    signal = np.sqrt(steady.var(axis=0).mean())
+    for drift, most in ((1e-7, 1.2), (5e-7, 2.5)):  # it goes by an exponential, the fit by a straight line
+        found = identify_response(*record(True, drift), candidates=STATIC[:1])
+        gone = record(True, drift)[1] - steady
+        assert found.held_out["linear"] < most * still.held_out["linear"]
+        assert found.held_out["linear"] < 0.4 * np.sqrt(gone.var(axis=0).mean()) / signal
+        assert np.linalg.norm(found.drift - gone[-1]) < 0.1 * np.linalg.norm(gone[-1])
+
+
+def test_more_numbers_than_measurements_change_nothing() -> None:
+    commands, measured, times = (array[:80] for array in record(True))
+    assert measured.shape[1] > len(measured)
+    whole = identify_response(commands, measured, times, candidates=STATIC[:1])
+    ours = identify_response(commands, measured @ np.linalg.qr(measured.T)[0], times, candidates=STATIC[:1])
+    assert whole.held_out["linear"] == pytest.approx(ours.held_out["linear"], rel=1e-6)
+    assert whole.influence.shape == (19, measured.shape[1])
+    np.testing.assert_allclose(whole.predict(commands, times).shape, measured.shape)
+
+
+def test_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    commands, measured, times = record(False, 1e-7, 80)
+    np.savez(tmp_path / "record.npz", commands=commands, measured=measured, times=times)
+    monkeypatch.setattr(sys, "argv", [EXAMPLE.name, str(tmp_path / "record.npz")])
+    found = runpy.run_path(str(EXAMPLE))["found"]
+    shown = capsys.readouterr().out
+    assert "held-out error, % of the signal (80 measurements)" in shown
+    assert found.held_out[found.name] < 0.4 * found.held_out["linear"]
+    for name, error in found.held_out.items():
+        assert f"{name} " in shown and f"{100 * error:.2f}" in shown
+
+
+def test_what_is_refused() -> None:
+    commands, measured, times = record(True)
+    with pytest.raises(ValueError, match=r"measured has the shape \(5, \d+\): must be \(300, numbers"):
+        identify_response(commands, measured[:5], times)
+    with pytest.raises(ValueError, match="commands reach 200: must be normalised"):
+        identify_response(200.0 * commands / np.abs(commands).max(), measured, times)
+    with pytest.raises(ValueError, match=r"times has the shape \(4,\)"):
+        identify_response(commands, measured, times[:4])
+    with pytest.raises(ValueError, match="time stamps: map 2"):
+        identify_response(commands, measured, -times)
+    with pytest.raises(ValueError, match="nothing in it changes"):
+        identify_response(commands, np.ones_like(measured), times)
+    with pytest.raises(ExcitationError, match="actuator 3 turned"):
+        identify_response(np.where(np.arange(19) == 2, 0.0, commands), measured, times)
