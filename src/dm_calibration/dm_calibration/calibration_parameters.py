@@ -117,7 +117,7 @@ PARAMETERS = (
     Parameter(
         "updates.still_time",
         real(0.5, 0.0, 600.0, "s"),
-        "The mirror must stand still for so long before and after the stamp of a map.",
+        "Before and after the stamp of a map the mirror must keep its shape for so long; creep corrections keep it.",
         live=True,
     ),
     Parameter(

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
-from dm_common.hysteresis.model import HysteresisModel
+from dm_calibration.procedure.applied_history import SMALL_MOVE, AppliedHistory, MapNotUsableError
+from dm_common.hysteresis.inverse import invert
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import Applied
 
 #: A signal with a backlash of half-width 0.3 that carries half of it.
 LAW = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.5], [0.5]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
+#: The same with creep, which a held shape is corrected for.
+CREEPING = replace(LAW, creep_rate=0.02, creep_time=CREEP_TIMES)
 
 
 class Driver:
@@ -79,6 +84,51 @@ def test_holding_a_shape_against_creep_is_no_move(history: AppliedHistory, drive
     driver.go(10.0, 0.2)
     driver.go(20.0, 0.2001)
     assert history.settled(20.2, 1.0).effective == pytest.approx(0.2001)
+
+
+def held(driver: Driver, wanted: float, began: float, until: float) -> None:
+    """Go to the effective signals `wanted` and keep them by corrections, as often as the focus controller does."""
+    law = CREEPING
+    driver.degauss(began - 10.0)
+    state = law.move(law.demagnetised(2, 0.0), np.zeros(2), began - 10.0)
+    time, wait = began, 0.02
+    while time < until:
+        state = law.advance(state, time)
+        signals = invert(law, state, np.full(2, wanted), -1.0, 1.0, 0.5 * wait).signals
+        state = law.move(state, signals, time)
+        driver.go(time, float(signals[0]))
+        wait = max(0.02, 0.07 * (time - began))
+        time += wait
+
+
+def test_corrections_of_a_held_shape_are_no_move(history: AppliedHistory, driver: Driver) -> None:
+    """Soon after a large move they are large, and come in the middle of an exposure."""
+    history.follow(CREEPING)
+    held(driver, 0.8, 10.0, 40.0)
+    reports = {seen.report.time: seen.report.signals[0] for seen in history._observer.recent()}
+    times = np.array(list(reports))
+    first, last = (reports[times[np.abs(times - stamp).argmin()]] for stamp in (10.5, 11.5))
+    assert abs(last - first) > 10 * SMALL_MOVE
+    for stamp in (11.0, 13.0, 20.0, 39.0):
+        settled = history.settled(stamp, 0.5)
+        assert settled.effective == pytest.approx(0.8, abs=SMALL_MOVE)
+        assert settled.since == pytest.approx(10.2, abs=0.2)
+    assert history.still_for(41.0) == pytest.approx(30.8, abs=0.2)
+
+
+def test_a_command_amid_corrections_is_a_move(history: AppliedHistory, driver: Driver) -> None:
+    history.follow(CREEPING)
+    held(driver, 0.8, 10.0, 13.0)
+    driver.go(13.1, float(driver.signals[0]) + 0.002)
+    with pytest.raises(MapNotUsableError, match=r"moved 0.100 s after the stamp"):
+        history.settled(13.0, 0.5)
+
+
+def test_a_correction_under_way_is_no_move(history: AppliedHistory, driver: Driver) -> None:
+    driver.go(10.0, 0.2)
+    for time, requested, still in ((20.0, 0.2001, True), (21.0, 0.6, False)):
+        history.observe(Applied(time, driver.signals, 2, None, 0, True, True, np.full(2, requested)), time)
+        assert (history.still_for(21.0) > 0.0) == still
 
 
 def test_effective_signals_follow_the_hysteresis(history: AppliedHistory, driver: Driver) -> None:

@@ -102,10 +102,29 @@ def test_one_bad_map_changes_nothing(bench: SteadyMirror, updates: Recalibration
     assert not verdict.accepted
     assert verdict.comparison.surprise > 3.0
     assert "bad map, or the mirror has changed" in verdict.reason
+    assert not verdict.comparison.displaced
     assert np.array_equal(changed_fit(updates).influence_sag, before.influence_sag)
     assert np.array_equal(changed_fit(updates).sag_offset, before.sag_offset)
     assert known(updates).revision == 1
     assert not updates.mirror_changed
+
+
+@pytest.mark.parametrize("stuck", [(6,), (0, 11)])
+def test_actuators_that_stick_are_named(
+    bench: SteadyMirror, updates: RecalibrationManager, stuck: tuple[int, ...]
+) -> None:
+    settled = bench.settled()
+    at = bench.signals.copy()
+    at[list(stuck)] = 0.0
+    bench.apply(at)
+    verdict = updates.take(bench.measure("stuck"), settled)
+    assert not verdict.accepted
+    assert set(verdict.comparison.displaced) == set(stuck)
+    for actuator in stuck:
+        wanted = settled.effective[actuator]
+        assert verdict.comparison.displaced[actuator] == pytest.approx(-wanted, abs=0.01)
+        assert f"actuator {actuator + 1} stands at " in verdict.reason
+        assert f"instead of {wanted:+.2f}" in verdict.reason
 
 
 def test_a_map_of_another_shape_is_refused(bench: SteadyMirror, updates: RecalibrationManager) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,11 +10,11 @@ from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.hysteresis.observer import Applied, HysteresisObserver
+from dm_common.hysteresis.observer import Applied, HysteresisObserver, Observed
 
 Floats = NDArray[np.float64]
 
-#: Signals that differ less, normalised, do not count as a move: below 1 nm, as steps of holding a shape against creep.
+#: Signals, or effective signals, that differ less, normalised, are the same shape: below 1 nm.
 SMALL_MOVE = 2e-4
 
 
@@ -60,8 +61,20 @@ class AppliedHistory:
         """Whether the driver has reported at or after `time` (s), so that a move until then would be known."""
         return self._heard >= time
 
+    def still_for(self, time: float) -> float:
+        """How long the mirror has stood in its present shape at `time`, s; 0 = it moves, infinite = no report of it."""
+        observed = self._observer.recent()
+        if not observed:
+            return float("inf")
+        if not self._keeps(observed[-1], observed[-1]):
+            return 0.0
+        return time - observed[self._since(observed, len(observed) - 1)].report.time
+
     def settled(self, time: float, still: float) -> SettledState:
-        """What stood at `time` (s), if the mirror stood still from `still` (s) before to `still` after.
+        """What stood at `time` (s), if the mirror kept its shape from `still` (s) before to `still` after.
+
+        Corrections of a held shape follow from the hysteresis model, and the signals at `time` are known: they are no
+        move.
 
         Raises:
             MapNotUsableError: it did not, or that is not known, or the hysteresis of the actuators is not known.
@@ -74,26 +87,47 @@ class AppliedHistory:
         report, estimate = observed[at]
         if not report.active:
             raise MapNotUsableError("pdm_driver was not active when the map was taken")
-        if report.moving:
+        if not self._keeps(observed[at], observed[at]):
             raise MapNotUsableError("the mirror was moving when the map was taken")
-        moved = [seen.moving or bool(np.abs(seen.signals - report.signals).max() > SMALL_MOVE) for seen, _ in observed]
-        after = next((k for k in range(at + 1, len(observed)) if moved[k]), None)
+        after = next((k for k in range(at + 1, len(observed)) if not self._keeps(observed[at], observed[k])), None)
         if after is not None and times[after] < time + still:
             raise MapNotUsableError(
                 f"the mirror moved {times[after] - time:.3f} s after the stamp of the map: must stand still for "
                 f"{still:g} s"
             )
-        first = at
-        while first > 0 and not moved[first - 1]:
-            first -= 1
-        if time - times[first] < still:
+        since = times[self._since(observed, at)]
+        if time - since < still:
             raise MapNotUsableError(
-                f"the mirror moved {time - times[first]:.3f} s before the stamp of the map: must stand still for "
-                f"{still:g} s"
+                f"the mirror moved {time - since:.3f} s before the stamp of the map: must stand still for {still:g} s"
             )
         if estimate.state is None or (law.remembers and estimate.unknown):
             raise MapNotUsableError(
                 f"the history of the actuators is not known: {estimate.unknown}; a degauss over the full range cures "
                 "that"
             )
-        return SettledState(law.effective(law.advance(estimate.state, time)), times[first])
+        return SettledState(law.effective(law.advance(estimate.state, time)), since)
+
+    def _since(self, observed: Sequence[Observed], at: int) -> int:
+        """Index of the first report from which on the shape of report `at` was kept."""
+        first = at
+        while first > 0 and self._keeps(observed[at], observed[first - 1]):
+            first -= 1
+        return first
+
+    def _keeps(self, shape: Observed, seen: Observed) -> bool:
+        """Whether the mirror stood in the shape of a report at another: the same signals, or the same surface."""
+        law, state, report = self._observer.law, seen.estimate.state, seen.report
+        ends = [report.signals]
+        if report.moving:
+            if report.requested is None:
+                return False
+            ends.append(report.requested)
+        for signals in ends:
+            if np.abs(signals - shape.report.signals).max() <= SMALL_MOVE:
+                continue
+            if state is None or shape.estimate.state is None:
+                return False
+            reached = law.effective(law.move(state, signals, report.time))
+            if np.abs(reached - law.effective(shape.estimate.state)).max() > SMALL_MOVE:
+                return False
+        return True

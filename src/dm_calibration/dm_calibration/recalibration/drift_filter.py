@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import ndtri
 
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
@@ -33,6 +33,9 @@ DAY_S = 86400.0
 NOISE_SHARE_MIN = 0.1
 #: The same in m^2, for maps without any noise.
 NOISE_MIN = 1e-24
+#: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
+#: that fits noise best explains about 0.13.
+DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 #: Gains of actuators that hardly show are not known worse than this.
 GAIN_SIGMA_MAX = 0.05
 
@@ -88,12 +91,15 @@ class Comparison:
         surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
             all values, and the largest single one over the largest to be expected of so many.
         updated: the drift with this map taken in.
+        displaced: {index: effective signal more than there should be} of the actuators that the difference comes from,
+            the worst first, where a few of them explain it: one that sticks, say.
     """
 
     max_zernike: float
     rms: float
     surprise: float
     updated: Drift
+    displaced: dict[int, float]
 
 
 class DriftFilter:
@@ -179,6 +185,7 @@ class DriftFilter:
             rms=float(rms(departure, self._fit.points.weight)),
             surprise=_surprise(innovation, expected, factor),
             updated=updated,
+            displaced=_displaced(innovation, self._gain, factor),
         )
 
     def changed(self, drift: Drift) -> InfluenceFit:
@@ -226,3 +233,25 @@ def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool])
     largest = -ndtri(0.5 * (1.0 - 0.5 ** (1.0 / size)))
     single = np.abs(innovation / np.sqrt(np.diag(expected))).max() / largest
     return float(max(together, single))
+
+
+def _displaced(innovation: Floats, gain: Floats, factor: tuple[Floats, bool]) -> dict[int, float]:
+    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares.
+
+    Args:
+        gain: (R, N) per unit of effective signal.
+        factor: Cholesky factor of the expected covariance (R, R).
+    """
+    white = solve_triangular(factor[0], np.column_stack((gain, innovation)), trans="T")
+    columns, whole = white[:, :-1], white[:, -1]
+    power = np.maximum(np.square(columns).sum(axis=0), np.finfo(np.float64).tiny)
+    left, found, amounts = whole, list[int](), np.zeros(0)
+    while len(found) < DISPLACED_MAX and left @ left > len(left):
+        explained = np.square(columns.T @ left) / power
+        best = int(explained.argmax())
+        if explained[best] < DISPLACED_SHARE * (left @ left):
+            break
+        found.append(best)
+        amounts = np.linalg.lstsq(columns[:, found], whole)[0]
+        left = whole - columns[:, found] @ amounts
+    return {found[k]: float(amounts[k]) for k in np.argsort(-np.abs(amounts))}

@@ -243,6 +243,7 @@ class MapListener:
         with self._turn:
             if self._busy():
                 raise Refusal(ErrorCode.BUSY, "a calibration is running")
+            self._wait_for_rest()
             measured = self._services.measure_as_it_stands("calibration check")
             try:
                 verdict = self._judge(measured, request.dry_run)
@@ -254,6 +255,15 @@ class MapListener:
         comparison = verdict.comparison
         response.max_zernike, response.rms = comparison.max_zernike, comparison.rms
         response.surprise = comparison.surprise
+
+    def _wait_for_rest(self) -> None:
+        """Let a move end, and the mirror stand for as long as it must before a map; not for ever."""
+        still = self._values["updates.still_time"]
+        deadline = time.monotonic() + REPORT_WAIT_S + 2.0 * still
+        while self._history.still_for(1e-9 * self._node.get_clock().now().nanoseconds) < still:
+            if time.monotonic() > deadline:
+                return  # the map will be refused, with the reason
+            time.sleep(0.01)
 
     def _check_calibrated(self) -> None:
         if self._updates.calibration is None:

@@ -34,6 +34,8 @@ Floats = NDArray[np.float64]
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
+#: Moves that are nearer to each other in time are one, s.
+SAME_MOVE_S = 0.2
 SUFFIX = ".updates.hdf5"
 
 
@@ -169,9 +171,9 @@ class RecalibrationManager:
                 updates.drift, measured.coefficients, measured.sag, settled.effective, measured.stamp_ns, repeat
             )
             accepted = comparison.surprise <= options.surprise_max
-            reason = f"differs by {comparison.surprise:.1f} times what is to be expected" + (
-                "" if accepted else f", more than {options.surprise_max:g}: bad map, or the mirror has changed"
-            )
+            reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
+            if not accepted:
+                reason += f", more than {options.surprise_max:g}: {_cause(comparison, settled.effective)}"
             if dry_run:
                 return Verdict(accepted, reason, comparison)
             if accepted:
@@ -205,11 +207,22 @@ class RecalibrationManager:
             self._forget_repeats()
 
     def _repeats(self, stamp_ns: int, settled: SettledState) -> int:
-        same = settled.since == self._since and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
+        # Where it is held against creep, the first correction that kept this very shape is not always the same one.
+        same = abs(settled.since - self._since) < SAME_MOVE_S and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
         return self._repeat if same else 0
 
     def _file(self, identifier: str) -> Path:
         return self._folder / f"{identifier}{SUFFIX}"
+
+
+def _cause(comparison: Comparison, effective: Floats) -> str:
+    """What a map that disagrees shows, for the settled effective signals (N,)."""
+    if not comparison.displaced:
+        return "bad map, or the mirror has changed"
+    return ", ".join(
+        f"actuator {actuator + 1} stands at {effective[actuator] + more:+.2f} instead of {effective[actuator]:+.2f}"
+        for actuator, more in comparison.displaced.items()
+    )
 
 
 def check_map(measured: Measurement, calibration: Calibration, options: UpdateOptions) -> None:
