@@ -56,8 +56,9 @@ def _recipes(bench: SimulatedBench, loop: Planner) -> RecipeBook:
         tracker.observe(report)
     options = BuildOptions(settle_time=bench.config.settle_time)
     builder = RecipeBuilder(loop, bench, lambda: bench.time, options, state=tracker.state)
-    recipes = [builder.build(FocusTarget(c)) for c in CURVATURES]
-    return recipe_book(recipes, loop, bench.config.degauss_steps, round(1e9 * bench.time))
+    for curvature in CURVATURES:
+        builder.build(FocusTarget(curvature))
+    return recipe_book(builder.recipes, loop, bench.config.degauss_steps, round(1e9 * bench.time))
 
 
 def _variant(

@@ -58,7 +58,7 @@ class DrivenMirror:
         """The move to `target` from where the mirror stands, or by a recipe after a degauss, which is carried out."""
         effective, error = None, None
         if self._book.recipes:
-            found = find(self._book, target)
+            found = find(self._book, target, self._planner)
             effective, error = found.effective, found.error
             self.bench.degauss()
         self._follow()

@@ -101,12 +101,13 @@ def _recipes(bench: SimulatedBench, active: ActiveCalibration, curvatures: Float
         tracker.observe(report)
     options = BuildOptions(settle_time=bench.config.settle_time)
     builder = RecipeBuilder(active.planner, bench, lambda: bench.time, options, state=tracker.state)
-    recipes, refusals = [], []
+    refusals = []
     for curvature in curvatures:
         try:
-            recipes.append(builder.build(FocusTarget(float(curvature))))
+            builder.build(FocusTarget(float(curvature)))
         except UnreachableError as error:  # the told range said otherwise
             refusals.append(str(error))
+    recipes = builder.recipes
     if not recipes:
         return NO_RECIPES, refusals
     book = recipe_book(recipes, active.planner, bench.config.degauss_steps, round(1e9 * bench.time))

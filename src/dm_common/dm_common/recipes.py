@@ -48,7 +48,8 @@ class RecipeBook:
     Attributes:
         recipes: by rising conic constant, then curvature.
         degauss_steps: half-swings of the degauss that they begin with.
-        interpolation_error: m, largest coefficient error of a recipe interpolated from the others.
+        interpolation_error: m, by how much the bound halfway between neighbours exceeds what was re-measured, when the
+            last were built.
         stamp_ns: when the last was built.
     """
 
@@ -67,22 +68,26 @@ class RecipeBook:
             if recipe.signals.shape != recipe.effective.shape or not np.isfinite(recipe.effective).all():
                 raise RecipeError(f"recipe of {recipe.curvature:+.4f} 1/m: effective signals must be finite, one each")
 
+    def check_condition(self, degauss_steps: int) -> None:
+        """Raise RecipeError when recipes that begin with so many half-swings cannot join these."""
+        if self.recipes and degauss_steps != self.degauss_steps:
+            raise RecipeError(
+                f"degauss_steps = {degauss_steps}: the recipes there are begin with {self.degauss_steps}; "
+                "build all of them again"
+            )
+
     def merged(self, newer: RecipeBook) -> RecipeBook:
-        """With the recipes of `newer` in the place of those of the same shape.
+        """With the recipes of `newer` in the place of those of the same shape; its other figures are of the whole.
 
         Raises:
             RecipeError: made under another condition.
         """
-        if self.recipes and newer.degauss_steps != self.degauss_steps:
-            raise RecipeError(
-                f"degauss_steps = {newer.degauss_steps}: the recipes there are begin with {self.degauss_steps}; "
-                "build all of them again"
-            )
+        self.check_condition(newer.degauss_steps)
         both = {(r.conic_constant, r.curvature): r for r in (*self.recipes, *newer.recipes)}
         return RecipeBook(
             tuple(both[key] for key in sorted(both)),
             newer.degauss_steps,
-            max(self.interpolation_error, newer.interpolation_error),
+            newer.interpolation_error,
             newer.stamp_ns,
         )
 

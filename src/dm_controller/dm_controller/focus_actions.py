@@ -49,7 +49,7 @@ LOOP_PARAMETERS = (
         live=True,
     ),
     Parameter("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take", live=True),
-    Parameter("recipes.average", whole(8, 2, 50), "maps averaged after each degauss of a recipe", live=True),
+    Parameter("recipes.average", whole(8, 2, 50), "most maps averaged after each degauss of a recipe", live=True),
     Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
     Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
     Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),

@@ -1,17 +1,19 @@
 """Building recipes on the bench: condition the mirror, go to the shape, measure, correct, and begin again.
 
-Knows no ROS. Every round begins with a degauss, for a recipe holds from that condition only. Its maps are averaged.
-Creep goes on meanwhile and the electronics write whole steps only; the memory law says how far the effective signals
-were from the wanted ones at each map, and the influence function takes that off. What remains of a map is the *defect*
-of the model: measured less predicted surface at the effective signals of the shape. The defect hardly depends on small
-corrections, so the maps of all rounds are averaged, and the next effective signals solve the target less the defect.
+Knows no ROS. Every round begins with a degauss, for a recipe holds from that condition only. Its maps are averaged
+until their mean is sure. Creep goes on meanwhile and the electronics write whole steps only; the hysteresis model says
+how far the effective signals were from the wanted ones at each map, and the influence function takes that off. What
+remains of a map is the *defect* of the model: measured less predicted surface at the effective signals of the shape. It
+changes little from shape to shape, so that of the next is estimated from all rounds so far
+(`planning.recipes.Kriging`): most shapes are right at once, and their only round is the one that re-measures them. In
+the end each recipe rests on its neighbours' maps too.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -20,17 +22,19 @@ from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import PISTON_TILT
-from dm_common.recipes import Recipe, RecipeBook, RecipeError
+from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.recipes import interpolation_error
+from dm_controller.planning.recipes import Kriging, worst_error
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import MISS, Floats, Shape, measured_shape, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag, target_shape
 
-#: Effective signals that a limit denies by more than this make a shape unreachable from the condition.
+#: Limits that deny a larger coefficient, m, make a shape unreachable from the condition.
+DENIED_MAX = 2e-8
+#: Effective signals that limits deny count from here on.
 MISSED_MAX = 1e-3
-#: Maps go on until their mean is as sure as this share of the tolerance.
-SURE_SHARE = 0.1
+#: Maps of a round go on until their mean is as sure as this share of the tolerance, but fewer do not tell their noise.
+SURE_SHARE, MAPS_MIN = 0.2, 3
 #: No mean of maps is surer than this, m.
 SIGMA_MIN = 1e-12
 
@@ -58,7 +62,7 @@ class BuildOptions:
     Attributes:
         tolerance: largest coefficient error beyond tilt, m, re-measured.
         maps_max: maps that one recipe may take.
-        average: maps of one round.
+        average: most maps of one round.
         settle_time: s after the move at which the shape is to be right.
     """
 
@@ -100,15 +104,16 @@ class _Round:
     """Maps of one round, averaged.
 
     Attributes:
+        target, signals: what was wanted, and (N,) what was written.
         aim: (N,) effective signals.
         defect: measured less predicted surface at `aim`.
-        variance: (K - 3,) m^2, of the mean coefficients beyond tilt.
         maps: taken.
     """
 
+    target: FocusTarget
+    signals: Floats
     aim: Floats
     defect: Shape
-    variance: Floats
     maps: int
 
 
@@ -148,9 +153,13 @@ class RecipeBuilder:
         actuators = model.influence_zernike.shape[1]
         self.state = state if state is not None else loop.law.demagnetised(actuators, now(), self._middle)
         self.maps = 0
+        self._rounds: list[_Round] = []
+        self._built: list[tuple[_Round, int]] = []
+        # Squares (K - 3,) of what maps scatter about the means of their rounds, and their degrees of freedom.
+        self._scatter, self._freedom = np.zeros(len(model.zernike_offset) - PISTON_TILT), 0
 
     def build(self, target: FocusTarget) -> Recipe:
-        """The recipe for `target`. Figures of the last round judge signals found before it, so they flatter nothing.
+        """The recipe for `target`, as it is known now.
 
         Raises:
             TargetError: no such surface exists over the aperture.
@@ -161,36 +170,61 @@ class RecipeBuilder:
         """
         if any(target.zernike):
             raise RecipeError("zernike: recipes are of plain conics, without added terms")
-        model, options = self._loop.mirror.model, self._options
-        wanted = target_shape(target, model)
-        defect, spread = Shape(np.zeros_like(wanted.coefficients), np.zeros_like(wanted.sag)), math.inf
-        rounds: list[_Round] = []
-        maps = 0
+        options = self._options
+        aim, maps = self._solve(target, None), 0
         while True:
-            aim = self._solve(wanted, defect)
-            signals = self._go(target, aim)
-            taken = self._measure_round(target, wanted, aim, maps)
-            rounds.append(taken)
+            aim = self._solve(target, aim)
+            taken = self._measure_round(target, aim, maps)
+            self._rounds.append(taken)
             maps += taken.maps
-            error = self._predicted(aim) + taken.defect - wanted
-            defect, variance = _pooled(rounds, self._response)
-            spread = float(np.sqrt(variance.max()))
-            enough = error.max_zernike <= options.tolerance and spread <= SURE_SHARE * options.tolerance
-            if len(rounds) >= 2 and (enough or maps + options.average > options.maps_max):
-                return Recipe(
-                    curvature=target.curvature,
-                    conic_constant=target.conic_constant,
-                    effective=self._solve(wanted, defect),
-                    signals=signals,
-                    max_zernike=error.max_zernike,
-                    rms=rms_sag(error, model),
-                    maps=maps,
-                )
+            if self._error(taken).max_zernike <= options.tolerance or maps + options.average > options.maps_max:
+                self._built.append((taken, maps))
+                return self.recipes[-1]
+            aim = taken.aim
 
-    def _solve(self, wanted: Shape, defect: Shape) -> Floats:
-        """(N,) effective signals for `wanted` on a mirror with this defect."""
-        mirror = self._loop.mirror
-        change = wanted - self._offset - defect
+    @property
+    def recipes(self) -> tuple[Recipe, ...]:
+        """Those built, in order, by all that was measured so far.
+
+        Figures are of each shape's last round, which judged signals found before it: so they flatter nothing.
+        """
+        return tuple(
+            Recipe(
+                curvature=taken.target.curvature,
+                conic_constant=taken.target.conic_constant,
+                effective=self._solve(taken.target, taken.aim),
+                signals=taken.signals,
+                max_zernike=self._error(taken).max_zernike,
+                rms=rms_sag(self._error(taken), self._loop.mirror.model),
+                maps=maps,
+            )
+            for taken, maps in self._built
+        )
+
+    def _error(self, taken: _Round) -> Shape:
+        """What was measured in a round, less what was wanted."""
+        return self._predicted(taken.aim) + taken.defect - target_shape(taken.target, self._loop.mirror.model)
+
+    def _defect(self, aim: Floats) -> Shape:
+        """The defect to expect at the effective signals `aim` (N,), from all rounds."""
+        model, rounds = self._loop.mirror.model, self._rounds
+        if not rounds:
+            return Shape(np.zeros_like(model.zernike_offset), np.zeros_like(model.sag_offset))
+        coefficients = np.array([taken.defect.coefficients for taken in rounds])
+        size = max(np.mean(np.square(coefficients[:, PISTON_TILT:])), SIGMA_MIN**2)
+        noise = np.array([float(np.mean(self._noise)) / taken.maps for taken in rounds]) + SIGMA_MIN**2
+        weights, _ = Kriging(np.array([taken.aim for taken in rounds]), noise / size).at(aim)
+        return Shape(weights @ coefficients, weights @ np.array([taken.defect.sag for taken in rounds]))
+
+    @property
+    def _noise(self) -> Floats:
+        """(K - 3,) m^2, variance of the coefficients beyond tilt of one map, by all that were taken."""
+        return self._scatter / max(self._freedom, 1)
+
+    def _solve(self, target: FocusTarget, near: Floats | None) -> Floats:
+        """(N,) effective signals for `target` on a mirror with the defect at `near` (N,); None = without any."""
+        mirror, wanted = self._loop.mirror, target_shape(target, self._loop.mirror.model) - self._offset
+        change = wanted if near is None else wanted - self._defect(near)
         return mirror.solve(mirror.rows(change.coefficients, change.sag))
 
     def _response(self, effective: Floats) -> Shape:
@@ -200,8 +234,12 @@ class RecipeBuilder:
     def _predicted(self, effective: Floats) -> Shape:
         return self._offset + self._response(effective)
 
-    def _go(self, target: FocusTarget, aim: Floats) -> Floats:
-        """Condition the mirror and move it to the effective signals `aim`; returns the signals written."""
+    def _go(self, target: FocusTarget, aim: Floats) -> tuple[Floats, Floats]:
+        """Condition the mirror and move it to the effective signals `aim`.
+
+        Returns:
+            (N,) signals written, and (N,) the effective signals to keep: others than `aim` where limits deny those.
+        """
         law, plant = self._loop.law, self._plant
         self._stop_if_cancelled()
         began = self._now()
@@ -212,21 +250,24 @@ class RecipeBuilder:
         applied = plant.apply(move.plan.signals)
         self.state = law.move(self.state, applied, self._now())
         missed = law.effective(law.advance(self.state, self._now() + self._options.settle_time)) - aim
-        worst = int(np.abs(missed).argmax())
-        if abs(missed[worst]) > MISSED_MAX:
+        worst, denied = int(np.abs(missed).argmax()), self._response(missed).max_zernike
+        if denied > DENIED_MAX:
             raise UnreachableError(
                 f"curvature = {target.curvature:+.4f} 1/m: actuator {worst + 1} stands at its limit and misses its "
-                f"effective signal by {abs(missed[worst]):.4f} (allowed {MISSED_MAX:g}): no recipe reaches this shape"
+                f"effective signal by {abs(missed[worst]):.4f}, which leaves a coefficient error of "
+                f"{denied * 1e9:.1f} nm (allowed {DENIED_MAX * 1e9:g} nm): no recipe reaches this shape"
             )
         if not plant.settle():
             raise Cancelled("cancelled while settling")
-        return applied
+        return applied, aim if abs(missed[worst]) <= MISSED_MAX else aim + missed
 
-    def _measure_round(self, target: FocusTarget, wanted: Shape, aim: Floats, before: int) -> _Round:
-        model, law = self._loop.mirror.model, self._loop.law
-        coefficients, sags = [], []
-        for number in range(1, self._options.average + 1):
+    def _measure_round(self, target: FocusTarget, aim: Floats, before: int) -> _Round:
+        model, law, options = self._loop.mirror.model, self._loop.law, self._options
+        signals, aim = self._go(target, aim)
+        coefficients, sags = list[Floats](), list[Floats]()
+        while True:
             self._stop_if_cancelled()
+            number = len(coefficients) + 1
             if number > 1:
                 self._hold(aim)
             measured = self._plant.measure(f"recipe {target.curvature:+.4f} 1/m {before + number}")
@@ -238,12 +279,18 @@ class RecipeBuilder:
             defect = surface - self._predicted(effective)
             coefficients.append(defect.coefficients)
             sags.append(defect.sag)
-            mean = Shape(np.mean(coefficients, axis=0), np.mean(sags, axis=0))
-            error = self._predicted(aim) + mean - wanted
+            taken = _Round(target, signals, aim, Shape(np.mean(coefficients, axis=0), np.mean(sags, axis=0)), number)
+            error = self._error(taken)
             self._on_step(BuildStep(target.curvature, before + number, error.max_zernike, rms_sag(error, model)))
+            beyond = np.array(coefficients)[:, PISTON_TILT:]
+            scatter = self._scatter + np.square(beyond - beyond.mean(axis=0)).sum(axis=0)
+            spread = math.sqrt(scatter.max() / max(self._freedom + number - 1, 1) / number)
+            sure = number >= min(MAPS_MIN, options.average) and spread <= SURE_SHARE * options.tolerance
+            if sure or number == options.average:
+                break
+        self._scatter, self._freedom = scatter, self._freedom + number - 1
         self.state = law.advance(self.state, self._now())
-        scatter = np.var(np.array(coefficients)[:, PISTON_TILT:], axis=0, ddof=1)
-        return _Round(aim, mean, scatter / len(coefficients), len(coefficients))
+        return taken
 
     def _hold(self, aim: Floats) -> None:
         """Keep the shape against creep as it is kept in use: what the law misses of that becomes part of the recipe."""
@@ -258,27 +305,16 @@ class RecipeBuilder:
             raise Cancelled("cancelled")
 
 
-def _pooled(rounds: Sequence[_Round], response: Callable[[Floats], Shape]) -> tuple[Shape, Floats]:
-    """The defect where the last round was, from all rounds, and the variance (K - 3,) m^2 of its coefficients.
+def recipe_book(
+    recipes: Sequence[Recipe], loop: Planner, degauss_steps: int, stamp_ns: int, before: RecipeBook = NO_RECIPES
+) -> RecipeBook:
+    """Recipes of one run as a book; its figures are of the whole that they make with those there were `before`.
 
-    A round counts less the more maps scatter in it, and the further the shape was from the last one: of the way
-    between, the actuators may miss a share (`MISS`).
+    Raises:
+        RecipeError: those were made under another condition.
     """
-    last = rounds[-1]
-    weights = []
-    for taken in rounds:
-        way = response(last.aim - taken.aim).coefficients[PISTON_TILT:]
-        weights.append(1.0 / (SIGMA_MIN**2 + np.mean(taken.variance) + (MISS * np.abs(way).max()) ** 2))
-    share = np.array(weights) / np.sum(weights)
-    pooled = Shape(
-        np.sum([w * taken.defect.coefficients for w, taken in zip(share, rounds, strict=True)], axis=0),
-        np.sum([w * taken.defect.sag for w, taken in zip(share, rounds, strict=True)], axis=0),
-    )
-    variance = np.sum([w**2 * taken.variance for w, taken in zip(share, rounds, strict=True)], axis=0)
-    return pooled, np.asarray(variance)
-
-
-def recipe_book(recipes: Sequence[Recipe], loop: Planner, degauss_steps: int, stamp_ns: int) -> RecipeBook:
-    """Recipes of one run (one conic constant, by rising curvature) as a book, with their error of interpolation."""
-    between = interpolation_error(recipes, loop.mirror.model.influence_zernike)
-    return RecipeBook(tuple(recipes), degauss_steps, between, stamp_ns)
+    ordered = sorted(recipes, key=lambda recipe: (recipe.conic_constant, recipe.curvature))
+    book = RecipeBook(tuple(ordered), degauss_steps, 0.0, stamp_ns)
+    whole = before.merged(book)
+    between = worst_error(whole, loop) - max(recipe.max_zernike for recipe in whole.recipes)
+    return replace(book, interpolation_error=between)

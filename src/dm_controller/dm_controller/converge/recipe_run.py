@@ -21,7 +21,7 @@ from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.observer import Applied, HysteresisTracker
 from dm_common.messages import recipe_book_message
-from dm_common.recipes import Recipe, RecipeError
+from dm_common.recipes import RecipeError
 from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
 from dm_controller.converge.goals import UnreachableError, check_figures, ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
@@ -79,6 +79,8 @@ class RecipeRun:
         active = bench.host.active_calibration()
         planner, calibration = active.planner, active.calibration
         targets = self._targets(goal, target, planner)
+        steps = self._values["recipes.degauss_steps"]
+        active.recipes.check_condition(steps)
         bench.check_ready()
         clock = self._node.get_clock()
         wait_for_clock(clock)
@@ -103,13 +105,14 @@ class RecipeRun:
             on_step=report,
             cancelled=bench.cancelled,
         )
-        recipes, code, text = self._build(builder, targets)
+        code, text = self._build(builder, targets)
+        recipes = builder.recipes
         result = BuildRecipes.Result(maps=builder.maps, residual_rms=math.nan, max_zernike=math.nan)
         rest = bench.rest(np.full(calibration.actuators, active.middle))
         if recipes:
             result.residual_rms = max(recipe.rms for recipe in recipes)
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
-            book = recipe_book(recipes, planner, self._values["recipes.degauss_steps"], clock.now().nanoseconds)
+            book = recipe_book(recipes, planner, steps, clock.now().nanoseconds, active.recipes)
             result.interpolation_error = book.interpolation_error
             stored, reason = self._stored(
                 StoreRecipes.Request(calibration_id=calibration.id, recipes=recipe_book_message(book))
@@ -134,22 +137,20 @@ class RecipeRun:
         outcomes: dict[int, str] = {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "canceled"}
         return outcomes.get(code, "abort"), result
 
-    def _build(self, builder: RecipeBuilder, targets: list[FocusTarget]) -> tuple[list[Recipe], int, str]:
-        """Whole recipes, and what ended the work: an ErrorCode and a sentence."""
-        recipes: list[Recipe] = []
+    def _build(self, builder: RecipeBuilder, targets: list[FocusTarget]) -> tuple[int, str]:
+        """Build all; those that are whole stay when the next fails. Returns an ErrorCode and a sentence."""
         try:
             for target in targets:
-                recipe = builder.build(target)
-                recipes.append(recipe)  # one by one: what is whole stays when the next fails
+                builder.build(target)
         except Cancelled as error:
-            return recipes, ErrorCode.CANCELED, str(error)
+            return ErrorCode.CANCELED, str(error)
         except Refusal as error:
-            return recipes, error.error_code, str(error)
+            return error.error_code, str(error)
         except UnreachableError as error:
-            return recipes, ErrorCode.UNREACHABLE, str(error)
+            return ErrorCode.UNREACHABLE, str(error)
         except ValueError as error:
-            return recipes, ErrorCode.INVALID_ARGUMENT, str(error)
-        return recipes, ErrorCode.OK, ""
+            return ErrorCode.INVALID_ARGUMENT, str(error)
+        return ErrorCode.OK, ""
 
     def _options(self, goal: Any) -> BuildOptions:
         """What the goal asks for, 0 = configured. Raises ValueError naming the field."""

@@ -18,6 +18,7 @@ from dm_common.mirror import mismatch
 from dm_common.recipes import RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
+from dm_controller.planning.recipes import worst_error
 from dm_controller.planning.target import FocusTarget
 
 NO_CALIBRATION = "no calibration: run `./dm calibrate` or load_calibration"
@@ -61,10 +62,7 @@ class ActiveCalibration:
     @property
     def conditioned_error(self) -> float:
         """m, bound of the largest coefficient error of a conditioned move; 0 = no recipes."""
-        if not self.recipes.recipes:
-            return 0.0
-        worst = max(recipe.max_zernike for recipe in self.recipes.recipes)
-        return worst + self.recipes.interpolation_error
+        return worst_error(self.recipes, self.planner)
 
     def error_bound(self, history_known: bool) -> float:
         """m, 95 % bound of the largest coefficient error of a direct move."""

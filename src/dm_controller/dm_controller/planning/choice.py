@@ -108,7 +108,7 @@ def _conditioned(target: FocusTarget, context: PlanningContext, degauss: Degauss
             f"{degauss.steps} (condition.degauss_steps): build them again, or set it to 0",
         )
     try:
-        recipe = find(book, target)
+        recipe = find(book, target, context.active.planner)
     except RecipeError as error:
         raise Refusal(ErrorCode.OUT_OF_RANGE, f"mode CONDITIONED: {error}") from error
     return replace(_after_degauss(target, context, degauss, recipe), mode=_CONDITIONED)

@@ -161,11 +161,14 @@ class Planner:
             reached = aim - missed
             if effective is None:
                 largest = mirror.predict(target, reached).max_zernike
+            else:
+                denied = self._largest(missed)
+                largest, error = largest + denied, None if error is None else error + denied
 
         def predict() -> Plan:
             plan = mirror.predict(target, reached if effective is None else aim)
             if error is not None:
-                plan = replace(plan, max_zernike=min(plan.max_zernike, error), max_zernike_upper=error)
+                plan = replace(plan, max_zernike=largest, max_zernike_upper=error)
             # But for creep, how far the actuators go.
             step = (aim if missed is None else aim - missed) - law.effective(law.advance(begun, arrival))
             return self._bounded(plan, signals, known, self._young_creep(step, ahead), error)

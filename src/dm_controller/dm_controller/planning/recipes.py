@@ -1,37 +1,44 @@
-"""Finding a recipe: the stored one of a shape, or one interpolated over curvature from those around it.
+"""What recipes say of a shape: what the model misses there, and how far that can be trusted.
 
-Between recipes of one conic constant the effective signals are smooth in curvature. Which curve goes through them is
-chosen by leaving each inner recipe out in turn. Beyond the outermost recipes there is none: nothing is extrapolated.
+A recipe shows what the model's own effective signals miss of one shape. Shapes nearby miss about the same: the
+corrections are samples of a field over effective signals whose differences grow with the root of the distance, as those
+of a random walk do, and its best linear estimate (kriging: Matheron 1963; Gaussian process regression with the
+exponential covariance) serves every shape near recipes, of whatever kind. How large the field is follows from what the
+model promises and from what the recipes show: their corrections, and what is missed of each when it is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator, make_interp_spline
 
 from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import Recipe, RecipeBook, RecipeError
+from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
-Curve = Callable[[float], Floats]
 
 #: Curvatures that differ less are the same shape, 1/m: over a radius of 11 mm that is 3 pm of defocus.
 SAME_CURVATURE = 1e-7
 #: The same for conic constants.
 SAME_CONIC = 1e-9
-
-#: Curves by name, with the fewest recipes each of them needs; the simplest first, which wins a draw.
-_CURVES: dict[str, tuple[int, Callable[[Floats, Floats], Curve]]] = {
-    "linear": (2, lambda x, y: make_interp_spline(x, y, k=1)),
-    "monotone cubic": (3, PchipInterpolator),
-    "cubic spline": (4, CubicSpline),
-}
+#: Distance of effective signals, rms over actuators, at which corrections are alike to 1/e. A sphere of 0.05 1/m and
+#: mid range are about 0.5 apart.
+REACH = 1.0
+#: Variance of a recipe's own error, as a share of the field's.
+NUGGET = 1e-3
+#: Where recipes leave more of the variance than this they say nothing of a shape.
+LEFT_MAX = 0.5
+#: By how much a conditioned shape does not repeat, as a share of what the model promises of any shape.
+REPEAT_SHARE = 0.3
+#: Recipes whose weight is less, as a share of the largest, do not count for what was measured nearby.
+SLIGHT = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +47,9 @@ class FoundRecipe:
 
     Attributes:
         effective: (N,) effective signals.
-        error: m, largest coefficient error to expect: as re-measured, and where interpolated that of the worse
-            neighbour and the error of interpolation together.
-        interpolated: there is no recipe of this very curvature.
+        error: m, bound of the largest coefficient error but for creep: as re-measured at the recipes that it rests on,
+            and what the correction may have changed by since the nearest of them.
+        interpolated: there is no recipe of this very shape.
     """
 
     effective: Floats
@@ -50,85 +57,128 @@ class FoundRecipe:
     interpolated: bool
 
 
-def find(book: RecipeBook, target: FocusTarget) -> FoundRecipe:
-    """The recipe for `target`.
-
-    Raises:
-        RecipeError: there is none: added terms, another conic constant, or a curvature outside the recipes'; naming
-            field, value and range.
-    """
-    if any(target.zernike):
-        raise RecipeError("zernike: recipes are of plain conics; ask for added terms without conditioning (DIRECT)")
-    if not book.recipes:
-        raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
-    recipes = _of_conic(book, target.conic_constant)
-    curvatures = [recipe.curvature for recipe in recipes]
-    for recipe in recipes:
-        if abs(recipe.curvature - target.curvature) <= SAME_CURVATURE:
-            return FoundRecipe(recipe.effective, recipe.max_zernike, False)
-    low, high = curvatures[0], curvatures[-1]
-    if not low < target.curvature < high:
-        raise RecipeError(
-            f"curvature = {target.curvature:+.4f} 1/m: recipes with conic_constant = {target.conic_constant:g} go from "
-            f"{low:+.4f} to {high:+.4f} 1/m and are not extrapolated"
-        )
-    above = int(np.searchsorted(curvatures, target.curvature))
-    worse = max(recipes[above - 1].max_zernike, recipes[above].max_zernike)
-    effective = np.asarray(_curve(book, target.conic_constant)(target.curvature), dtype=np.float64)
-    return FoundRecipe(effective, worse + book.interpolation_error, True)
-
-
-def interpolation_error(recipes: Sequence[Recipe], influence_zernike: Floats) -> float:
-    """Largest coefficient error of a recipe interpolated from the others, m; 0 with fewer than three.
-
-    Each inner recipe is left out in turn, so gaps are twice as wide as in use: on the safe side.
+class Kriging:
+    """The best linear estimate of a field of unit variance from samples.
 
     Args:
-        recipes: of one conic constant, by rising curvature.
-        influence_zernike: (K, N) m per unit of effective signal.
+        places: (R, N) effective signals of the samples.
+        noise: (R,) variance of each.
     """
-    if len(recipes) < 3:
-        return 0.0
-    missed = _left_out(recipes, _best_curve(recipes))
-    return float(np.abs(missed @ influence_zernike[PISTON_TILT:].T).max())
+
+    def __init__(self, places: Floats, noise: Floats) -> None:
+        self._places = places
+        self._inverse = np.linalg.inv(_alike(places[:, None], places) + np.diag(noise))
+
+    def at(self, place: Floats) -> tuple[Floats, float]:
+        """Weights (R,) of the samples at `place` (N,), and the variance that they leave."""
+        alike = _alike(place, self._places)
+        weights = alike @ self._inverse
+        return weights, max(1.0 - float(weights @ alike), 0.0)
+
+    def left_out(self, values: Floats) -> tuple[Floats, Floats]:
+        """What the others miss of each sample of `values` (R, N), and (R,) the variance that they leave there."""
+        left = 1.0 / np.diag(self._inverse)
+        return left[:, None] * (self._inverse @ values), left
 
 
-def _of_conic(book: RecipeBook, conic_constant: float) -> list[Recipe]:
-    recipes = [r for r in book.recipes if abs(r.conic_constant - conic_constant) <= SAME_CONIC]
-    if not recipes:
-        there = ", ".join(f"{conic:g}" for conic in sorted({r.conic_constant for r in book.recipes}))
-        raise RecipeError(f"conic_constant = {conic_constant:g}: there are recipes of {there} only")
-    return recipes
+def _alike(one: Floats, other: Floats) -> Floats:
+    """(..., R) correlation between effective signals (..., N) and (R, N)."""
+    return np.asarray(np.exp(-np.sqrt(np.square(one - other).mean(axis=-1)) / REACH))
 
 
-@lru_cache(maxsize=16)
-def _curve(book: RecipeBook, conic_constant: float) -> Curve:
-    """(N,) effective signals over curvature, by the curve that predicts recipes left out best."""
-    recipes = _of_conic(book, conic_constant)
-    return _through(recipes, _best_curve(recipes))
+class Corrections:
+    """The corrections that the recipes of one calibration show.
+
+    Attributes:
+        amplitude: m, bound of the largest coefficient that a correction makes where no recipe is near.
+    """
+
+    def __init__(self, recipes: Sequence[Recipe], planner: Planner) -> None:
+        self._mirror, self._recipes = planner.mirror, recipes
+        self._own = np.array([planner.mirror.command(target_of(recipe))[0] for recipe in recipes])
+        self._corrections = np.array([recipe.effective for recipe in recipes]) - self._own
+        self._measured = np.array([recipe.max_zernike for recipe in recipes])
+        self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
+        missed, left = self._kriging.left_out(self._corrections)
+        # Alone, a recipe is missed by its whole correction; what was re-measured counts by itself.
+        beyond = np.maximum(self._largest(missed) - self._measured.max(), 0.0) / np.sqrt(left)
+        hysteresis, model = planner.hysteresis, planner.mirror.model
+        promised = model.held_out_max_zernike if hysteresis is None else hysteresis.held_out_max_zernike
+        shown = max(float(self._largest(self._corrections).max()), float(beyond.max()))
+        # The largest of a few samples is not the largest there is.
+        self.amplitude = max(promised, shown * (1.0 + 2.0 / len(recipes)))
+        self._repeat = REPEAT_SHARE * promised
+
+    def _bound(self, measured: float, left: float) -> float:
+        """m, for shapes near recipes that were re-measured with that error (m), which leave that variance."""
+        return measured + math.hypot(self.amplitude * math.sqrt(left), self._repeat)
+
+    def _largest(self, effective: Floats) -> Floats:
+        """(R,) m, largest coefficients beyond tilt that effective signals (R, N) make."""
+        influence = self._mirror.model.influence_zernike[PISTON_TILT:]
+        return np.asarray(np.abs(effective @ influence.T).max(axis=1))
+
+    def find(self, target: FocusTarget) -> FoundRecipe:
+        """What makes `target`. Raises RecipeError when no recipe is near it."""
+        for recipe in self._recipes:
+            if _same(recipe, target):
+                return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0), False)
+        own = self._mirror.command(target)[0]
+        weights, left = self._kriging.at(own)
+        if left > LEFT_MAX:
+            raise RecipeError(
+                f"curvature = {target.curvature:+.4f} 1/m: no recipe is near this shape; there are {self._there()}"
+            )
+        near = np.abs(weights) >= SLIGHT * np.abs(weights).max()
+        error = self._bound(float(self._measured[near].max()), left)
+        return FoundRecipe(own + weights @ self._corrections, error, True)
+
+    @cached_property
+    def worst(self) -> float:
+        """m, bound of the largest coefficient error at recipes and halfway between neighbours."""
+        lefts = [
+            self._kriging.at(0.5 * (own + following))[1]
+            for own, following, a, b in zip(self._own, self._own[1:], self._recipes, self._recipes[1:], strict=False)
+            if abs(a.conic_constant - b.conic_constant) <= SAME_CONIC
+        ]
+        return self._bound(float(self._measured.max()), max(lefts, default=0.0))
+
+    def _there(self) -> str:
+        """The recipes there are, in words."""
+        conics = sorted({recipe.conic_constant for recipe in self._recipes})
+        ranges = {c: [r.curvature for r in self._recipes if r.conic_constant == c] for c in conics}
+        return ", ".join(
+            f"{len(of)} from {min(of):+.4f} to {max(of):+.4f} 1/m with conic_constant = {conic:g}"
+            for conic, of in ranges.items()
+        )
 
 
-def _best_curve(recipes: Sequence[Recipe]) -> str:
-    """Name of the curve whose prediction of recipes left out is best."""
-    # One recipe is left out for the choice, so a curve must do with one fewer.
-    able = [name for name, (fewest, _) in _CURVES.items() if len(recipes) - 1 >= fewest]
-    if len(able) < 2:
-        return "linear"
-    return min(able, key=lambda name: float(np.linalg.norm(_left_out(recipes, name))))
+def target_of(recipe: Recipe) -> FocusTarget:
+    """The shape of a recipe."""
+    return FocusTarget(recipe.curvature, recipe.conic_constant)
 
 
-def _left_out(recipes: Sequence[Recipe], name: str) -> Floats:
-    """(M - 2, N) what a curve through the others misses of each inner recipe."""
-    rows = []
-    for k in range(1, len(recipes) - 1):
-        others = [*recipes[:k], *recipes[k + 1 :]]
-        rows.append(_through(others, name)(recipes[k].curvature) - recipes[k].effective)
-    return np.array(rows)
+def _same(recipe: Recipe, target: FocusTarget) -> bool:
+    return (
+        abs(recipe.curvature - target.curvature) <= SAME_CURVATURE
+        and abs(recipe.conic_constant - target.conic_constant) <= SAME_CONIC
+        and not any(target.zernike)
+    )
 
 
-def _through(recipes: Sequence[Recipe], name: str) -> Curve:
-    curvature = np.array([recipe.curvature for recipe in recipes])
-    return _CURVES[name][1](curvature, np.array([recipe.effective for recipe in recipes]))
+@lru_cache(maxsize=4)
+def corrections(book: RecipeBook, planner: Planner) -> Corrections:
+    """Those of `book` on the mirror of `planner`. Raises RecipeError when it is empty."""
+    if not book.recipes:
+        raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
+    return Corrections(book.recipes, planner)
 
 
-__all__ = ["FoundRecipe", "RecipeError", "find", "interpolation_error"]
+def find(book: RecipeBook, target: FocusTarget, planner: Planner) -> FoundRecipe:
+    """What makes `target` on the mirror of `planner`, by recipes near it. Raises RecipeError when there are none."""
+    return corrections(book, planner).find(target)
+
+
+def worst_error(book: RecipeBook, planner: Planner) -> float:
+    """m, bound of the largest coefficient error at recipes and halfway between neighbours; 0 = no recipes."""
+    return corrections(book, planner).worst if book.recipes else 0.0
