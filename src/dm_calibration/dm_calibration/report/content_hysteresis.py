@@ -91,7 +91,7 @@ def recipes(calibration: Calibration) -> Section:
         title,
         [
             f"Each begins with a degauss of {book.degauss_steps} half-swings. The last was built {utc(book.stamp_ns)}. "
-            "A recipe interpolated from the others erred by "
+            "Halfway between neighbours the bound is larger than what was re-measured by "
             f"{length(book.interpolation_error, calibration.wavelength)} at most."
         ],
         [Table("Recipes", header, rows)],

@@ -3,10 +3,9 @@
 Knows no ROS. Every round begins with a degauss, for a recipe holds from that condition only. Its maps are averaged
 until their mean is sure. Creep goes on meanwhile and the electronics write whole steps only; the hysteresis model says
 how far the effective signals were from the wanted ones at each map, and the influence function takes that off. What
-remains of a map is the *defect* of the model: measured less predicted surface at the effective signals of the shape. It
-changes little from shape to shape, so that of the next is estimated from all rounds so far
-(`planning.recipes.Kriging`): most shapes are right at once, and their only round is the one that re-measures them. In
-the end each recipe rests on its neighbours' maps too.
+remains of a map is the defect of the model at the effective signals of the shape. That of the next shape is estimated
+from all rounds so far (`converge.defects`): most shapes are right at once, and their only round is the one that
+re-measures them. In the end each recipe rests on its neighbours' maps too.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ import numpy as np
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Measurement
-from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
+from dm_controller.converge.defects import Defects, mean_of
 from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.recipes import Kriging, worst_error
+from dm_controller.planning.recipes import worst_error
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag, target_shape
 
@@ -35,8 +34,6 @@ DENIED_MAX = 2e-8
 MISSED_MAX = 1e-3
 #: Maps of a round go on until their mean is as sure as this share of the tolerance, but fewer do not tell their noise.
 SURE_SHARE, MAPS_MIN = 0.2, 3
-#: No mean of maps is surer than this, m.
-SIGMA_MIN = 1e-12
 
 
 class ConditionedPlant(Protocol):
@@ -153,10 +150,8 @@ class RecipeBuilder:
         actuators = model.influence_zernike.shape[1]
         self.state = state if state is not None else loop.law.demagnetised(actuators, now(), self._middle)
         self.maps = 0
-        self._rounds: list[_Round] = []
+        self._defects = Defects(model)
         self._built: list[tuple[_Round, int]] = []
-        # Squares (K - 3,) of what maps scatter about the means of their rounds, and their degrees of freedom.
-        self._scatter, self._freedom = np.zeros(len(model.zernike_offset) - PISTON_TILT), 0
 
     def build(self, target: FocusTarget) -> Recipe:
         """The recipe for `target`, as it is known now.
@@ -175,7 +170,6 @@ class RecipeBuilder:
         while True:
             aim = self._solve(target, aim)
             taken = self._measure_round(target, aim, maps)
-            self._rounds.append(taken)
             maps += taken.maps
             if self._error(taken).max_zernike <= options.tolerance or maps + options.average > options.maps_max:
                 self._built.append((taken, maps))
@@ -205,26 +199,10 @@ class RecipeBuilder:
         """What was measured in a round, less what was wanted."""
         return self._predicted(taken.aim) + taken.defect - target_shape(taken.target, self._loop.mirror.model)
 
-    def _defect(self, aim: Floats) -> Shape:
-        """The defect to expect at the effective signals `aim` (N,), from all rounds."""
-        model, rounds = self._loop.mirror.model, self._rounds
-        if not rounds:
-            return Shape(np.zeros_like(model.zernike_offset), np.zeros_like(model.sag_offset))
-        coefficients = np.array([taken.defect.coefficients for taken in rounds])
-        size = max(np.mean(np.square(coefficients[:, PISTON_TILT:])), SIGMA_MIN**2)
-        noise = np.array([float(np.mean(self._noise)) / taken.maps for taken in rounds]) + SIGMA_MIN**2
-        weights, _ = Kriging(np.array([taken.aim for taken in rounds]), noise / size).at(aim)
-        return Shape(weights @ coefficients, weights @ np.array([taken.defect.sag for taken in rounds]))
-
-    @property
-    def _noise(self) -> Floats:
-        """(K - 3,) m^2, variance of the coefficients beyond tilt of one map, by all that were taken."""
-        return self._scatter / max(self._freedom, 1)
-
     def _solve(self, target: FocusTarget, near: Floats | None) -> Floats:
         """(N,) effective signals for `target` on a mirror with the defect at `near` (N,); None = without any."""
         mirror, wanted = self._loop.mirror, target_shape(target, self._loop.mirror.model) - self._offset
-        change = wanted if near is None else wanted - self._defect(near)
+        change = wanted if near is None else wanted - self._defects.at(near)
         return mirror.solve(mirror.rows(change.coefficients, change.sag))
 
     def _response(self, effective: Floats) -> Shape:
@@ -264,31 +242,25 @@ class RecipeBuilder:
     def _measure_round(self, target: FocusTarget, aim: Floats, before: int) -> _Round:
         model, law, options = self._loop.mirror.model, self._loop.law, self._options
         signals, aim = self._go(target, aim)
-        coefficients, sags = list[Floats](), list[Floats]()
+        defects = list[Shape]()
         while True:
             self._stop_if_cancelled()
-            number = len(coefficients) + 1
-            if number > 1:
+            if defects:
                 self._hold(aim)
+            number = len(defects) + 1
             measured = self._plant.measure(f"recipe {target.curvature:+.4f} 1/m {before + number}")
             self.maps += 1
             surface = measured_shape(measured.coefficients, measured.sag, model)
             # A map tells when it was taken; one that does not was taken now.
             seen = min(max(1e-9 * measured.stamp_ns, self.state.time), self._now())
-            effective = law.effective(law.advance(self.state, seen))
-            defect = surface - self._predicted(effective)
-            coefficients.append(defect.coefficients)
-            sags.append(defect.sag)
-            taken = _Round(target, signals, aim, Shape(np.mean(coefficients, axis=0), np.mean(sags, axis=0)), number)
+            defects.append(surface - self._predicted(law.effective(law.advance(self.state, seen))))
+            taken = _Round(target, signals, aim, mean_of(defects), number)
             error = self._error(taken)
             self._on_step(BuildStep(target.curvature, before + number, error.max_zernike, rms_sag(error, model)))
-            beyond = np.array(coefficients)[:, PISTON_TILT:]
-            scatter = self._scatter + np.square(beyond - beyond.mean(axis=0)).sum(axis=0)
-            spread = math.sqrt(scatter.max() / max(self._freedom + number - 1, 1) / number)
-            sure = number >= min(MAPS_MIN, options.average) and spread <= SURE_SHARE * options.tolerance
+            sure = number >= MAPS_MIN and self._defects.spread(defects) <= SURE_SHARE * options.tolerance
             if sure or number == options.average:
                 break
-        self._scatter, self._freedom = scatter, self._freedom + number - 1
+        self._defects.add(aim, defects)
         self.state = law.advance(self.state, self._now())
         return taken
 

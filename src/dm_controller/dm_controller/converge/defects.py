@@ -1,0 +1,70 @@
+"""What maps show of a model: its defect, measured less predicted surface, as a field over effective signals.
+
+Neighbouring shapes have about the same defect, so that of a shape is estimated from all rounds of maps
+(`planning.recipes.Kriging`), each as sure as the noise of its maps permits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from dm_common.optics.zernike import PISTON_TILT
+from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.recipes import Kriging
+from dm_controller.solvers.base import Floats, Shape
+
+#: No mean of maps is surer than this, m.
+SIGMA_MIN = 1e-12
+
+
+def mean_of(shapes: Sequence[Shape]) -> Shape:
+    """The mean of surfaces."""
+    return Shape(
+        np.mean([shape.coefficients for shape in shapes], axis=0), np.mean([shape.sag for shape in shapes], axis=0)
+    )
+
+
+class Defects:
+    """The rounds of one run.
+
+    Args:
+        model: whose defect it is.
+    """
+
+    def __init__(self, model: InfluenceModel) -> None:
+        self._none = Shape(np.zeros_like(model.zernike_offset), np.zeros_like(model.sag_offset))
+        self._aims: list[Floats] = []
+        self._means: list[Shape] = []
+        self._maps: list[int] = []
+        # Squares (K - 3,) of what maps scatter about the means of their rounds, and their degrees of freedom.
+        self._scatter, self._freedom = np.zeros(len(model.zernike_offset) - PISTON_TILT), 0
+
+    def add(self, aim: Floats, maps: Sequence[Shape]) -> None:
+        """Take a round: the defects that its maps show at the effective signals `aim` (N,)."""
+        self._scatter, self._freedom = self._scattered(maps)
+        self._aims.append(aim)
+        self._means.append(mean_of(maps))
+        self._maps.append(len(maps))
+
+    def spread(self, maps: Sequence[Shape]) -> float:
+        """Standard deviation of the worst coefficient of the mean of a round, m, by what all maps scatter."""
+        scatter, freedom = self._scattered(maps)
+        return math.sqrt(scatter.max() / max(freedom, 1) / len(maps))
+
+    def _scattered(self, maps: Sequence[Shape]) -> tuple[Floats, int]:
+        coefficients = np.array([shape.coefficients[PISTON_TILT:] for shape in maps])
+        squares = np.square(coefficients - coefficients.mean(axis=0)).sum(axis=0)
+        return self._scatter + squares, self._freedom + len(maps) - 1
+
+    def at(self, aim: Floats) -> Shape:
+        """The defect to expect at the effective signals `aim` (N,); none before the first round."""
+        if not self._means:
+            return self._none
+        coefficients = np.array([shape.coefficients for shape in self._means])
+        size = max(float(np.mean(np.square(coefficients[:, PISTON_TILT:]))), SIGMA_MIN**2)
+        noise = self._scatter.mean() / max(self._freedom, 1) / np.array(self._maps) + SIGMA_MIN**2
+        weights, _ = Kriging(np.array(self._aims), noise / size).at(aim)
+        return Shape(weights @ coefficients, weights @ np.array([shape.sag for shape in self._means]))
