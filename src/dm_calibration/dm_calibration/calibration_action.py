@@ -139,16 +139,14 @@ class CalibrateAction:
 
     def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> tuple[Plan, PlanOptions]:
         """The plan of a goal and what it follows from, after its fields were checked."""
-        if goal.plan not in tuple(PlanKind):
-            raise Refusal(ErrorCode.OUT_OF_RANGE, f"plan = {goal.plan}: must be 0 to {max(PlanKind)}")
-        if not 0.0 <= goal.poke_amplitude <= 1.0:  # also refuses NaN
-            raise Refusal(
-                ErrorCode.OUT_OF_RANGE, f"poke_amplitude = {goal.poke_amplitude}: must be 0 to 1, 0 = configured"
-            )
-        if not 0.0 <= goal.settle_time <= 600.0:
-            raise Refusal(ErrorCode.OUT_OF_RANGE, f"settle_time = {goal.settle_time}: must be 0 to 600 s")
-        if goal.maps_per_state > 100:
-            raise Refusal(ErrorCode.OUT_OF_RANGE, f"maps_per_state = {goal.maps_per_state}: must be 0 to 100")
+        for name, value, high, unit in (
+            ("plan", goal.plan, max(PlanKind), ""),
+            ("poke_amplitude", goal.poke_amplitude, 1, ", 0 = configured"),
+            ("settle_time", goal.settle_time, 600, " s"),
+            ("maps_per_state", goal.maps_per_state, 100, ""),
+        ):
+            if not 0 <= value <= high:  # also refuses NaN
+                raise Refusal(ErrorCode.OUT_OF_RANGE, f"{name} = {value}: must be 0 to {high}{unit}")
         options = PlanOptions(
             poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],
             reference_every=goal.reference_every or self._values["reference_every"],

@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN, REPEATS
 from dm_calibration.influence.surfaces import LinearModel
-from dm_calibration.procedure.plan import (
-    HYSTERESIS_REFERENCE_EVERY,
-    Plan,
-    PlanKind,
-    PlanOptions,
-    StepKind,
-    make_plan,
-)
+from dm_calibration.procedure.plan import HYSTERESIS_REFERENCE_EVERY, Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions
 from dm_common.errors import ErrorCode, MeasurementError
 from dm_common.measurement import Measurement

@@ -40,14 +40,7 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
-from dm_calibration.regression.stepwise import (
-    P_ENTER,
-    P_REMOVE,
-    SelectionOptions,
-    StepwiseFit,
-    leave_one_out,
-    stepwise,
-)
+from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions, StepwiseFit, leave_one_out, stepwise
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sample_regions import regional_rms
 

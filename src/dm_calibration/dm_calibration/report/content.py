@@ -49,24 +49,18 @@ def summary(calibration: Calibration) -> Section:
     """What a user must know first."""
     fit, hysteresis, wavelength = calibration.fit, calibration.hysteresis, calibration.wavelength
     grades = Counter(GRADE_NAMES[grade] for grade in fit.grades)
+    move = "largest coefficient error of a move in open loop, held out, 95 %"
     rows = [
         ("residual sag of the maps used, in-sample", length(fit.in_sample_rms, wavelength)),
         ("residual sag of maps held out of the fit", length(fit.held_out_rms, wavelength)),
         ("largest coefficient error, held out, 95 % of the maps", length(fit.held_out_max_zernike, wavelength)),
+        *([(move, length(hysteresis.held_out_max_zernike, wavelength))] if hysteresis is not None else []),
+        ("largest coefficient error, re-measured (recipes)", remeasured(calibration)),
         ("figure drift during the run, rms", length(fit.drift_rms, wavelength)),
         ("condition number (rms-normalised modes)", f"{fit.condition_number:.1f}"),
         ("actuators", ", ".join(f"{count} {name}" for name, count in grades.items())),
         ("signals seen", f"{fit.signal_min:+.3f} … {fit.signal_max:+.3f}"),
     ]
-    if hysteresis is not None:
-        rows.insert(
-            3, ("largest coefficient error of a move in open loop, held out, 95 %",
-                length(hysteresis.held_out_max_zernike, wavelength)),
-        )  # fmt: skip
-    rows.insert(
-        4 if hysteresis is not None else 3,
-        ("largest coefficient error, re-measured (recipes)", remeasured(calibration)),
-    )
     if hysteresis is None:
         kind = (
             "This calibration is linear, without hysteresis: after any move, hysteresis and creep leave an error that "
