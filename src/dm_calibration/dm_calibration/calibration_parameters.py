@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.influence.quality import GradeOptions
-from dm_calibration.influence.screening import ScreeningOptions
 from dm_calibration.procedure.bump_check import BumpOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift_filter import DriftRates
@@ -157,15 +156,8 @@ PARAMETERS = (
 
 def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
     """Options of a fit from the node's parameters; `method` empty = the default."""
-    screening = ScreeningOptions(
-        valid_fraction_min=values["valid_fraction_min"],
-        outlier_sigmas=values["outlier_sigmas"],
-        hysteresis_allowance=values["hysteresis_allowance"],
-    )
-    grades = GradeOptions(
-        dead_sigmas=values["dead_sigmas"], weak_sigmas=values["weak_sigmas"], weak_share=values["weak_share"]
-    )
-    return FitOptions(method or FitOptions().method, values["folds"], screening, grades, values["epsilon"] or None)
+    same = {field.name: values[field.name] for field in fields(FitOptions) if field.name in values}
+    return FitOptions(**same | {"method": method or FitOptions().method, "epsilon": values["epsilon"] or None})
 
 
 def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> ProcedureOptions:

@@ -9,14 +9,13 @@ tilt, so they are removed, area-weighted, from every sag vector before the fit a
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence import quality, screening
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.quality import GradeOptions
 from dm_calibration.influence.region_weighting import choose_weighting, weighted_coefficients
 from dm_calibration.influence.regression import (
     METHODS,
@@ -28,7 +27,6 @@ from dm_calibration.influence.regression import (
     regress,
     usable_sag,
 )
-from dm_calibration.influence.screening import ScreeningOptions
 from dm_calibration.influence.weights import check_epsilon
 from dm_common.names import unknown_name
 from dm_common.optics.piston_tilt import rms
@@ -40,9 +38,19 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit: method (a name of METHODS), folds of the cross-validation, thresholds.
+    """How to fit, and from where on maps and actuators are no good.
 
-    `epsilon` (m^2, above 0) is the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
+    Attributes:
+        method: a name of METHODS.
+        folds: of the cross-validation.
+        epsilon: m^2, above 0, the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
+        valid_fraction_min: least share of valid pixels in the aperture of a map.
+        outlier_sigmas: residual, in robust sigmas above the median, beyond which a map is an outlier.
+        hysteresis_allowance: share of an actuator's move by which it may miss its mark because of hysteresis (half the
+            loop, whose width is 7-15 % of the move) without the map counting as an outlier.
+        dead_sigmas: an actuator is dead below this many standard errors of its response.
+        weak_sigmas: it is weak below this many standard errors ...
+        weak_share: ... or below this share of the median response of its ring.
 
     Raises:
         ValueError: fewer than 2 folds, or an epsilon that is not above 0.
@@ -50,9 +58,13 @@ class FitOptions:
 
     method: str = "AZreg"
     folds: int = 10
-    screening: ScreeningOptions = field(default_factory=ScreeningOptions)
-    grades: GradeOptions = field(default_factory=GradeOptions)
     epsilon: float | None = None
+    valid_fraction_min: float = 0.5
+    outlier_sigmas: float = 6.0
+    hysteresis_allowance: float = 0.10
+    dead_sigmas: float = 3.0
+    weak_sigmas: float = 10.0
+    weak_share: float = 0.4
 
     def __post_init__(self) -> None:
         if self.folds < 2:
@@ -141,12 +153,12 @@ def fit_influence(
     for label in exclude:
         if label not in maps.label:
             raise unknown_name("map label", label, maps.label)
-    reasons = screening.unusable(maps, options.screening)
+    reasons = screening.unusable(maps, options.valid_fraction_min)
     reasons = ["excluded by request" if label in exclude else r for label, r in zip(maps.label, reasons, strict=True)]
 
     sag = usable_sag(maps, reasons)
     good, design, fitted, responses = _fit_good(maps, sag, reasons)
-    budget = int(options.screening.dropped_max * len(maps))
+    budget = int(screening.DROPPED_MAX * len(maps))
     doubtful = False
     while not doubtful:
         outlier = screening.worst_outlier(
@@ -154,7 +166,8 @@ def fit_influence(
             fitted.leverage,
             good.applied,
             _response(fitted, design, good),
-            options.screening,
+            options.outlier_sigmas,
+            options.hysteresis_allowance,
         )
         if outlier is None:
             break
@@ -179,7 +192,7 @@ def fit_influence(
         remarks.append(weighting.sentence())
     if doubtful:
         remarks.append(
-            f"More than {options.screening.dropped_max:.0%} of the maps look like outliers; not all of them were "
+            f"More than {screening.DROPPED_MAX:.0%} of the maps look like outliers; not all of them were "
             "dropped. Doubt this calibration."
         )
     return _judge(maps, options, rings, reasons, good, design, fitted, responses, remarks)
@@ -238,7 +251,15 @@ def _judge(
     tilt_known = bool(np.all(np.linalg.norm(tilt, axis=0) > 3.0 * np.linalg.norm(tilt_error, axis=0)))
 
     response = _response(fitted, design, good)
-    grades = quality.grade(response, standard_error, design.excited, rings, options.grades)
+    grades = quality.grade(
+        response,
+        standard_error,
+        design.excited,
+        rings,
+        dead_sigmas=options.dead_sigmas,
+        weak_sigmas=options.weak_sigmas,
+        weak_share=options.weak_share,
+    )
     figure_sag = figure[:, terms:]
     return InfluenceFit(
         method=options.method,

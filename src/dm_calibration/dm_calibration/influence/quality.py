@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +13,8 @@ Floats = NDArray[np.float64]
 
 #: Variance of a held-out prediction, in variances of one measurement, beyond which it is extrapolation.
 EXTRAPOLATION_MAX = 10.0
+#: Share of the median response of all excited actuators below which one is dead.
+DEAD_SHARE = 0.02
 
 # Values of dm_msgs/Calibration.actuator_grade.
 GRADE_GOOD = 0
@@ -24,39 +24,27 @@ GRADE_NOT_EXCITED = 3
 GRADE_NAMES = ("good", "weak", "dead", "not excited")
 
 
-@dataclass(frozen=True)
-class GradeOptions:
-    """Thresholds for actuators; a response is the weighted rms sag of a unit signal, piston and tilt removed.
-
-    Attributes:
-        dead_sigmas: DEAD below this many standard errors ...
-        dead_share: ... or below this share of the median response of all excited actuators.
-        weak_sigmas: WEAK below this many standard errors ...
-        weak_share: ... or below this share of the median response of its ring.
-    """
-
-    dead_sigmas: float = 3.0
-    dead_share: float = 0.02
-    weak_sigmas: float = 10.0
-    weak_share: float = 0.4
-
-
 def grade(
     response: Floats,
     standard_error: Floats,
     excited: NDArray[np.bool_],
-    rings: NDArray[np.int64] | None = None,
-    options: GradeOptions | None = None,
+    rings: NDArray[np.int64] | None,
+    *,
+    dead_sigmas: float,
+    weak_sigmas: float,
+    weak_share: float,
 ) -> NDArray[np.uint8]:
-    """Grade of each actuator from its response (N,) and standard error (N,), both m per unit signal."""
-    options = options or GradeOptions()
+    """Grade of each actuator from its response (N,) and standard error (N,), both m per unit signal.
+
+    A response is the weighted rms sag of a unit signal, piston and tilt removed.
+    """
     rings = np.zeros(response.size, dtype=np.int64) if rings is None else rings
     overall = float(np.median(response[excited])) if excited.any() else 0.0
     ring_median = np.array(
         [np.median(response[excited & (rings == ring)]) if e else 0.0 for ring, e in zip(rings, excited, strict=True)]
     )
-    dead = (response < options.dead_sigmas * standard_error) | (response < options.dead_share * overall)
-    weak = (response < options.weak_sigmas * standard_error) | (response < options.weak_share * ring_median)
+    dead = (response < dead_sigmas * standard_error) | (response < DEAD_SHARE * overall)
+    weak = (response < weak_sigmas * standard_error) | (response < weak_share * ring_median)
     grades = np.where(dead, GRADE_DEAD, np.where(weak, GRADE_WEAK, GRADE_GOOD))
     return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
 

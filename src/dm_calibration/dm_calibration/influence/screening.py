@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,31 +13,15 @@ Floats = NDArray[np.float64]
 MAD_TO_SIGMA = 1.4826
 #: Maps with a leverage above this fix something alone: their own residual says nothing about them.
 LEVERAGE_MAX = 0.95
+#: Largest share of sampling points without data.
+MISSING_POINTS_MAX = 0.2
+#: No map with a smaller residual is an outlier, m rms.
+RESIDUAL_FLOOR = 5e-9
+#: Largest share of the maps that may be dropped as outliers.
+DROPPED_MAX = 0.25
 
 
-@dataclass(frozen=True)
-class ScreeningOptions:
-    """Thresholds for maps.
-
-    Attributes:
-        valid_fraction_min: least share of valid pixels in the aperture.
-        missing_points_max: largest share of sampling points without data.
-        outlier_sigmas: residual, in robust sigmas above the median, beyond which a map is an outlier.
-        hysteresis_allowance: share of an actuator's move by which it may miss its mark because of hysteresis (half the
-            loop, whose width is 7-15 % of the move) without the map counting as an outlier.
-        residual_floor: no map with a smaller residual is an outlier, m rms.
-        dropped_max: largest share of the maps that may be dropped as outliers.
-    """
-
-    valid_fraction_min: float = 0.5
-    missing_points_max: float = 0.2
-    outlier_sigmas: float = 6.0
-    hysteresis_allowance: float = 0.10
-    residual_floor: float = 5e-9
-    dropped_max: float = 0.25
-
-
-def unusable(maps: MapSet, options: ScreeningOptions) -> list[str]:
+def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
     """Reason for which each map cannot enter a fit; "" = it can."""
     terms_finite = np.asarray(np.isfinite(maps.coefficients).all(axis=1))
     applied_finite = np.asarray(np.isfinite(maps.applied).all(axis=1))
@@ -54,15 +36,13 @@ def unusable(maps: MapSet, options: ScreeningOptions) -> list[str]:
             reason = "an applied signal is not finite"
         elif infinite[i]:
             reason = "a sag sample is infinite"
-        elif not maps.valid_fraction[i] >= options.valid_fraction_min:
+        elif not maps.valid_fraction[i] >= valid_fraction_min:
             reason = (
                 f"too few valid pixels: {maps.valid_fraction[i]:.1%} of the aperture, "
-                f"at least {options.valid_fraction_min:.0%} are needed"
+                f"at least {valid_fraction_min:.0%} are needed"
             )
-        elif missing[i] > options.missing_points_max:
-            reason = (
-                f"{missing[i]:.1%} of the sampling points have no data, at most {options.missing_points_max:.0%} may"
-            )
+        elif missing[i] > MISSING_POINTS_MAX:
+            reason = f"{missing[i]:.1%} of the sampling points have no data, at most {MISSING_POINTS_MAX:.0%} may"
         reasons.append(reason)
     return reasons
 
@@ -72,7 +52,8 @@ def worst_outlier(
     leverage: Floats,
     applied: Floats,
     response: Floats,
-    options: ScreeningOptions,
+    outlier_sigmas: float,
+    hysteresis_allowance: float,
 ) -> tuple[int, str] | None:
     """The map that stands out most from the fit, with the reason; None when none does.
 
@@ -94,8 +75,8 @@ def worst_outlier(
     median = float(np.median(scaled[judged]))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(scaled[judged] - median)))
     move = np.sqrt(np.square(applied) @ np.square(response))
-    allowance = options.hysteresis_allowance * np.maximum.accumulate(move)
-    limit = np.maximum(np.maximum(median + options.outlier_sigmas * sigma, options.residual_floor), allowance)
+    allowance = hysteresis_allowance * np.maximum.accumulate(move)
+    limit = np.maximum(np.maximum(median + outlier_sigmas * sigma, RESIDUAL_FLOOR), allowance)
     outside = scaled > limit
     if not outside.any():
         return None
