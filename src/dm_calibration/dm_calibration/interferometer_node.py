@@ -24,7 +24,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from dm_calibration.acquisition import interferometer_messages as messages
-from dm_calibration.acquisition.acquisition import Acquired, Acquisition
+from dm_calibration.acquisition.acquisition import Acquisition
 from dm_calibration.acquisition.ingest import Ingest
 from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
 from dm_calibration.map_files import MapFileError, SurfaceMap
@@ -147,7 +147,8 @@ class InterferometerNode(LifecycleNode):
             raise Refusal(ErrorCode.OUT_OF_RANGE, f"timeout = {request.timeout} s: must be 0 (configured) to 86400 s")
         with self._counting_refusals():
             acquired = acquisition.acquire(timeout_s)
-        header = self._header(self._measurement_time(acquired))
+        taken = acquired.taken_ns
+        header = self._header(self._file_time(acquired.surface, believe_header=False) if taken is None else taken)
         what = f"measured {request.label}".strip()
         return self._accept(response, acquired.surface, acquired.measurement, header, what)
 
@@ -226,11 +227,6 @@ class InterferometerNode(LifecycleNode):
 
     def _header(self, stamp_ns: int) -> Header:
         return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=self._values["frame_id"])
-
-    def _measurement_time(self, acquired: Acquired) -> int:
-        if acquired.began_ns is None or acquired.ended_ns is None:
-            return self._file_time(acquired.surface, believe_header=False)
-        return (acquired.began_ns + acquired.ended_ns) // 2
 
     def _file_time(self, surface: SurfaceMap, believe_header: bool) -> int:
         now = self._now_ns()

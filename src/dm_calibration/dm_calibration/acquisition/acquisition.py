@@ -6,7 +6,8 @@ import queue
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -64,14 +65,13 @@ class Acquired:
 
     Attributes:
         surface, measurement: the oriented map and what was found in it.
-        began_ns, ended_ns: when the trigger command started and ended, on the clock given to Acquisition; None when
-            the file came without a trigger.
+        taken_ns: the middle of the trigger command's run, on the clock given to Acquisition; None when the file came
+            without a trigger.
     """
 
     surface: SurfaceMap
     measurement: Measurement
-    began_ns: int | None = None
-    ended_ns: int | None = None
+    taken_ns: int | None
 
 
 class Acquisition:
@@ -142,30 +142,24 @@ class Acquisition:
                 ErrorCode.NOT_SUPPORTED, "neither trigger_command nor watch_folder is configured: use ingest_file"
             )
         deadline = time.monotonic() + timeout_s
-        if not self.settings.trigger_command:
-            return Acquired(*self._next_file(watch, deadline, None))
         trigger_s = min(self.settings.trigger_timeout, timeout_s)
-        began = self._now_ns()
         if self.settings.names_output:
             output = self._new_name(watch)
-            self._trigger(output, trigger_s)
-            ended = self._now_ns()
-            return Acquired(*self._expected_file(output, deadline), began, ended)
-        times: list[int] = []
+            taken = self._trigger(output, trigger_s)
+            return Acquired(*self._expected_file(output, deadline), taken)
+        with self._arrivals() as arrivals:
+            triggered = self._trigger(None, trigger_s) if self.settings.trigger_command else None
+            return Acquired(*self._next_file(watch, arrivals, deadline), triggered)
 
-        def trigger() -> None:
-            self._trigger(None, trigger_s)
-            times.append(self._now_ns())
-
-        surface, measurement = self._next_file(watch, deadline, trigger)
-        return Acquired(surface, measurement, began, times[0])
-
-    def _trigger(self, output: Path | None, timeout_s: float) -> None:
+    def _trigger(self, output: Path | None, timeout_s: float) -> int:
+        """Run the trigger command; returns the middle of its run, ns."""
+        began = self._now_ns()
         try:
             run_trigger(self.settings.trigger_command, output, timeout_s, self._stop)
         except TriggerError:
             self._check_stopped()
             raise
+        return (began + self._now_ns()) // 2
 
     def _check_stopped(self) -> None:
         if self._stop.is_set():
@@ -209,28 +203,30 @@ class Acquisition:
                 )
             time.sleep(_POLL_OUTPUT_S)
 
-    def _next_file(
-        self, watch: FolderWatch, deadline: float, trigger: Callable[[], None] | None
-    ) -> tuple[SurfaceMap, Measurement]:
-        """Read the next file in the folder that is written from now on, after `trigger()` if there is one."""
+    @contextmanager
+    def _arrivals(self) -> Iterator[queue.SimpleQueue[Path]]:
+        """Where the next file in the folder arrives that is written from now on."""
         arrivals: queue.SimpleQueue[Path] = queue.SimpleQueue()
         with self._handover:
             self._waiting, self._waiting_since = arrivals, time.monotonic()
         try:
-            if trigger is not None:
-                trigger()
-            while True:
-                self._check_stopped()
-                remaining = deadline - time.monotonic()
-                try:
-                    return self._read(arrivals.get(timeout=min(max(remaining, 0.001), 0.1)))
-                except queue.Empty:
-                    if remaining <= 0:
-                        reason = self.folder_trouble or f"no new map file in {watch.folder} in time"
-                        raise Refusal(ErrorCode.MAP_TIMEOUT, reason) from None
+            yield arrivals
         finally:
             with self._handover:
                 self._waiting = None
+
+    def _next_file(
+        self, watch: FolderWatch, arrivals: queue.SimpleQueue[Path], deadline: float
+    ) -> tuple[SurfaceMap, Measurement]:
+        while True:
+            self._check_stopped()
+            remaining = deadline - time.monotonic()
+            try:
+                return self._read(arrivals.get(timeout=min(max(remaining, 0.001), 0.1)))
+            except queue.Empty:
+                if remaining <= 0:
+                    reason = self.folder_trouble or f"no new map file in {watch.folder} in time"
+                    raise Refusal(ErrorCode.MAP_TIMEOUT, reason) from None
 
     def _run(self, watch: FolderWatch) -> None:
         period = min(max(self.settings.stable_time / 4, 0.02), 0.25)
