@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.recalibration.update_storage import Updates
+from dm_calibration.recalibration.drift_filter import Drift
 from dm_common.messages import doubles, recipe_book_message, time_message
 
 Floats = NDArray[np.float64]
@@ -77,7 +77,7 @@ def calibration_message(
 
 
 def put_updates(
-    message: CalibrationMsg, updates: Updates, fit: InfluenceFit, doubts: list[str], mirror_changed: bool
+    message: CalibrationMsg, updates: Drift, fit: InfluenceFit, doubts: list[str], mirror_changed: bool
 ) -> None:
     """What later maps have shown, into the `message` of the calibration that they update.
 
@@ -90,8 +90,8 @@ def put_updates(
         setattr(message, name, doubles(getattr(fit, name)))
     message.revision = updates.revision
     message.checked = time_message(updates.checked_ns)
-    message.gain_drift = abs(updates.drift.largest_gain[0])
-    message.offset_drift = updates.drift.offset_rms
+    message.gain_drift = abs(updates.largest_gain[0])
+    message.offset_drift = updates.offset_rms
     message.known_limitations = [*message.known_limitations, *doubts]
     if mirror_changed:
         message.quality = CalibrationMsg.APPROXIMATE

@@ -12,8 +12,7 @@ import pytest
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.drift_filter import DriftRates
-from dm_calibration.recalibration.update_storage import Updates
+from dm_calibration.recalibration.drift_filter import Drift, DriftRates
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -53,7 +52,7 @@ def begun(made: Made, folder: Path, options: UpdateOptions = EXACT, remark: str 
     return updates
 
 
-def known(manager: RecalibrationManager) -> Updates:
+def known(manager: RecalibrationManager) -> Drift:
     assert manager.updates is not None
     return manager.updates
 
@@ -89,7 +88,7 @@ def test_slow_drift_is_followed(bench: SteadyMirror, made: Made, tmp_path: Path)
         bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
         bench.drift(gain * (night + 1) / 100, figure * (night + 1) / 100)
         assert updates.take(bench.measure("night", days=1.0), bench.settled()).accepted, night
-    drift = known(updates).drift
+    drift = known(updates)
     assert drift.offset_rms == pytest.approx(20e-9, rel=0.1)
     assert np.abs(drift.gain - gain).max() < 0.25 * gain.max()
     assert error(bench, changed_fit(updates)) < 0.1 * error(bench, made[1].fit)
@@ -147,7 +146,7 @@ def test_maps_of_one_unmoved_mirror_count_for_less_and_less(bench: SteadyMirror,
     sizes = []
     for _ in range(12):
         updates.take(bench.measure("again"), settled)
-        sizes.append(np.trace(known(updates).drift.covariance))
+        sizes.append(np.trace(known(updates).covariance))
     gained = -np.diff(sizes)
     assert gained[-1] < 0.2 * gained[0]
 
@@ -247,5 +246,5 @@ def test_a_rate_of_zero_keeps_the_gains(bench: SteadyMirror, made: Made, tmp_pat
     for gain in (0.0, 1e-3):
         updates = begun(made, tmp_path / str(gain), replace(EXACT, rates=DriftRates(gain=gain, figure=0.0)))
         updates.take(bench.measure("later", days=100.0), bench.settled())
-        widths.append(np.diag(known(updates).drift.covariance)[: bench.mirror.actuators].max())
+        widths.append(np.diag(known(updates).covariance)[: bench.mirror.actuators].max())
     assert widths[0] < 0.1 * widths[1]

@@ -62,12 +62,18 @@ class Drift:
         offset: (R,) m rms, change of the figure in reduced values.
         covariance: (N + R, N + R) of both.
         stamp_ns: time it holds for.
+        revision: maps taken in.
+        checked_ns: stamp of the last of them; 0 = none.
+        surprising: maps in a row, the last ones, that disagreed.
     """
 
     gain: Floats
     offset: Floats
     covariance: Floats
     stamp_ns: int
+    revision: int = 0
+    checked_ns: int = 0
+    surprising: int = 0
 
     @property
     def largest_gain(self) -> tuple[float, int]:
@@ -179,6 +185,8 @@ class DriftFilter:
             drift.offset + correction[actuators:],
             0.5 * (covariance + covariance.T),
             max(stamp_ns, drift.stamp_ns),
+            drift.revision + 1,
+            stamp_ns,
         )
         return Comparison(
             max_zernike=float(np.abs(coefficients - predicted)[PISTON_TILT:].max()),

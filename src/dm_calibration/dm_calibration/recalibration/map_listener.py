@@ -224,8 +224,8 @@ class MapListener:
             if updates is not None:
                 response.revision = updates.revision
                 response.gain_drift, response.offset_drift = (
-                    abs(updates.drift.largest_gain[0]),
-                    updates.drift.offset_rms,
+                    abs(updates.largest_gain[0]),
+                    updates.offset_rms,
                 )
         return response
 
@@ -277,15 +277,15 @@ class MapListener:
         if updates is None:
             return diagnostics.OK, [], {}
         warnings = [doubt.rstrip(".") for doubt in self._doubts()]
-        gain, actuator = updates.drift.largest_gain
+        gain, actuator = updates.largest_gain
         if abs(gain) > self._values["updates.gain_drift_max"]:
             warnings.append(f"the gain of actuator {actuator + 1} has drifted by {gain:+.2%}")
-        if updates.drift.offset_rms > self._values["updates.offset_drift_max"]:
-            warnings.append(f"the figure has drifted by {updates.drift.offset_rms * 1e9:.1f} nm rms")
+        if updates.offset_rms > self._values["updates.offset_drift_max"]:
+            warnings.append(f"the figure has drifted by {updates.offset_rms * 1e9:.1f} nm rms")
         figures: dict[str, object] = {
             "gain_drift_percent": round(100.0 * gain, 4),
             "gain_drift_actuator": actuator + 1,
-            "offset_drift_nm": round(updates.drift.offset_rms * 1e9, 3),
+            "offset_drift_nm": round(updates.offset_rms * 1e9, 3),
             "revision": updates.revision,
             "hours_since_check": round(self._age_s / 3600.0, 3),
             "maps_taken": self._taken,

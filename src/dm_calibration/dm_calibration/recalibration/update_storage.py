@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,28 +17,12 @@ SCHEMA = "dm_calibration/updates"
 SCHEMA_VERSION = 1
 
 _ARRAYS = ("gain", "offset", "covariance")
+_NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
 
 class UpdatesFileError(ValueError):
     """A file of updates is damaged, foreign, or of another calibration; the message says which."""
-
-
-@dataclass(frozen=True)
-class Updates:
-    """What later maps have shown of a calibrated mirror.
-
-    Attributes:
-        drift: changes of gains and figure.
-        revision: maps taken in.
-        checked_ns: stamp of the last of them; 0 = none.
-        surprising: maps in a row, the last ones, that disagreed.
-    """
-
-    drift: Drift
-    revision: int = 0
-    checked_ns: int = 0
-    surprising: int = 0
 
 
 def basis_hash(calibration: Calibration) -> str:
@@ -48,27 +32,24 @@ def basis_hash(calibration: Calibration) -> str:
     return content_hash(columns | hysteresis_columns(calibration.hysteresis), {"id": calibration.id})
 
 
-def write_updates(path: Path, identifier: str, basis: str, updates: Updates) -> None:
+def write_updates(path: Path, identifier: str, basis: str, updates: Drift) -> None:
     """Write `updates` of the calibration `identifier` with the hash `basis`.
 
     Raises:
         OSError: what stood there before still does.
     """
-    columns: dict[str, Column] = {name: getattr(updates.drift, name) for name in _ARRAYS}
+    columns: dict[str, Column] = {name: getattr(updates, name) for name in _ARRAYS}
     attributes: dict[str, Attribute] = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "calibration": identifier,
         "basis_sha256": basis,
-        "stamp_ns": updates.drift.stamp_ns,
+        **{name: getattr(updates, name) for name in _NUMBERS},
     }
-    for field in fields(Updates):
-        if field.name != "drift":
-            attributes[field.name] = getattr(updates, field.name)
     write_whole(path, write_image(columns, attributes))
 
 
-def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Updates | None:
+def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift | None:
     """The updates in a file; None when there is no file.
 
     Args:
@@ -89,17 +70,14 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Update
     for name, value in wanted.items():
         if attributes.get(name) != value:
             raise UpdatesFileError(f"{path.name}: {name} is {attributes.get(name)!r}: must be {value!r}")
-    numbers = {}
-    for name in ("stamp_ns", *(field.name for field in fields(Updates) if field.name != "drift")):
-        number = attributes.get(name)
+    numbers = {name: attributes.get(name) for name in _NUMBERS}
+    for name, number in numbers.items():
         if not isinstance(number, int) or number < 0:
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a whole number from 0")
-        numbers[name] = number
-    arrays = {}
-    for name in _ARRAYS:
-        value, shape = columns.get(name), getattr(like, name).shape
+    arrays = {name: columns.get(name) for name in _ARRAYS}
+    for name, value in arrays.items():
+        shape = getattr(like, name).shape
         if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
-        arrays[name] = value.astype(np.float64)
-    drift = Drift(stamp_ns=numbers.pop("stamp_ns"), **arrays)
-    return Updates(drift, **numbers)
+    found: dict[str, Any] = {**arrays, **numbers}
+    return Drift(**found)

@@ -18,14 +18,8 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
 from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
-from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter, DriftRates
-from dm_calibration.recalibration.update_storage import (
-    Updates,
-    UpdatesFileError,
-    basis_hash,
-    read_updates,
-    write_updates,
-)
+from dm_calibration.recalibration.drift_filter import Comparison, Drift, DriftFilter, DriftRates
+from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
 from dm_calibration.store.atomic_write import storing
 from dm_common.measurement import Measurement
 from dm_common.mirror import APERTURE_TOLERANCE
@@ -87,7 +81,7 @@ class RecalibrationManager:
         self._lock = threading.RLock()
         self._calibration: Calibration | None = None
         self._filter: DriftFilter | None = None
-        self._updates: Updates | None = None
+        self._updates: Drift | None = None
         self._basis = ""
         self._forget_repeats()
 
@@ -101,7 +95,7 @@ class RecalibrationManager:
             return self._calibration
 
     @property
-    def updates(self) -> Updates | None:
+    def updates(self) -> Drift | None:
         """What maps have shown since; None without a calibration."""
         with self._lock:
             return self._updates
@@ -128,11 +122,11 @@ class RecalibrationManager:
             self._filter = DriftFilter(
                 calibration.fit, calibration.maps, calibration.hysteresis, options.signal_sigma, options.rates
             )
-            fresh = Updates(self._filter.start(calibration.stamp_ns))
+            fresh = self._filter.start(calibration.stamp_ns)
             self._updates = fresh
             file = self._file(calibration.id)
             try:
-                stored = read_updates(file, calibration.id, self._basis, fresh.drift)
+                stored = read_updates(file, calibration.id, self._basis, fresh)
             except UpdatesFileError as error:
                 return f"updates of {calibration.id} are ignored: {error}"
             self._updates = stored or fresh
@@ -143,7 +137,7 @@ class RecalibrationManager:
         with self._lock:
             if self._filter is None or self._updates is None:
                 return None
-            return self._filter.changed(self._updates.drift)
+            return self._filter.changed(self._updates)
 
     def take(self, measured: Measurement, settled: SettledState, dry_run: bool = False) -> Verdict:
         """Compare a map of the mirror at `settled` with the calibration, and take it in when it agrees.
@@ -168,7 +162,7 @@ class RecalibrationManager:
                 )
             repeat = self._repeats(measured.stamp_ns, settled)
             comparison = drift_filter.compare(
-                updates.drift, measured.coefficients, measured.sag, settled.effective, measured.stamp_ns, repeat
+                updates, measured.coefficients, measured.sag, settled.effective, measured.stamp_ns, repeat
             )
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
@@ -176,10 +170,7 @@ class RecalibrationManager:
                 reason += f", more than {options.surprise_max:g}: {_cause(comparison, settled.effective)}"
             if dry_run:
                 return Verdict(accepted, reason, comparison)
-            if accepted:
-                changed = Updates(comparison.updated, updates.revision + 1, measured.stamp_ns, 0)
-            else:
-                changed = replace(updates, surprising=updates.surprising + 1)
+            changed = comparison.updated if accepted else replace(updates, surprising=updates.surprising + 1)
             with storing(f"the update of {calibration.id} was not stored in {self._folder}"):
                 write_updates(self._file(calibration.id), calibration.id, self._basis, changed)
             self._updates = changed
@@ -203,7 +194,7 @@ class RecalibrationManager:
                 raise MapNotUsableError("no calibration is in use")
             with storing(f"updates of {self._calibration.id} were not removed"):
                 self._file(self._calibration.id).unlink(missing_ok=True)
-            self._updates = Updates(self._filter.start(self._calibration.stamp_ns))
+            self._updates = self._filter.start(self._calibration.stamp_ns)
             self._forget_repeats()
 
     def _repeats(self, stamp_ns: int, settled: SettledState) -> int:
