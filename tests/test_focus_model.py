@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,6 +70,20 @@ def test_reachable_range_has_its_edge_where_the_error_meets_the_tolerance(mirror
         assert controller.plan(FocusTarget(edge)).max_zernike <= tolerance
         assert controller.plan(FocusTarget(edge * 1.01)).max_zernike > tolerance
         assert controller.plan(FocusTarget(edge * 1.01)).saturated.any()
+
+
+def test_the_range_of_a_mirror_that_does_not_reach_0(mirror: LinearMirror) -> None:
+    """Pulled in mid range to a bowl deeper than its stroke can lift: the same range about another middle."""
+    bowl = 0.2
+    flat = calibrated(mirror)
+    defocus = np.zeros_like(flat.model.zernike_offset)
+    defocus[3] = bowl * RADIUS**2 / 4.0
+    figure = flat.model.sag_offset + mirror.modes @ defocus
+    pulled = replace(flat.model, zernike_offset=flat.model.zernike_offset + defocus, sag_offset=figure)
+    low, high = flat.reachable_range(FocusTarget(0.0), 1e-8)
+    assert CalibratedMirror(pulled, flat.limits).reachable_range(FocusTarget(0.0), 1e-8) == pytest.approx(
+        (bowl + low, bowl + high), abs=1e-4
+    )
 
 
 def test_a_tighter_neighbour_limit_narrows_the_range_and_is_kept(mirror: LinearMirror) -> None:

@@ -72,7 +72,7 @@ def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
 
 
 def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
-    """(count, N) bowls with some astigmatism, coma and scatter, inside the limits."""
+    """(count, N) bowls with some astigmatism, coma and scatter about any common level, inside the limits."""
     middle, half_range = mirror.limits.middle, mirror.limits.half_range
     reach = float(np.hypot(mirror.x, mirror.y).max())
     x, y = mirror.x / reach, mirror.y / reach
@@ -84,4 +84,7 @@ def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
         steepest = np.abs(shapes[:, a] - shapes[:, b]).max(axis=1)
         allowed = mirror.limits.neighbour_difference / half_range
         shapes *= np.minimum(1.0, 0.999 * allowed / np.maximum(steepest, 1e-12))[:, None]
-    return np.asarray(middle + half_range * np.clip(shapes, -1.0, 1.0))
+    shapes = np.clip(shapes, -1.0, 1.0)
+    # Of a plate the level is only piston; a membrane that all actuators pull is a sphere.
+    room = 1.0 - np.abs(shapes).max(axis=1, keepdims=True)
+    return np.asarray(middle + half_range * (shapes + room * rng.uniform(-1.0, 1.0, (count, 1))))

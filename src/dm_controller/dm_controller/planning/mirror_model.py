@@ -230,22 +230,27 @@ class CalibratedMirror:
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
         """Smallest and largest curvature [1/m] with the target's conic constant and added terms that the limits permit.
 
-        Reachable means: the model's largest coefficient error stays below `tolerance` [m]. Returns (nan, nan) when not
-        even curvature 0 is (for example with large added terms).
+        Reachable means: the model's largest coefficient error stays below `tolerance` [m]. Returns (nan, nan) when
+        neither curvature 0 nor that in mid range is (for example with large added terms).
         """
         return self._range_cached(target.with_curvature(0.0), tolerance)
 
     def _find_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
+        model, near = self.model, 0.0
         if self.command(target)[1] > tolerance:
-            return (float("nan"), float("nan"))
+            # A mirror that is only pulled does not reach 0.
+            defocus = model.zernike_offset[3] + self.limits.middle * model.influence_zernike[3].sum()
+            near = 4.0 * float(defocus) / model.aperture_radius**2
+            if self.command(target.with_curvature(near))[1] > tolerance:
+                return (float("nan"), float("nan"))
         # Beyond this the stroke of all actuators together could not follow (defocus of a sphere is c r^2 / 4).
-        defocus_stroke = float(np.abs(self.model.influence_zernike[3]).sum())
-        far = 4.0 * (self.limits.high - self.limits.low) * defocus_stroke / self.model.aperture_radius**2
-        return (self._bisect(target, -far, tolerance), self._bisect(target, far, tolerance))
+        defocus_stroke = float(np.abs(model.influence_zernike[3]).sum())
+        far = 4.0 * (self.limits.high - self.limits.low) * defocus_stroke / model.aperture_radius**2
+        return (self._bisect(target, near, near - far, tolerance), self._bisect(target, near, near + far, tolerance))
 
-    def _bisect(self, target: FocusTarget, far: float, tolerance: float) -> float:
-        """The largest reachable curvature between 0 and `far`: one edge, since the programme is convex."""
-        near = 0.0
+    def _bisect(self, target: FocusTarget, near: float, far: float, tolerance: float) -> float:
+        """The reachable curvature between `near`, which is, and `far` next to that: one edge, as the programme is
+        convex."""
         while abs(far - near) > 1e-5:
             middle = 0.5 * (near + far)
             if self.command(target.with_curvature(middle))[1] <= tolerance:
