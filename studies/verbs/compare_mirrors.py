@@ -20,7 +20,7 @@ def run(seeds: Sequence[int], quick: bool) -> list[Any]:
     """Judge the mirrors of `seeds`, printing a line of each when it is done."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # of the processes to come: one core each
-    from studies.comparison.population import PopulationOptions, judge_population
+    from studies.comparison.population import ANY_ORDER, PopulationOptions, judge_population
 
     options = PopulationOptions(requests=10, maps=150, recipes=0, pixels=120) if quick else PopulationOptions()
     workers = min(WORKERS_MAX, os.cpu_count() or 1, len(seeds))
@@ -29,8 +29,10 @@ def run(seeds: Sequence[int], quick: bool) -> list[Any]:
         task = bar.add_task("mirrors", total=len(seeds))
         for outcome in judge_population(seeds, options, workers):
             outcomes.append(outcome)
-            bar.update(task, advance=1, description=f"mirrors: seed {outcome.mirror.simulation.seed}")
-            bar.console.print(f"seed {outcome.mirror.simulation.seed}: {outcome.mirror.description()}", highlight=False)
+            seed, order = outcome.mirror.simulation.seed, outcome.groups.get(ANY_ORDER)
+            found = f"p90 {nanometres(order.quantile(0.9)):.2f} nm, {order.coverage:.0%} inside" if order else "failed"
+            bar.update(task, advance=1, description=f"mirrors: seed {seed}")
+            bar.console.print(f"seed {seed}: {outcome.mirror.description()}: {found}", highlight=False)
     return outcomes
 
 
