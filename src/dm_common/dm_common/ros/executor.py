@@ -154,8 +154,10 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
 
     Returns the exit status: 0, or 1 when the node could not be made (the reason is on standard error).
     """
-    # Until the executor takes the signals over, SIGTERM must end the process by the same path as Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Until the executor takes the signals over, SIGTERM must end the process by the same path as Ctrl-C, and so must
+    # SIGINT, which a shell's background job begins with ignoring.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node: Node | None = None
     executor: Executor | None = None
