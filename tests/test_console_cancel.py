@@ -54,7 +54,7 @@ def test_a_goal_that_is_not_accepted_yet_is_cancelled_as_soon_as_it_is(bench: tu
 
     async def scene() -> BackgroundExecutor:
         run = asyncio.create_task(side.run("calibrate", Calibrate.Goal(), lambda _feedback: None))
-        while not side._connection.client(Calibrate, "calibrate")._pending_goal_requests:
+        while not side._connection.clients["calibrate"]._pending_goal_requests:
             await asyncio.sleep(0.01)
         await side.cancel("calibrate")
         served = BackgroundExecutor(node)  # only now does the node take the goal

@@ -14,6 +14,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, MirrorInfo, SurfaceMapInfo, ZernikeCoefficients
 from matplotlib.image import imread
+from rcl_interfaces.msg import Log
 
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.hysteresis.model import HysteresisModel
@@ -203,7 +204,7 @@ def test_the_worst_diagnostics_come_first() -> None:
 
 
 def test_the_log_can_be_narrowed_to_what_went_wrong() -> None:
-    lines = [SimpleNamespace(level=level, node="n", message=level) for level in ("INFO", "ERROR")]
+    lines = [Log(level=level, name="n", msg="said") for level in (Log.INFO, Log.ERROR)]
     assert [row[0] for row in status.log_rows(lines, True)] == ["ERROR", "INFO"]
     assert [row[0] for row in status.log_rows(lines, False)] == ["ERROR"]
 

@@ -12,34 +12,27 @@ from dm_client import DeformableMirrorClient
 
 
 class CameraFocusClient(DeformableMirrorClient):
-    """A client of one mirror's nodes and of the node `autofocus` beside them. Use as a context manager.
+    """A client of one mirror's nodes and of the node `autofocus` beside them, made and used as its base class."""
 
-    Args:
-        namespace: of the mirror, "" for none.
-        domain: ROS domain; None = the environment's.
-        timeout_s: how long to wait for a service that should answer at once.
-    """
-
-    def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
-        super().__init__(namespace, domain, timeout_s)
-        # Early, so that the node has discovered them by the time the first is used.
-        self.client(SetFocusDistance, "set_focus_distance")
-        self.client(GetFocusRange, "get_focus_range")
-        self.client(Autofocus, "autofocus")
+    interfaces = DeformableMirrorClient.interfaces | {
+        "set_focus_distance": SetFocusDistance,
+        "get_focus_range": GetFocusRange,
+        "autofocus": Autofocus,
+    }
 
     def focus_range(self) -> GetFocusRange.Response:
         """Between which object distances the camera can focus."""
-        return self.call(GetFocusRange, "get_focus_range", GetFocusRange.Request())
+        return self.call("get_focus_range", GetFocusRange.Request())
 
     def focus_distance(self, distance: float, *, dry_run: bool = False) -> SetFocusDistance.Response:
         """Focus on an object at `distance` (m; 0 or inf = infinity)."""
         request = SetFocusDistance.Request(distance=float(distance), dry_run=dry_run)
-        return self.call(SetFocusDistance, "set_focus_distance", request)
+        return self.call("set_focus_distance", request)
 
     def focus_dioptre(self, dioptre: float, *, dry_run: bool = False) -> SetFocusDistance.Response:
         """Focus on 1 / distance (1/m; 0 = infinity), as libcamera and Android count."""
         request = SetFocusDistance.Request(dioptre=float(dioptre), dry_run=dry_run)
-        return self.call(SetFocusDistance, "set_focus_distance", request)
+        return self.call("set_focus_distance", request)
 
     def autofocus(
         self,
@@ -59,4 +52,4 @@ class CameraFocusClient(DeformableMirrorClient):
         """
         goal = Autofocus.Goal(region=[float(value) for value in region])
         goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
-        return self.run_action(Autofocus, "autofocus", goal, on_feedback, timeout_s)
+        return self.run_action("autofocus", goal, on_feedback, timeout_s)

@@ -68,8 +68,11 @@ class DeformableMirrorClient(Connection):
         timeout_s: how long to wait for a service that should answer at once.
     """
 
+    #: What it calls, made at once.
+    interfaces: dict[str, Any] = INTERFACES
+
     def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
-        super().__init__("dm_client", namespace, domain, TOPICS, INTERFACES, timeout_s=timeout_s)
+        super().__init__("dm_client", namespace, domain, TOPICS, self.interfaces, timeout_s=timeout_s)
         self.start()
 
     def __enter__(self) -> Self:
@@ -130,7 +133,7 @@ class DeformableMirrorClient(Connection):
     ) -> FocusState:
         """Set the surface curvature [1/m] (concave positive) and return the prediction; `dry_run` moves nothing."""
         request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant), zernike=list(zernike))
-        return self.call(SetFocus, "set_focus", SetFocus.Request(request=request, dry_run=dry_run)).state
+        return self.call("set_focus", SetFocus.Request(request=request, dry_run=dry_run)).state
 
     def focus_power(self, power: float, *, dry_run: bool = False) -> FocusState:
         """Set the optical power [dioptre] = 2 x surface curvature."""
@@ -138,23 +141,23 @@ class DeformableMirrorClient(Connection):
 
     def flatten(self, *, dry_run: bool = False) -> FocusState:
         """Make the surface as flat as the mirror can."""
-        return self.call(Flatten, "flatten", Flatten.Request(dry_run=dry_run)).state
+        return self.call("flatten", Flatten.Request(dry_run=dry_run)).state
 
     def set_signals(self, signals: Sequence[float], *, wait: bool = True) -> SetSignals.Response:
         """Set all actuator signals (normalised, -1..+1)."""
-        return self.call(SetSignals, "set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait))
+        return self.call("set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait))
 
     def degauss(self, timeout_s: float = 120.0) -> Degauss.Response:
         """Remove the hysteresis and end at mid range."""
-        return self.call(Degauss, "degauss", Degauss.Request(), timeout_s)
+        return self.call("degauss", Degauss.Request(), timeout_s)
 
     def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:
         """Take one map with the interferometer."""
-        return self.call(Measure, "measure", Measure.Request(label=label), timeout_s)
+        return self.call("measure", Measure.Request(label=label), timeout_s)
 
     def ingest(self, path: str, timeout_s: float = 60.0) -> IngestFile.Response:
         """Read one map file."""
-        return self.call(IngestFile, "ingest_file", IngestFile.Request(path=path), timeout_s)
+        return self.call("ingest_file", IngestFile.Request(path=path), timeout_s)
 
     def measure_map(self, label: str = "", timeout_s: float = 60.0) -> tuple[Measure.Response, Image]:
         """Take one map and return it too (sensor_msgs/Image, 32FC1, m)."""
@@ -176,11 +179,11 @@ class DeformableMirrorClient(Connection):
 
     def list_calibrations(self) -> ListCalibrations.Response:
         """Calibrations in the store, newest first."""
-        return self.call(ListCalibrations, "list_calibrations", ListCalibrations.Request())
+        return self.call("list_calibrations", ListCalibrations.Request())
 
     def load_calibration(self, name: str = "") -> LoadCalibration.Response:
         """Load a stored calibration; "" = the newest that fits."""
-        return self.call(LoadCalibration, "load_calibration", LoadCalibration.Request(calibration=name))
+        return self.call("load_calibration", LoadCalibration.Request(calibration=name))
 
     def update_calibration(
         self, *, dry_run: bool = False, forget: bool = False, timeout_s: float = 70.0
@@ -190,7 +193,7 @@ class DeformableMirrorClient(Connection):
         `forget` takes no map but drops all earlier updates.
         """
         request = UpdateCalibration.Request(dry_run=dry_run, forget=forget)
-        return self.call(UpdateCalibration, "update_calibration", request, timeout_s)
+        return self.call("update_calibration", request, timeout_s)
 
     # --- actions ---
 
@@ -207,7 +210,7 @@ class DeformableMirrorClient(Connection):
         """Move to a curvature and return when the shape stands."""
         request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
         goal = MoveFocus.Goal(request=request, tolerance=float(tolerance), settle_time=float(settle_time))
-        return self.run_action(MoveFocus, "move_focus", goal, on_feedback, timeout_s)
+        return self.run_action("move_focus", goal, on_feedback, timeout_s)
 
     def converge(
         self,
@@ -223,7 +226,7 @@ class DeformableMirrorClient(Connection):
         """Close the loop on the interferometer until the measured surface is the requested one."""
         request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
         goal = Converge.Goal(request=request, method=method, tolerance=float(tolerance), max_maps=max_maps)
-        return self.run_action(Converge, "converge", goal, on_feedback, timeout_s)
+        return self.run_action("converge", goal, on_feedback, timeout_s)
 
     def build_recipes(
         self,
@@ -242,7 +245,7 @@ class DeformableMirrorClient(Connection):
             tolerance=float(tolerance),
             max_maps=max_maps,
         )
-        return self.run_action(BuildRecipes, "build_recipes", goal, on_feedback, timeout_s)
+        return self.run_action("build_recipes", goal, on_feedback, timeout_s)
 
     def calibrate(
         self,
@@ -252,4 +255,4 @@ class DeformableMirrorClient(Connection):
     ) -> Calibrate.Result:
         """Measure and store a calibration; by default the full plan, used at once."""
         goal = goal if goal is not None else Calibrate.Goal(activate=True)
-        return self.run_action(Calibrate, "calibrate", goal, on_feedback, timeout_s)
+        return self.run_action("calibrate", goal, on_feedback, timeout_s)

@@ -56,6 +56,7 @@ class Connection:
 
     Attributes:
         messages: {topic: latest message}.
+        clients: {name: client of the service or action}.
     """
 
     def __init__(
@@ -73,11 +74,12 @@ class Connection:
         self.node = Node(f"{name}_{os.getpid()}_{next(_NUMBERS)}", namespace=namespace, context=self._context)
         self.messages: dict[str, Any] = {}
         self._on_message, self._timeout_s = on_message, timeout_s
-        self._clients: dict[str, Any] = {}
+        self.clients: dict[str, Any] = {}
         for topic, (message_type, profile) in topics.items():
             self.hear(topic, message_type, profile)
         for interface_name, interface in interfaces.items():
-            self.client(interface, interface_name)
+            make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
+            self.clients[interface_name] = make(self.node, interface, interface_name)
         self._background: BackgroundExecutor | None = None
 
     def start(self) -> None:
@@ -99,13 +101,6 @@ class Connection:
 
         self.node.create_subscription(message_type, topic, take, profile)
 
-    def client(self, interface: Any, name: str) -> Any:
-        """The service or action client of that name."""
-        if name not in self._clients:
-            make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
-            self._clients[name] = make(self.node, interface, name)
-        return self._clients[name]
-
     def wait(self, condition: Callable[[], Any], timeout_s: float | None = None) -> bool:
         """Wait until `condition()` is true; False when it was not in time."""
         deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
@@ -115,22 +110,20 @@ class Connection:
             time.sleep(0.005)
         return True
 
-    def call(self, service_type: Any, name: str, request: Any, timeout_s: float | None = None) -> Any:
-        """Call any service of the suite; raise DeformableMirrorError when it refuses or does not answer."""
+    def call(self, name: str, request: Any, timeout_s: float | None = None) -> Any:
+        """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
         try:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
-            return checked(call(self.client(service_type, name), request, timeout_s))
+            return checked(call(self.clients[name], request, timeout_s))
         except ServiceCallError as error:
             raise DeformableMirrorError(ErrorCode.TIMEOUT, str(error)) from error
 
-    def run_action(
-        self, action_type: Any, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float
-    ) -> Any:
-        """Run a goal to its end; raise DeformableMirrorError when it is refused or fails.
+    def run_action(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float) -> Any:
+        """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
 
         Ctrl-C cancels it first, so that the mirror is left safe.
         """
-        client = self.client(action_type, name)
+        client = self.clients[name]
         if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))

@@ -6,56 +6,40 @@ import asyncio
 import contextlib
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
-from dm_msgs.msg import (
-    ActuatorState,
-    Calibration,
-    Capabilities,
-    FocusState,
-    MirrorInfo,
-    SurfaceMapInfo,
-    ZernikeCoefficients,
-)
-from dm_msgs.srv import Degauss, Flatten, ListCalibrations, LoadCalibration, Measure, SetFocus, SetSignals
+from dm_msgs.msg import FocusState, SurfaceMapInfo, ZernikeCoefficients
+from rcl_interfaces.msg import Log
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import Image
 
+from dm_client import client
 from dm_client.connection import Connection, DeformableMirrorError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
-from dm_common.ros.rosout import LogTail
 from dm_common.ros.worker import answers_arrive
 from dm_tools.console.external_goals import ExternalGoals
 from dm_tools.console.state_observer import StateObserver
 
-TOPICS = {
-    "mirror_info": (MirrorInfo, qos.LATCHED),
-    "calibration": (Calibration, qos.LATCHED),
-    "capabilities": (Capabilities, qos.LATCHED),
-    "actuator_state": (ActuatorState, qos.STATE),
+TOPICS = client.TOPICS | {
     "focus_state": (FocusState, qos.STATE),
     "surface_map": (Image, qos.MAP),
     "surface_map_info": (SurfaceMapInfo, qos.MAP),
     "zernike": (ZernikeCoefficients, qos.STATE),
 }
-SERVICES = {
-    "set_signals": SetSignals,
-    "degauss": Degauss,
-    "set_focus": SetFocus,
-    "flatten": Flatten,
-    "measure": Measure,
-    "list_calibrations": ListCalibrations,
-    "load_calibration": LoadCalibration,
-}
-ACTIONS = {"build_recipes": BuildRecipes, "calibrate": Calibrate, "converge": Converge, "move_focus": MoveFocus}
-
+#: What the console has no button for.
+NOT_OFFERED = ("ingest_file", "update_calibration")
+INTERFACES = {name: interface for name, interface in client.INTERFACES.items() if name not in NOT_OFFERED}
+#: Lines of the log that are kept; nodes offer their latest to those who come late.
+LOG_LINES = 200
+LOG = QoSProfile(depth=LOG_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
 WATCHED = ("build_recipes", "calibrate", "converge")
 
@@ -96,6 +80,10 @@ class ConsoleNode:
     Args:
         namespace: of the mirror, "" for none.
         domain: ROS domain; None = the environment's.
+
+    Attributes:
+        log: the last lines of all nodes' logs.
+        lines_logged: how many were heard in all.
     """
 
     def __init__(self, namespace: str = "", domain: int | None = None) -> None:
@@ -106,11 +94,13 @@ class ConsoleNode:
         self._goals: dict[str, Any] = {}
         self._beginning: dict[str, bool] = {}  # goals that are not accepted yet; True = to be cancelled
         self.observer = StateObserver()
-        self._connection = Connection("dm_console", namespace, domain, TOPICS, SERVICES | ACTIONS, self._take)
+        self._connection = Connection("dm_console", namespace, domain, TOPICS, INTERFACES, self._take)
         self.node = self._connection.node
-        self.log = LogTail(self.node)
+        self.log: deque[Log] = deque(maxlen=LOG_LINES)
+        self.lines_logged = 0
+        self.node.create_subscription(Log, "/rosout", self._take_log, LOG)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
-        self.watched = {name: ExternalGoals(self.node, ACTIONS[name], name) for name in WATCHED}
+        self.watched = {name: ExternalGoals(self.node, INTERFACES[name], name) for name in WATCHED}
         self._connection.start()
 
     def _take(self, topic: str, message: Any) -> None:
@@ -129,6 +119,10 @@ class ConsoleNode:
         for status in message.status:
             self._diagnostics[status.name] = status
             self._heard[status.name] = time.monotonic()
+
+    def _take_log(self, message: Log) -> None:
+        self.log.append(message)
+        self.lines_logged += 1
 
     def close(self) -> None:
         """Leave the ROS graph; the mirror keeps its shape."""
@@ -156,7 +150,7 @@ class ConsoleNode:
             Refusal: it refused, with its sentence, or did not answer.
         """
         try:
-            return await asyncio.to_thread(self._connection.call, SERVICES[name], name, request, timeout_s)
+            return await asyncio.to_thread(self._connection.call, name, request, timeout_s)
         except DeformableMirrorError as error:
             raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
 
@@ -166,8 +160,8 @@ class ConsoleNode:
         Raises:
             Refusal: the goal was refused, ended with an error or was cancelled, with the node's sentence.
         """
-        client = self._connection.client(ACTIONS[name], name)
-        identity = ACTIONS[name].Impl.SendGoalService.Request().goal_id
+        action = self._connection.clients[name]
+        identity = INTERFACES[name].Impl.SendGoalService.Request().goal_id
         identity.uuid = list(uuid.uuid4().bytes)
         if name in self.watched:
             self.watched[name].own(identity)
@@ -177,7 +171,7 @@ class ConsoleNode:
             finished = handle.get_result_async()
             if self._beginning.pop(name):
                 await self.cancel(name)
-            if not await _until(finished.done, timeout_s, lambda: not client.server_is_ready()):
+            if not await _until(finished.done, timeout_s, lambda: not action.server_is_ready()):
                 with contextlib.suppress(Refusal):
                     await self.cancel(name)
                 raise Refusal(
@@ -197,12 +191,12 @@ class ConsoleNode:
 
     async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None], identity: Any) -> Any:
         """The handle of a goal that was accepted."""
-        client = self._connection.client(ACTIONS[name], name)
-        if not await _until(lambda: answers_arrive(client, client.server_is_ready), ANSWER_S):
+        action = self._connection.clients[name]
+        if not await _until(lambda: answers_arrive(action, action.server_is_ready), ANSWER_S):
             raise Refusal(ErrorCode.TIMEOUT, f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
         if self._beginning[name]:
             raise Refusal(ErrorCode.CANCELED, f"{name}: cancelled before it began; nothing has changed")
-        accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
+        accepted = action.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
         if not await _until(accepted.done, ANSWER_S):
             raise Refusal(ErrorCode.TIMEOUT, f"{name}: no answer to the goal within {ANSWER_S:g} s")
         handle = accepted.result()

@@ -9,6 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration
+from rcl_interfaces.msg import Log
 
 from dm_tools.console.view_models import QUALITIES
 
@@ -32,6 +33,8 @@ LEVELS = {
     DiagnosticStatus.ERROR: "error",
     DiagnosticStatus.STALE: "stale",
 }
+#: Those of rcl_interfaces/Log.
+LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 
 #: Paths of files, as nodes tell them: at least two folders deep below a folder of the system or a home.
 _PATH = re.compile(r"(?<![\w/.])/(?:home|root|tmp|var|opt|mnt|media|srv|data|work|Users)(?:/[^\s/,;:'\"()]+)+")
@@ -150,13 +153,10 @@ def diagnostic_rows(statuses: dict[str, Any]) -> list[Row]:
     ]
 
 
-def log_rows(lines: Sequence[Any], everything: bool) -> list[tuple[str, ...]]:
-    """(level, node, message) of :class:`~dm_common.ros.rosout.LogLine`, the newest first."""
-    return [
-        (line.level, line.node, line.message)
-        for line in reversed(lines)
-        if everything or line.level in ("WARN", "ERROR", "FATAL")
-    ]
+def log_rows(lines: Sequence[Log], everything: bool) -> list[tuple[str, ...]]:
+    """(level, node, message) of the log's lines, the newest first."""
+    rows = [(LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg) for line in reversed(lines)]
+    return [row for row in rows if everything or row[0] in ("WARN", "ERROR", "FATAL")]
 
 
 #: Phases of the action `calibrate`, by their number.

@@ -61,8 +61,8 @@ class LogCard:
             self._place.props('tabindex="0" role="log" aria-label="Log"')
 
     def refresh(self, _snapshot: Snapshot) -> None:
-        log = self._session.ros.log
-        key = (log.count, bool(self._all.value))
+        ros = self._session.ros
+        key = (ros.lines_logged, bool(self._all.value))
         if key != self._shown:
             self._shown = key
-            self._place.set_content(_table(log_rows(list(log.lines), bool(self._all.value))))
+            self._place.set_content(_table(log_rows(list(ros.log), bool(self._all.value))))
