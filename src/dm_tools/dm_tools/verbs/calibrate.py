@@ -23,18 +23,17 @@ class CalibrationPlan(StrEnum):
 
 def run_calibration(client: Any, goal: Any) -> Any:
     """Run a Calibrate goal with a progress bar; returns the action's result."""
-    phases = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
+    from dm_tools.console.status import calibration_step
+
     with progress_bar() as progress:
         task = progress.add_task("calibration", total=None)
 
         def show(feedback: Any) -> None:
-            dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
-            name = phases[feedback.phase] if feedback.phase < len(phases) else "?"
             progress.update(
                 task,
                 total=feedback.steps or None,
                 completed=feedback.step,
-                description=f"calibration: {name} {feedback.label}{dropped}",
+                description=f"calibration: {calibration_step(feedback)}",
             )
 
         result = client.calibrate(goal, show)

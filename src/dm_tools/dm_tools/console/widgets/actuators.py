@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any
 
 from nicegui import ui
@@ -96,25 +97,28 @@ class ActuatorCards:
 
     # --- moving ---
 
+    def _swing(self) -> float:
+        """The amplitude that was typed. Raises ValueError when there is none."""
+        if self._amplitude.value is None:
+            raise ValueError("the amplitude must be a number")
+        return float(self._amplitude.value)
+
     def _poke(self) -> None:
-        session, number, amplitude = self._session, self._session.chosen, self._amplitude.value
-        reason = reason_against("move", session.snapshot(), session.running)
-        if reason or amplitude is None:
-            session.fail(f"Poke {number}", reason or "the amplitude must be a number")
+        session, number, snapshot = self._session, self._session.chosen, self._session.snapshot()
+        reason = reason_against("move", snapshot, session.running)
+        if reason:
+            session.fail(f"Poke {number}", reason)
             return
-        maps = bool(self._with_map.value) and not reason_against("measure", session.snapshot(), "")
-        session.begin(f"Poke {number}", lambda: operations.poke(session, number, float(amplitude), maps))
+        maps = bool(self._with_map.value) and not reason_against("measure", snapshot, "")
+        session.begin(f"Poke {number}", lambda: operations.poke(session, number, self._swing(), maps))
 
     def _start_release(self) -> None:
         self._session.begin("Release", lambda: operations.release(self._session))
 
     def _start_loop(self) -> None:
-        session, number, amplitude = self._session, self._session.chosen, self._amplitude.value
-        if amplitude is None:
-            session.fail("Measured loop", "the amplitude must be a number")
-            return
-        work = lambda: operations.measure_loop(session, number, float(amplitude))  # noqa: E731
-        session.begin(f"Loop of actuator {number}", work, session.between_steps)
+        session, number = self._session, self._session.chosen
+        work = partial(operations.measure_loop, session, number)
+        session.begin(f"Loop of actuator {number}", lambda: work(self._swing()), session.between_steps)
 
     # --- showing ---
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from html import escape
 from typing import Any
 
@@ -61,26 +62,14 @@ class CalibrationCard:
 
     def _begin(self) -> None:
         session = self._session
-        try:
-            goal = self._goal()
-        except ValueError as error:
-            session.fail("Calibration", str(error))
-            return
-        work = lambda: operations.calibrate(session, goal)  # noqa: E731
-        session.begin("Calibration", work, lambda: session.ros.cancel("calibrate"))
+        cancel = partial(session.ros.cancel, "calibrate")
+        session.begin("Calibration", lambda: operations.calibrate(session, self._goal()), cancel)
 
     def _begin_estimate(self) -> None:
-        session = self._session
-        try:
-            goal = self._goal()
-        except ValueError as error:
-            session.fail("Estimate", str(error))
-            return
-        session.begin("Estimate", lambda: operations.estimate(session, goal))
+        self._session.begin("Estimate", lambda: operations.estimate(self._session, self._goal()))
 
     def _begin_load(self) -> None:
-        session, name = self._session, str(self._choice.value or "")
-        session.begin("Load", lambda: operations.load(session, name))
+        self._session.begin("Load", lambda: operations.load(self._session, str(self._choice.value or "")))
 
     def refresh(self, snapshot: Snapshot) -> None:
         session = self._session

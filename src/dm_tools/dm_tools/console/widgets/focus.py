@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import partial
 
 from dm_msgs.msg import FocusRequest
 from nicegui import background_tasks, ui
@@ -71,27 +72,23 @@ class FocusCard:
     def _touch(self) -> None:
         self._changed_at, self._asked = time.monotonic(), False
 
-    def _request(self) -> FocusRequest | None:
-        """The wish; None when a field is empty."""
+    def _request(self) -> FocusRequest:
+        """The wish. Raises ValueError when a field is empty."""
         if self._number.value is None or self._conic.value is None:
-            return None
+            raise ValueError("curvature and conic constant must be numbers")
         return FocusRequest(
             curvature=float(self._number.value), conic_constant=float(self._conic.value), mode=int(self._mode.value)
         )
 
     def _start_move(self) -> None:
-        request, session = self._request(), self._session
-        if request is None:
-            session.fail("Move", "curvature and conic constant must be numbers")
-            return
-        session.begin("Move", lambda: operations.move(session, request), lambda: session.ros.cancel("move_focus"))
+        session = self._session
+        cancel = partial(session.ros.cancel, "move_focus")
+        session.begin("Move", lambda: operations.move(session, self._request()), cancel)
 
     def _start_converge(self) -> None:
-        request, session = self._request(), self._session
-        if request is None:
-            session.fail("Converge", "curvature and conic constant must be numbers")
-            return
-        session.begin("Converge", lambda: operations.converge(session, request), lambda: session.ros.cancel("converge"))
+        session = self._session
+        cancel = partial(session.ros.cancel, "converge")
+        session.begin("Converge", lambda: operations.converge(session, self._request()), cancel)
 
     def refresh(self, snapshot: Snapshot) -> None:
         session = self._session
@@ -140,13 +137,11 @@ class FocusCard:
             self._slider.props(f"min={low:.4f} max={high:.4f}")
 
     async def _predict(self) -> None:
-        request = self._request()
         try:
-            if request is not None:
-                text = await operations.predict(self._session, request)
-                self._prediction.label.classes(remove="refused")
-                self._prediction.show(text)
-        except Refusal as error:
+            text = await operations.predict(self._session, self._request())
+            self._prediction.label.classes(remove="refused")
+            self._prediction.show(text)
+        except (Refusal, ValueError) as error:
             self._prediction.label.classes(add="refused")
             self._prediction.show(str(error))
         finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from html import escape
 
 from nicegui import ui
@@ -59,13 +60,11 @@ class RecipesCard:
 
     def _begin(self) -> None:
         session = self._session
-        try:
-            curvatures = evenly(self._first.value, self._last.value, self._number.value)
-        except ValueError as error:
-            session.fail("Recipes", str(error))
-            return
-        work = lambda: operations.build_recipes(session, curvatures)  # noqa: E731
-        session.begin("Recipes", work, lambda: session.ros.cancel("build_recipes"))
+        session.begin(
+            "Recipes",
+            lambda: operations.build_recipes(session, evenly(self._first.value, self._last.value, self._number.value)),
+            partial(session.ros.cancel, "build_recipes"),
+        )
 
     def refresh(self, snapshot: Snapshot) -> None:
         reason = reason_against("converge", snapshot, self._session.running)
