@@ -18,8 +18,14 @@ from xml.etree import ElementTree
 MODULE_LINES = 300
 #: Types that a surface map passes on its way from a file to the controller; each must still exist.
 REPRESENTATIONS = (
-    "SurfaceMap", "Measurement", "MapSet", "InfluenceFit", "Calibration", "InfluenceModel", "CalibratedMirror",
-)  # fmt: skip
+    "SurfaceMap",
+    "Measurement",
+    "MapSet",
+    "InfluenceFit",
+    "Calibration",
+    "InfluenceModel",
+    "CalibratedMirror",
+)
 #: Prints our modules that the node loads, packages included.
 LOADED = """
 import json, sys

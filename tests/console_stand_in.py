@@ -68,10 +68,18 @@ class StandIn:
 def mirror_info(x: NDArray[np.float64], y: NDArray[np.float64]) -> MirrorInfo:
     a, b = neighbour_pairs(x, y).T
     return MirrorInfo(
-        name="MIRROR", serial="7", actuators=x.size, actuator_x=array("d", x), actuator_y=array("d", y),
-        neighbour_a=array("I", a.tolist()), neighbour_b=array("I", b.tolist()), working_aperture_diameter=2 * RADIUS,
-        signal_min=-1.0, signal_max=1.0, neighbour_difference_max=2.0,
-    )  # fmt: skip
+        name="MIRROR",
+        serial="7",
+        actuators=x.size,
+        actuator_x=array("d", x),
+        actuator_y=array("d", y),
+        neighbour_a=array("I", a.tolist()),
+        neighbour_b=array("I", b.tolist()),
+        working_aperture_diameter=2 * RADIUS,
+        signal_min=-1.0,
+        signal_max=1.0,
+        neighbour_difference_max=2.0,
+    )
 
 
 def calibration(actuators: int) -> Calibration:
@@ -80,8 +88,17 @@ def calibration(actuators: int) -> Calibration:
     influence = np.random.default_rng(5).normal(size=(21, actuators)) * 1e-7
     sag = basis(points.x, points.y) @ influence
     return Calibration(
-        id="c19", actuators=actuators, terms=21, points=200, aperture_radius=RADIUS, quality=Calibration.CALIBRATED,
-        influence_zernike=array("d", influence.ravel()), zernike_offset=array("d", np.zeros(21)),
-        sample_x=array("d", points.x), sample_y=array("d", points.y), sample_weight=array("d", points.weight),
-        influence_sag=array("d", sag.ravel()), sag_offset=array("d", np.zeros(200)),
-    )  # fmt: skip
+        id="c19",
+        actuators=actuators,
+        terms=21,
+        points=200,
+        aperture_radius=RADIUS,
+        quality=Calibration.CALIBRATED,
+        influence_zernike=array("d", influence.ravel()),
+        zernike_offset=array("d", np.zeros(21)),
+        sample_x=array("d", points.x),
+        sample_y=array("d", points.y),
+        sample_weight=array("d", points.weight),
+        influence_sag=array("d", sag.ravel()),
+        sag_offset=array("d", np.zeros(200)),
+    )

@@ -30,23 +30,38 @@ def calibration() -> Calibration:
     mirror = LinearMirror(X, Y)
     points = mirror.points
     return Calibration(
-        id="known", aperture_radius=RADIUS, actuators=37, terms=21, points=len(points), maps_used=100,
+        id="known",
+        aperture_radius=RADIUS,
+        actuators=37,
+        terms=21,
+        points=len(points),
+        maps_used=100,
         influence_zernike=doubles(mirror.fit_terms(mirror.influence.T).T.ravel()),
         zernike_offset=doubles(mirror.figure_coefficients),
-        sample_x=doubles(points.x), sample_y=doubles(points.y), sample_weight=doubles(points.weight),
+        sample_x=doubles(points.x),
+        sample_y=doubles(points.y),
+        sample_weight=doubles(points.weight),
         influence_sag=doubles(mirror.influence.ravel()),
         sag_offset=doubles(mirror.modes @ mirror.figure_coefficients),
-        in_sample_rms=1e-10, held_out_rms=1e-10, held_out_max_zernike=1e-10,
-    )  # fmt: skip
+        in_sample_rms=1e-10,
+        held_out_rms=1e-10,
+        held_out_max_zernike=1e-10,
+    )
 
 
 def mirror_info() -> MirrorInfo:
     pairs = make_mirror().limits.pairs
     return MirrorInfo(
-        actuators=37, actuator_x=doubles(X), actuator_y=doubles(Y), signal_min=-1.0, signal_max=1.0,
-        neighbour_a=[int(a) for a, _b in pairs], neighbour_b=[int(b) for _a, b in pairs], neighbour_difference_max=2.0,
+        actuators=37,
+        actuator_x=doubles(X),
+        actuator_y=doubles(Y),
+        signal_min=-1.0,
+        signal_max=1.0,
+        neighbour_a=[int(a) for a, _b in pairs],
+        neighbour_b=[int(b) for _a, b in pairs],
+        neighbour_difference_max=2.0,
         working_aperture_diameter=2.0 * RADIUS,
-    )  # fmt: skip
+    )
 
 
 class Host(Node, LoopHost):

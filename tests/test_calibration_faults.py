@@ -139,9 +139,14 @@ def test_killed_at_a_surface_a_full_run_goes_on(
 
 @pytest.mark.parametrize("place", ["frame", "fit", "before_store", "after_store", "read_back"])
 def test_killed_in_the_middle_of_writing_nothing_is_lost_or_measured_twice(
-    place: str, node: Callable[..., NodeProcess], bench: StandIn, observer: Observer, folder: Path, tmp_path: Path,
+    place: str,
+    node: Callable[..., NodeProcess],
+    bench: StandIn,
+    observer: Observer,
+    folder: Path,
+    tmp_path: Path,
     domain: int,
-) -> None:  # fmt: skip
+) -> None:
     settings = tmp_path / "stuck.yaml"
     settings.write_text(yaml.safe_dump({"/**": {"ros__parameters": parameters(folder)}}))
     script = Path(__file__).with_name("stuck_calibration.py")
@@ -218,9 +223,13 @@ def test_start_fresh_is_for_one_goal(
     ],
 )
 def test_maps_of_another_instrument_stop_the_run_which_goes_on_with_the_right_one(
-    change: dict[str, Any], words: str, node: Callable[..., NodeProcess], bench: StandIn, observer: Observer,
+    change: dict[str, Any],
+    words: str,
+    node: Callable[..., NodeProcess],
+    bench: StandIn,
+    observer: Observer,
     folder: Path,
-) -> None:  # fmt: skip
+) -> None:
     node()
     bench.on_label = {"poke+03": lambda: bench.other.update(change)}
     stopped = run(observer)
@@ -242,9 +251,13 @@ def test_maps_of_another_instrument_stop_the_run_which_goes_on_with_the_right_on
     ],
 )
 def test_a_bumped_mirror_is_found_by_the_reference_frame(
-    bump: dict[str, float], words: str, node: Callable[..., NodeProcess], bench: StandIn, observer: Observer,
+    bump: dict[str, float],
+    words: str,
+    node: Callable[..., NodeProcess],
+    bench: StandIn,
+    observer: Observer,
     folder: Path,
-) -> None:  # fmt: skip
+) -> None:
     node()
     bench.on_label = {"poke+03": lambda: bench.bump.update(bump)}
     stopped = run(observer)

@@ -14,7 +14,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, MirrorInfo, SurfaceMapInfo, ZernikeCoefficients
 from matplotlib.image import imread
-from rcl_interfaces.msg import Log
 
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.hysteresis.model import HysteresisModel
@@ -40,10 +39,18 @@ def mirror_info() -> MirrorInfo:
     x, y = hexagonal_positions(COUNT)
     a, b = neighbour_pairs(x, y).T
     return MirrorInfo(
-        name="T", serial="1", actuators=COUNT, actuator_x=x.tolist(), actuator_y=y.tolist(),
-        neighbour_a=a.tolist(), neighbour_b=b.tolist(), working_aperture_diameter=2 * RADIUS,
-        signal_min=-1.0, signal_max=1.0, neighbour_difference_max=2.0,
-    )  # fmt: skip
+        name="T",
+        serial="1",
+        actuators=COUNT,
+        actuator_x=x.tolist(),
+        actuator_y=y.tolist(),
+        neighbour_a=a.tolist(),
+        neighbour_b=b.tolist(),
+        working_aperture_diameter=2 * RADIUS,
+        signal_min=-1.0,
+        signal_max=1.0,
+        neighbour_difference_max=2.0,
+    )
 
 
 def state(applied: list[float], **fields: Any) -> ActuatorState:
@@ -58,20 +65,33 @@ def calibration() -> tuple[Calibration, np.ndarray]:
     influence = np.random.default_rng(5).normal(size=(21, COUNT)) * 1e-7
     terms = basis(points.x, points.y)
     message = Calibration(
-        id="c1", actuators=COUNT, terms=21, points=300, aperture_radius=RADIUS, quality=Calibration.CALIBRATED,
-        influence_zernike=influence.ravel().tolist(), zernike_offset=np.zeros(21).tolist(),
-        sample_x=points.x.tolist(), sample_y=points.y.tolist(), sample_weight=points.weight.tolist(),
-        influence_sag=(terms @ influence).ravel().tolist(), sag_offset=np.zeros(300).tolist(),
-    )  # fmt: skip
+        id="c1",
+        actuators=COUNT,
+        terms=21,
+        points=300,
+        aperture_radius=RADIUS,
+        quality=Calibration.CALIBRATED,
+        influence_zernike=influence.ravel().tolist(),
+        zernike_offset=np.zeros(21).tolist(),
+        sample_x=points.x.tolist(),
+        sample_y=points.y.tolist(),
+        sample_weight=points.weight.tolist(),
+        influence_sag=(terms @ influence).ravel().tolist(),
+        sag_offset=np.zeros(300).tolist(),
+    )
     return message, influence
 
 
 def map_of_terms(coefficients: np.ndarray, pixels: int = 300) -> tuple[np.ndarray, SurfaceMapInfo]:
     """A map over the aperture with these coefficients, off the middle of the frame."""
     info = SurfaceMapInfo(
-        width=pixels, height=pixels, centre_x=pixels / 2 + 3, centre_y=pixels / 2 - 2,
-        aperture_radius_px=0.45 * pixels, aperture_radius=RADIUS,
-    )  # fmt: skip
+        width=pixels,
+        height=pixels,
+        centre_x=pixels / 2 + 3,
+        centre_y=pixels / 2 - 2,
+        aperture_radius_px=0.45 * pixels,
+        aperture_radius=RADIUS,
+    )
     x = (np.arange(pixels) - info.centre_x) / info.aperture_radius_px
     y = (info.centre_y - np.arange(pixels)) / info.aperture_radius_px
     grid_x, grid_y = np.meshgrid(x, y)
@@ -189,9 +209,11 @@ def test_badges_warn_of_an_unknown_history() -> None:
     message, _ = calibration()
     message.hysteresis.play_radius = [0.0, 0.1]
     snapshot = Snapshot(
-        mirror_info=mirror_info(), actuator_state=state([0.0] * COUNT), calibration=message,
+        mirror_info=mirror_info(),
+        actuator_state=state([0.0] * COUNT),
+        calibration=message,
         present=frozenset({"pdm_driver"}),
-    )  # fmt: skip
+    )
     assert status.Badge("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
     assert status.Badge("history: known") in status.badges(snapshot, "")
 
@@ -204,7 +226,7 @@ def test_the_worst_diagnostics_come_first() -> None:
 
 
 def test_the_log_can_be_narrowed_to_what_went_wrong() -> None:
-    lines = [Log(level=level, name="n", msg="said") for level in (Log.INFO, Log.ERROR)]
+    lines = [(level, "n", "said") for level in ("INFO", "ERROR")]
     assert [row[0] for row in status.log_rows(lines, True)] == ["ERROR", "INFO"]
     assert [row[0] for row in status.log_rows(lines, False)] == ["ERROR"]
 

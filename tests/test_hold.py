@@ -19,8 +19,12 @@ from linear_mirror import LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
 DEFAULTS = {
-    "hold.enable": True, "hold.period": 1.0, "hold.tolerance": 2e-10, "hold.slew": 0.02, "hold.resolution": 3e-5,
-}  # fmt: skip
+    "hold.enable": True,
+    "hold.period": 1.0,
+    "hold.tolerance": 2e-10,
+    "hold.slew": 0.02,
+    "hold.resolution": 3e-5,
+}
 
 
 class Shape:

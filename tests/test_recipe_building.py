@@ -48,7 +48,7 @@ class Stand:
         mirror = CalibratedMirror(influence_model(calibration.fit, calibration.aperture_radius), self.bench.limits)
         figures = HysteresisFigures(
             hysteresis.law, hysteresis.zernike_sigma, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma
-        )  # fmt: skip
+        )
         self.loop = Planner(mirror, figures)
         tracker = HysteresisTracker(hysteresis.law)
         for report in self.bench.reports:
@@ -135,9 +135,14 @@ class LinearPlant:
             self.noise * self.random.standard_normal(21) / TERM_RMS
         )
         return Measurement(
-            points=mirror.points, sag=sag, coefficients=mirror.fit_terms(sag), sigma=np.zeros(21),
-            stamp_ns=round(self.time * 1e9), residual_rms=0.0, valid_fraction=1.0,
-        )  # fmt: skip
+            points=mirror.points,
+            sag=sag,
+            coefficients=mirror.fit_terms(sag),
+            sigma=np.zeros(21),
+            stamp_ns=round(self.time * 1e9),
+            residual_rms=0.0,
+            valid_fraction=1.0,
+        )
 
     def left(self, recipe: Recipe) -> float:
         """Largest coefficient error that the recipe truly leaves, m."""
@@ -207,9 +212,7 @@ def seeded(noise: float, seed: int) -> LinearPlant:
 
 def test_cancelling_stops_between_two_maps() -> None:
     plant = LinearPlant()
-    builder = RecipeBuilder(
-        LOOP, plant, lambda: plant.time, cancelled=lambda: plant.calls.count("measure") == 3
-    )  # fmt: skip
+    builder = RecipeBuilder(LOOP, plant, lambda: plant.time, cancelled=lambda: plant.calls.count("measure") == 3)
     with pytest.raises(Cancelled):
         builder.build(FocusTarget(0.02))
     assert plant.calls.count("measure") == builder.maps == 3

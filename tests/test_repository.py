@@ -25,8 +25,14 @@ SOURCE = ROOT / "src"
 
 _NODES = {"dm_msgs", "dm_common"}
 _INSTALLED = _NODES | {
-    "dm_driver", "dm_simulation", "dm_calibration", "dm_controller", "dm_client", "dm_autofocus", "dm_bringup"
-}  # fmt: skip
+    "dm_driver",
+    "dm_simulation",
+    "dm_calibration",
+    "dm_controller",
+    "dm_client",
+    "dm_autofocus",
+    "dm_bringup",
+}
 #: What each package may import of the others (docs/architecture.md).
 ALLOWED = {
     "dm_common": {"dm_msgs"},

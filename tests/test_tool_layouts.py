@@ -24,18 +24,25 @@ STANDARD = {"diagnostics", "rosout"}
 PANELS = {
     "Image": {"imageMode"},
     "Plot": {
-        "paths", "minYValue", "maxYValue", "showLegend", "legendDisplay", "showPlotValuesInLegend", "showXAxisLabels",
-        "showYAxisLabels", "isSynced", "xAxisVal", "sidebarDimension",
+        "paths",
+        "minYValue",
+        "maxYValue",
+        "showLegend",
+        "legendDisplay",
+        "showPlotValuesInLegend",
+        "showXAxisLabels",
+        "showYAxisLabels",
+        "isSynced",
+        "xAxisVal",
+        "sidebarDimension",
     },
     "DiagnosticSummary": {"minLevel", "pinnedIds", "hardwareIdFilter", "topicToRender"},
     "RosOut": {"searchTerms", "minLogLevel", "topicToRender"},
     "RawMessages": {"topicPath", "diffEnabled", "showFullMessageForDiff"},
-}  # fmt: skip
+}
 TITLE = "foxglovePanelTitle"
 #: Plugins of rqt by package: the names in their plugin.xml.
-RQT_PLUGINS = {
-    "rqt_plot/Plot", "rqt_image_view/ImageView", "rqt_runtime_monitor/RuntimeMonitor", "rqt_console/Console"
-}  # fmt: skip
+RQT_PLUGINS = {"rqt_plot/Plot", "rqt_image_view/ImageView", "rqt_runtime_monitor/RuntimeMonitor", "rqt_console/Console"}
 
 
 def foxglove() -> dict[str, Any]:

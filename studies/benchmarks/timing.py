@@ -21,7 +21,7 @@ class Effort:
 
     Attributes:
         rounds: turns of a job of about a millisecond; slower ones get fewer.
-        quick: small sizes only, for a look and for tests.
+        quick: small sizes only, for a first impression and for tests.
     """
 
     rounds: int = 60

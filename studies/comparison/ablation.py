@@ -137,7 +137,7 @@ def ablate(options: AblationOptions, progress: Callable[[str], None] = lambda st
 
             calibration = bench.calibrate(
                 PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps), progress=calibrating
-            )  # fmt: skip
+            )
             progress(f"{where}: identification")
             hysteresis = calibration.hysteresis
             assert hysteresis is not None

@@ -18,7 +18,7 @@ class Requests:
     Attributes:
         dwell: (R,) s.
         curvature: (R,) 1/m.
-        max_zernike, upper: (R,) m, largest coefficient error of the true surface, and the bound told beforehand.
+        max_zernike, upper: (R,) m, largest coefficient error of the true surface, and the bound predicted beforehand.
         rms, limit: (R,) m, sag error, and the best that this mirror could do.
     """
 
@@ -81,7 +81,7 @@ class RowFigures:
         p50, p90: m, of the largest coefficient error.
         rms_share: median of rms sag error over PV.
         excess_share: the same of what exceeds the fitting limit (root of the difference of squares).
-        bound_coverage: share of requests inside the bound told beforehand.
+        bound_coverage: share of requests inside the bound predicted beforehand.
     """
 
     requests: int

@@ -238,10 +238,8 @@ def _sweep(
         seconds = bench.time - began + time.perf_counter() - computing
         error = true_error(bench, target)
         trials.append(
-            Trial(
-                bench.config.seed, solver.name, closed, curvature, error.max_zernike, error.rms, maps, seconds
-            )
-        )  # fmt: skip
+            Trial(bench.config.seed, solver.name, closed, curvature, error.max_zernike, error.rms, maps, seconds)
+        )
     return trials
 
 

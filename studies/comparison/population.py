@@ -1,8 +1,8 @@
-"""How good the open loop is on mirrors drawn at random, and whether the bound told beforehand holds on each.
+"""How good the open loop is on mirrors drawn at random, and whether the bound predicted beforehand holds on each.
 
 Every mirror is calibrated by the plan HYSTERESIS at the limits that ship, and then goes through random requests inside
-the range that it tells; the true surface is judged when each request's dwell ends. The requests reach the same planner
-as on the bench, with the calibration as the message says it.
+the range that it publishes; the true surface is judged when each request's dwell ends. The requests reach the same
+planner as on the bench, with the calibration as the message says it.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class Outcome:
 
     Attributes:
         law: what the calibration found.
-        held_out: m, 95th percentile of the largest coefficient error that it told.
-        curvatures: 1/m, range of spheres that was told.
+        held_out: m, 95th percentile of the largest coefficient error that it predicted.
+        curvatures: 1/m, range of spheres that was published.
         groups: requests by what preceded them: ANY_ORDER etc.
         failure: the reason why it could not be judged; "" = it was.
         seconds: of processor time, of the calibration, and of everything.
@@ -105,7 +105,7 @@ def _recipes(bench: SimulatedBench, active: ActiveCalibration, curvatures: Float
     for curvature in curvatures:
         try:
             builder.build(FocusTarget(float(curvature)))
-        except UnreachableError as error:  # the told range said otherwise
+        except UnreachableError as error:  # the published range said otherwise
             refusals.append(str(error))
     recipes = builder.recipes
     if not recipes:

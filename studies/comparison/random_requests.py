@@ -33,9 +33,9 @@ class Requests:
     """R requests of one kind.
 
     Attributes:
-        error, upper: (R,) m, largest coefficient error of the true surface, and its bound told beforehand.
+        error, upper: (R,) m, largest coefficient error of the true surface, and its bound predicted beforehand.
         dwell: (R,) s.
-        refusals: of requests inside the told range that controller or driver refused.
+        refusals: of requests inside the published range that controller or driver refused.
     """
 
     error: Floats

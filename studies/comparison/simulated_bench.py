@@ -52,8 +52,8 @@ class SimulatedBench:
         ValueError: a configuration that makes no sense, naming the parameter.
 
     Attributes:
-        mirror: what the calibration is told of it.
-        limits: what solvers are told of it.
+        mirror: as the calibration knows it.
+        limits: as solvers know it.
         piezo: its actuators, which nothing but an experiment may touch.
         time: s since the start.
         maps: maps taken so far.
@@ -159,15 +159,15 @@ class SimulatedBench:
 
     def _follow(self, shapes: list[Floats], known: bool = True) -> None:
         """Write a way, reporting as often as the driver does."""
-        told = -REPORT_INTERVAL_S
+        reported = -REPORT_INTERVAL_S
         for shape in shapes:
             self._drive.take_edac40(EdacFrame(EDAC40_VALUE, self._channels, self._scale.codes(shape)))
             self.piezo.apply(self._drive.signals(), self.time)
             self._moved = self.time
             self.time += self._limiter.pause_after(self._written, shape)
             self._written = shape
-            if self._moved - told >= REPORT_INTERVAL_S:
-                told = self._moved
+            if self._moved - reported >= REPORT_INTERVAL_S:
+                reported = self._moved
                 self._report(known, moving=True)
 
     def settle(self, dwell: float = 0.0) -> bool:

@@ -162,7 +162,7 @@ def _show_population(figures: dict[str, Any]) -> None:
     )
     console.print(
         f"{figures['mirrors']} mirrors; bound holds for 90 % or more of the requests on "
-        f"{figures['covered_90_to_100']:.0%} of them; lowest coverage: {lowest}; refused inside the told range: "
+        f"{figures['covered_90_to_100']:.0%} of them; lowest coverage: {lowest}; refused inside the published range: "
         f"{figures['refused']}; worst mirror: seed {figures['worst_seed']}; "
         f"{figures['seconds_per_mirror']:.0f} s a mirror"
     )

@@ -224,8 +224,11 @@ def test_too_few_or_equal_surfaces_are_refused() -> None:
     with pytest.raises(ValueError, match="folds = 1: must be at least 2"):
         weighting(maps, folds=1)
     with pytest.raises(ValueError, match="use AZreg"):
-        weighting(replace(maps, coefficients=maps.coefficients[:, :15], sigma=maps.sigma[:, :15],
-                          nominal=maps.nominal[:, :15]))  # fmt: skip
+        weighting(
+            replace(
+                maps, coefficients=maps.coefficients[:, :15], sigma=maps.sigma[:, :15], nominal=maps.nominal[:, :15]
+            )
+        )
     # A surface that never changes, whatever the signals: the same error in every map.
     figure = np.tile(200 * NM * np.cos(9 * POINTS.x), (len(maps), 1))
     with pytest.raises(ValueError, match="the regional errors are the same for all 40 sample surfaces"):

@@ -1,7 +1,7 @@
 """What the driver last said, whether it still says anything, whether it took the last command, and how quickly.
 
 A driver that is stopped or was killed tells nobody: its last report says for ever that it is active. So reports grow
-old here, by the steady clock, and a command that no report confirms is told of.
+old here, by the steady clock, and a command that no report confirms is reported.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class DriverMonitor:
         return Progress(share=share, remaining=gap)
 
     def untaken(self, now: float) -> tuple[Order | None, Refusal] | None:
-        """The order whose command the driver has not confirmed in time, and the reason; each is told once.
+        """The order whose command the driver has not confirmed in time, and the reason; each is given once.
 
         None = there is none. A command that went out later is the one that counts: the latest wins at the driver too.
         """

@@ -160,9 +160,15 @@ class Bench:
     def report(self, moving: bool = False, message: str = "") -> None:
         self.sequence += 1
         applied = Applied(
-            self.time, self.signals, self.turns, self.turned_at, self.degausses, self.history_known, moving,
+            self.time,
+            self.signals,
+            self.turns,
+            self.turned_at,
+            self.degausses,
+            self.history_known,
+            moving,
             self.requested,
-        )  # fmt: skip
+        )
         report = DriverReport(applied, self.requested, self.now.ns, self.state, self.sequence, message=message)
         self.do(self.controller.driver_report(report, self.now))
 

@@ -226,10 +226,14 @@ def hundred_clients(rig: FocusRig, random: Random, record: FaultRecord) -> None:
     clients = [
         subprocess.Popen(
             [*command, str(CLIENTS // CLIENT_PROCESSES), str(REQUESTS), str(random.randrange(10**6))],
-            env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
         )
         for _ in range(CLIENT_PROCESSES)
-    ]  # fmt: skip
+    ]
     deadline = time.monotonic() + CLIENTS_S
     try:
         while any(client.poll() is None for client in clients):

@@ -20,10 +20,10 @@ from fault_injection.fuzz.reference_files import DAT_FIELDS, DAT_HEADER, Referen
 
 #: Numbers that readers trip over, as text.
 _WORDS = (
-    "0", "-1", "1", "nan", "inf", "-inf", "1e999", "1e-320", "4294967296", "-2147483648", "2147483640", "2147483639",
-    "9223372036854775807", "18446744073709551616", "1_000", "0x10", "1e3", "No", "#", '"', "", "\x1f", "\x85", "\xa0",
-    "9" * 45, "9" * 5000,
-)  # fmt: skip
+    *("0", "-1", "1", "nan", "inf", "-inf", "1e999", "1e-320", "4294967296", "-2147483648", "2147483640"),
+    *("2147483639", "9223372036854775807", "18446744073709551616", "1_000", "0x10", "1e3", "No", "#", '"', ""),
+    *("\x1f", "\x85", "\xa0", "9" * 45, "9" * 5000),
+)
 _FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-45, 5e-324, 1e38, 1e308, 1e-7, 2e-5, 0.01, 100.0, float("inf"), float("nan"))
 _LONGEST_RUN = 64
 
@@ -118,8 +118,12 @@ def block(file: ReferenceFile, random: Random) -> bytes:
 
 
 _ANY: tuple[Callable[[ReferenceFile, Random], Any], ...] = (
-    bits, bits, bits, bits_in_the_beginning, bits_in_the_beginning, run_of_bytes, truncation, extension, block,
-)  # fmt: skip
+    *(bits, bits, bits, bits_in_the_beginning, bits_in_the_beginning),
+    run_of_bytes,
+    truncation,
+    extension,
+    block,
+)
 
 # Of one format
 

@@ -51,9 +51,12 @@ class Clients:
     def _client(self, node: Node, number: int) -> tuple[Any, Callable[[Any, Random], None]]:
         if number % 10 == 9:
             action = ThreadedActionClient(
-                node, MoveFocus, "move_focus",
-                goal_service_qos_profile=qos.SERVICE, result_service_qos_profile=qos.SERVICE,
-            )  # fmt: skip
+                node,
+                MoveFocus,
+                "move_focus",
+                goal_service_qos_profile=qos.SERVICE,
+                result_service_qos_profile=qos.SERVICE,
+            )
             self.ready.append(lambda: answers_arrive(action, action.server_is_ready))
             return action, self._move
         kind, name, work = (

@@ -89,12 +89,12 @@ def relaxation(time: Floats, start: float) -> Floats:
 def follow(
     law: HysteresisModel, state: HysteresisState, signals: Floats, time: Floats, moved: Floats | None = None
 ) -> tuple[Floats, HysteresisState]:
-    """Effective signals of a sequence, looked at at `time`.
+    """Effective signals of a sequence, observed at `time`.
 
     Args:
         signals: (M, N) as applied.
         time: (M,) s, rising.
-        moved: (M,) s, when each was applied, between the looks; None = right after the look before.
+        moved: (M,) s, when each was applied, between the observations; None = right after the one before.
 
     Returns:
         (M, N) effective signals, and the state after the last.

@@ -99,9 +99,9 @@ class MapSet:
         before = np.concatenate((self.stamp_ns[:1], self.stamp_ns[:-1]))
         resumed = np.concatenate(([False], np.diff(self.segment) != 0))
         before = np.where(resumed, self.stamp_ns, before)  # nobody knows what was before
-        told = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns)
-        told[1:] &= self.moved_ns[1:] >= self.stamp_ns[:-1]
-        return np.asarray(1e-9 * (np.where(told, self.moved_ns, before) - self.stamp_ns[0]))
+        plausible = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns)
+        plausible[1:] &= self.moved_ns[1:] >= self.stamp_ns[:-1]
+        return np.asarray(1e-9 * (np.where(plausible, self.moved_ns, before) - self.stamp_ns[0]))
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:

@@ -104,10 +104,8 @@ def response_figure(calibration: Calibration) -> Figure:
         calibration.actuator_x * MM, calibration.actuator_y * MM, c=fit.response * NM, s=170, cmap="cividis"
     )
     bad = ~good
-    right.scatter(
-        calibration.actuator_x[bad] * MM, calibration.actuator_y[bad] * MM, s=300, facecolors="none",
-        edgecolors=VERMILION, linewidths=2,
-    )  # fmt: skip
+    ring = {"s": 300, "facecolors": "none", "edgecolors": VERMILION, "linewidths": 2}
+    right.scatter(calibration.actuator_x[bad] * MM, calibration.actuator_y[bad] * MM, **ring)
     middle = 0.5 * (fit.response.min() + fit.response.max())
     for number, x, y, response in zip(
         numbers, calibration.actuator_x * MM, calibration.actuator_y * MM, fit.response, strict=True

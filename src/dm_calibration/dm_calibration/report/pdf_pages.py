@@ -60,10 +60,8 @@ def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     _register_fonts()
     stream = io.BytesIO()
     # Invariant: without a date, the same run gives the same file.
-    document = SimpleDocTemplate(
-        stream, pagesize=A4, title=title, invariant=1,
-        leftMargin=MARGIN, rightMargin=MARGIN, topMargin=MARGIN, bottomMargin=MARGIN,
-    )  # fmt: skip
+    margins = dict.fromkeys(("leftMargin", "rightMargin", "topMargin", "bottomMargin"), MARGIN)
+    document = SimpleDocTemplate(stream, pagesize=A4, title=title, invariant=1, **margins)
     story: list[Flowable] = [_paragraph(title, TITLE)]
     for section in sections:
         story.append(_paragraph(section.title, HEADING))

@@ -1,4 +1,4 @@
-"""A rate-independent memory that fades with travel: a Duhem operator with a learned slope.
+"""Rate-independent hysteresis that fades with travel: a Duhem operator with a learned slope.
 
 ``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 [21]. Play operators never forget what
 was not wiped out by a larger swing; this one forgets exponentially, as some ceramics do. f is a polynomial whose
@@ -30,7 +30,7 @@ class DuhemOperator:
         slope: (A,) coefficients a_1, a_2, ... of f.
 
     Raises:
-        ValueError: coefficients that are not finite, or a memory that no table holds.
+        ValueError: coefficients that are not finite, or a state that no table holds.
     """
 
     def __init__(self, slope: Floats) -> None:
@@ -48,7 +48,7 @@ class DuhemOperator:
         begin = KNOTS - 1 - end
         self._z, f = z[begin : end + 1], f[begin : end + 1]
         if end == KNOTS - 1 or len(f) < 3 or f.min() <= 0.0:
-            raise ValueError(f"duhem_slope = {slope.tolist()}: the memory does not stay within +-{REACH:g}")
+            raise ValueError(f"duhem_slope = {slope.tolist()}: the state does not stay within +-{REACH:g}")
         steps = 0.5 * (1.0 / f[1:] + 1.0 / f[:-1]) * np.diff(self._z)
         travel = np.concatenate(([0.0], np.cumsum(steps)))
         self._travel = travel - np.interp(0.0, self._z, travel)
@@ -56,7 +56,7 @@ class DuhemOperator:
         self.slope_range = float(f.min()), float(f.max())
 
     def move(self, z: Floats, change: Floats) -> Floats:
-        """The memory z (N,) after signals changed by `change` (N,) on a straight way."""
+        """The state z (N,) after signals changed by `change` (N,) on a straight way."""
         way = np.where(change < 0.0, -1.0, 1.0)
         travelled = np.interp(way * z, self._z, self._travel) + np.abs(change)
         return np.asarray(way * np.interp(travelled, self._travel, self._z))

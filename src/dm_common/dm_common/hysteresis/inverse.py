@@ -1,4 +1,4 @@
-"""The inverse of the memory law: which signals bring about wanted effective signals, from where the mirror stands.
+"""The inverse of the hysteresis model: the signals that bring about effective ones, from where the mirror stands.
 
 On a straight way the play operators set in one after another, and between two of these places the law is a polynomial
 in the signal. Its value at all places tells the piece that holds the solution, Newton's method finds it there. The work

@@ -7,7 +7,7 @@ the gains. Signals are normalised, so is the effective signal: it spans 2 over a
   Prandtl-Ishlinskii model ([16], section 2.4); higher powers make
   it a Preisach operator whose density over centre and half-width of the relays is learned: the relays
   of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
-* Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for memory that fades.
+* Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for hysteresis that fades.
 * Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
   grow by `creep_rate` of a step per decade [17, 18]; a spectrum says how much more or less each of them does.
 
@@ -108,7 +108,7 @@ class HysteresisModel:
 
     @classmethod
     def linear(cls) -> HysteresisModel:
-        """No memory: the effective signal is the signal."""
+        """No hysteresis: the effective signal is the signal."""
         none = np.zeros(0)
         return cls(np.zeros(1), np.ones((1, 1)), none, 0.0, 0.0, none)
 

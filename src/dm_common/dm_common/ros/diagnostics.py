@@ -1,4 +1,4 @@
-"""Health of a node on `/diagnostics`, once a second (the Python diagnostic_updater is not on PyPI)."""
+"""Health of a node on `/diagnostics`, once a second (the Python diagnostic_updater is not on PyPI); the log of all."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import Log
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 STALE = DiagnosticStatus.STALE
+#: Names of the levels of rcl_interfaces/Log.
+LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 
 
 @dataclass
@@ -47,3 +51,14 @@ class Diagnostics:
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
+
+
+def hear_log(node: Node, keep: int, take: Callable[[str, str, str], None]) -> None:
+    """Call `take(level, logger, message)` for every line on `/rosout`, the last `keep` of before among them."""
+
+    def on_log(line: Log) -> None:
+        take(LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg)
+
+    # Nodes offer their latest lines to those who come late.
+    profile = QoSProfile(depth=keep, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(Log, "/rosout", on_log, profile)

@@ -40,7 +40,7 @@ class ConditionedPlant(Protocol):
     """What is driven; `dm_common.measurement.Bench` is one."""
 
     def degauss(self) -> None:
-        """Wipe the hysteresis memory over the full range and end at mid range."""
+        """Wipe the hysteresis over the full range and end at mid range."""
 
     def apply(self, signals: Floats) -> Floats:
         """Command `signals` (N,), wait until they stand, return what was written (N,)."""
@@ -118,7 +118,7 @@ class RecipeBuilder:
     """Builds recipes one after the other on one mirror.
 
     Args:
-        loop: plans moves; without a memory its effective signals are signals.
+        loop: plans moves; without a hysteresis model its effective signals are signals.
         plant: the bench.
         now: the plant's time, s, of the clock that maps are stamped with.
         state: what the mirror remembers so far, creep above all; None = taken to be long rested at mid range.

@@ -157,7 +157,7 @@ class RecipeRun:
         check_figures(goal)
         values = self._values
         maps = goal.max_maps or values["recipes.max_maps"]
-        # At least four rounds: without a memory law, hysteresis makes each correction miss by some share of itself.
+        # At least four rounds: without a model, hysteresis makes each correction miss by some share of itself.
         average = min(values["recipes.average"], max(maps // 4, 2))
         tolerance = goal.tolerance or values["recipes.tolerance"]
         return BuildOptions(tolerance, maps, average, float(values["converge.settle_time"]))

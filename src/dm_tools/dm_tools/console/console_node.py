@@ -14,8 +14,6 @@ from typing import Any
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from dm_msgs.msg import FocusState, SurfaceMapInfo, ZernikeCoefficients
-from rcl_interfaces.msg import Log
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import Image
 
@@ -24,6 +22,7 @@ from dm_client.connection import Connection, DeformableMirrorError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
+from dm_common.ros.diagnostics import hear_log
 from dm_common.ros.worker import answers_arrive
 from dm_tools.console.external_goals import ExternalGoals
 from dm_tools.console.state_observer import StateObserver
@@ -37,9 +36,8 @@ TOPICS = client.TOPICS | {
 #: What the console has no button for.
 NOT_OFFERED = ("ingest_file", "update_calibration")
 INTERFACES = {name: interface for name, interface in client.INTERFACES.items() if name not in NOT_OFFERED}
-#: Lines of the log that are kept; nodes offer their latest to those who come late.
+#: Lines of the log that are kept.
 LOG_LINES = 200
-LOG = QoSProfile(depth=LOG_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 #: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
 WATCHED = ("build_recipes", "calibrate", "converge")
 
@@ -82,7 +80,7 @@ class ConsoleNode:
         domain: ROS domain; None = the environment's.
 
     Attributes:
-        log: the last lines of all nodes' logs.
+        log: the last lines that nodes logged: level, logger, message.
         lines_logged: how many were heard in all.
     """
 
@@ -96,9 +94,9 @@ class ConsoleNode:
         self.observer = StateObserver()
         self._connection = Connection("dm_console", namespace, domain, TOPICS, INTERFACES, self._take)
         self.node = self._connection.node
-        self.log: deque[Log] = deque(maxlen=LOG_LINES)
+        self.log: deque[tuple[str, str, str]] = deque(maxlen=LOG_LINES)
         self.lines_logged = 0
-        self.node.create_subscription(Log, "/rosout", self._take_log, LOG)
+        hear_log(self.node, LOG_LINES, self._take_log)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
         self.watched = {name: ExternalGoals(self.node, INTERFACES[name], name) for name in WATCHED}
         self._connection.start()
@@ -120,8 +118,8 @@ class ConsoleNode:
             self._diagnostics[status.name] = status
             self._heard[status.name] = time.monotonic()
 
-    def _take_log(self, message: Log) -> None:
-        self.log.append(message)
+    def _take_log(self, level: str, logger: str, message: str) -> None:
+        self.log.append((level, logger, message))
         self.lines_logged += 1
 
     def close(self) -> None:

@@ -49,12 +49,12 @@ class ExternalGoals:
         self._cancel = node.create_client(self._interface, f"{name}/_action/cancel_goal")
 
     def own(self, identity: Any) -> None:
-        """Tell that this console is about to send the goal `identity`, a unique_identifier_msgs/UUID."""
+        """Note that this console is about to send the goal `identity`, a unique_identifier_msgs/UUID."""
         with self._lock:
             self._own.add(bytes(identity.uuid))
 
     def disown(self, identity: Any) -> None:
-        """Tell that this console has lost sight of the goal `identity`: if it runs, it does as one of somebody else."""
+        """Note that this console has lost sight of the goal `identity`: if it runs, it does as one of somebody else."""
         with self._lock:
             self._own.discard(bytes(identity.uuid))
 
@@ -74,7 +74,7 @@ class ExternalGoals:
             return self._feedback
 
     def cancel(self) -> Future | None:
-        """Ask the goal that runs to stop: the answer, None = no goal runs. Its status tells when it has stopped."""
+        """Ask the goal that runs to stop: the answer, None = no goal runs. Its status says when it has stopped."""
         request = self._interface.Request()
         with self._lock:
             if not self._running:

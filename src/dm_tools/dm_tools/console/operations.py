@@ -122,12 +122,12 @@ async def load(session: Session, name: str) -> str:
     return f"{answer.id} is in use"
 
 
-def _standing(session: Session) -> tuple[Any, list[float]]:
-    """mirror_info and the requested signals. Raises Refusal when the driver has not told them."""
+def _mirror_and_signals(session: Session) -> tuple[Any, list[float]]:
+    """mirror_info and the requested signals. Raises Refusal when the driver has not published them."""
     snapshot = session.snapshot()
     state, mirror = snapshot.actuator_state, snapshot.mirror_info
     if mirror is None or state is None:
-        raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "the driver has not told its mirror and signals yet")
+        raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "the driver has not published its mirror and signals yet")
     requested = list(state.requested)
     if not requested:
         requested = [0.5 * (mirror.signal_min + mirror.signal_max)] * mirror.actuators
@@ -141,7 +141,7 @@ def _still_poked(session: Session, requested: list[float]) -> bool:
 
 async def poke(session: Session, actuator: int, amplitude: float, then_measure: bool) -> str:
     """Move one actuator away from the shape that stood before the first poke."""
-    mirror, requested = _standing(session)
+    mirror, requested = _mirror_and_signals(session)
     base = session.base if session.base is not None and _still_poked(session, requested) else requested
     signals = poke_signals(base, actuator, amplitude, mirror.signal_min, mirror.signal_max)
     await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), MOVE_S)
@@ -152,7 +152,7 @@ async def poke(session: Session, actuator: int, amplitude: float, then_measure: 
 
 async def release(session: Session) -> str:
     """Go back to the shape that stood before the poke."""
-    base, (_mirror, requested) = session.base, _standing(session)
+    base, (_mirror, requested) = session.base, _mirror_and_signals(session)
     if base is None:
         return "nothing is poked"
     session.base = None
@@ -166,19 +166,19 @@ async def release(session: Session) -> str:
 
 async def measure_loop(session: Session, actuator: int, amplitude: float) -> str:
     """Take one actuator up and down with a map at every step; it ends where it began."""
-    snapshot, (mirror, start) = session.snapshot(), _standing(session)
+    snapshot, (mirror, start) = session.snapshot(), _mirror_and_signals(session)
     calibration, observer = snapshot.calibration, session.ros.observer
     if calibration is None or not calibration.id:
         raise Refusal(
             ErrorCode.NOT_CALIBRATED,
             "a measured loop needs a calibration: it holds what the actuator does to the surface",
         )
-    standing = observer.now(snapshot.bench_time)
+    settled = observer.now(snapshot.bench_time)
     state = observer.state()
-    if standing.effective is None or state is None:
-        raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"where the actuators stand is not known: {standing.doubt}")
+    if settled.effective is None or state is None:
+        raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"where the actuators stand is not known: {settled.doubt}")
     signals = way(start[actuator - 1], amplitude, mirror.signal_min, mirror.signal_max)
-    first = float(standing.effective[actuator - 1])
+    first = float(settled.effective[actuator - 1])
     model = modelled_way(observer.law, state, actuator, signals)
     before = (await session.ros.call("measure", Measure.Request(label="loop start"), MEASURE_S)).samples
     values: list[float] = []

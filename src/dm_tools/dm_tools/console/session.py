@@ -58,7 +58,7 @@ class Session:
 
     Attributes:
         outcome: the last success, in words.
-        chosen: number of the actuator that is looked at.
+        chosen: number of the actuator that is shown.
         base: signals to go back to when a poke is released; None = nothing is poked.
         poked: signals of the last poke.
         loops: {actuator: measured loop}.
@@ -159,7 +159,7 @@ class Session:
             self.fail("Cancel", str(error))
 
     async def between_steps(self) -> None:
-        """How work that looks at `cancelled` between its steps is cancelled."""
+        """How work that checks `cancelled` between its steps is cancelled."""
 
     async def end(self) -> None:
         """Cancel what is under way here and wait for its end, for a shutdown in order."""

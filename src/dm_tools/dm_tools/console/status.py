@@ -9,7 +9,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration
-from rcl_interfaces.msg import Log
 
 from dm_tools.console.view_models import QUALITIES
 
@@ -33,15 +32,13 @@ LEVELS = {
     DiagnosticStatus.ERROR: "error",
     DiagnosticStatus.STALE: "stale",
 }
-#: Those of rcl_interfaces/Log.
-LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 
-#: Paths of files, as nodes tell them: at least two folders deep below a folder of the system or a home.
+#: Paths of files, as nodes write them: at least two folders deep below a folder of the system or a home.
 _PATH = re.compile(r"(?<![\w/.])/(?:home|root|tmp|var|opt|mnt|media|srv|data|work|Users)(?:/[^\s/,;:'\"()]+)+")
 
 
 def shortened(text: str) -> str:
-    """`text` with only the last part of every path in them: who looks at the page knows the folders."""
+    """`text` with only the last part of every path in them: who reads the page knows the folders."""
     return _PATH.sub(lambda match: f"…/{match[0].rsplit('/', 1)[-1]}", text)
 
 
@@ -89,7 +86,7 @@ def missing(present: frozenset[str], mirror_known: bool) -> list[str]:
         return ["No node of the suite is heard. Start them (./dm up) or check the namespace and the ROS domain."]
     lines = [f"The node {name} is not heard: {effect}." for name, effect in NODES.items() if name not in present]
     if "pdm_driver" in present and not mirror_known:
-        lines.append("The driver has not told which mirror it drives (topic mirror_info).")
+        lines.append("The driver has not published which mirror it drives (topic mirror_info).")
     return lines
 
 
@@ -153,10 +150,9 @@ def diagnostic_rows(statuses: dict[str, Any]) -> list[Row]:
     ]
 
 
-def log_rows(lines: Sequence[Log], everything: bool) -> list[tuple[str, ...]]:
-    """(level, node, message) of the log's lines, the newest first."""
-    rows = [(LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg) for line in reversed(lines)]
-    return [row for row in rows if everything or row[0] in ("WARN", "ERROR", "FATAL")]
+def log_rows(lines: Sequence[tuple[str, str, str]], everything: bool) -> list[tuple[str, str, str]]:
+    """(level, logger, message) of the log's lines, the newest first."""
+    return [line for line in reversed(lines) if everything or line[0] in ("WARN", "ERROR", "FATAL")]
 
 
 #: Phases of the action `calibrate`, by their number.

@@ -100,21 +100,21 @@ class SurfaceView:
             changed = self.predicted is not None
             self.predicted, self.doubt = None, ""
             return changed
-        standing = self._state_observer.now(snapshot.bench_time)
-        if standing.effective is None or standing.effective.shape != (self._model.actuators,):
+        settled = self._state_observer.now(snapshot.bench_time)
+        if settled.effective is None or settled.effective.shape != (self._model.actuators,):
             changed = self.predicted is not None
-            self.predicted, self.no_prediction_reason = None, standing.doubt or "the calibration is of another mirror"
+            self.predicted, self.no_prediction_reason = None, settled.doubt or "the calibration is of another mirror"
             return changed
         before = self._effective
         if (
             before is not None
-            and standing.doubt == self.doubt
-            and np.abs(before - standing.effective).max() < DRAWN_AGAIN
+            and settled.doubt == self.doubt
+            and np.abs(before - settled.effective).max() < DRAWN_AGAIN
         ):
             return False
-        self._effective, self.doubt = standing.effective, standing.doubt
+        self._effective, self.doubt = settled.effective, settled.doubt
         self.remark = CREEP_BEFORE if self._state_observer.creep_before else ""
-        self.predicted = self._model.surface(standing.effective)
+        self.predicted = self._model.surface(settled.effective)
         return True
 
     def _compare(self) -> None:

@@ -1,1 +1,1 @@
-"""What `dm doctor` looks for, on the machine and in a configuration."""
+"""What `dm doctor` checks, on the machine and in a configuration."""

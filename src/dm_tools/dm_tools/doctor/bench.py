@@ -75,7 +75,7 @@ def required_parameters(config: Config) -> Finding | None:
     missing = [name for name, item in _known("pdm_driver").items() if item.default is REQUIRED and name not in driver]
     if missing:
         return Finding(
-            f"pdm_driver lacks {', '.join(missing)}", "add them; docs/parameters.md tells what each of them means"
+            f"pdm_driver lacks {', '.join(missing)}", "add them; docs/parameters.md says what each of them means"
         )
     return None
 
@@ -124,7 +124,7 @@ def driver_configuration(config: Config) -> Finding | None:
 
     given = config.get("pdm_driver", {})
     if any(value == UNSET for value in given.values()) or required_parameters(config) or parameters(config):
-        return None  # told already
+        return None  # reported already
     try:
         build_configuration(_effective("pdm_driver", given))
     except ValueError as error:
@@ -290,7 +290,7 @@ def stored_calibration(folder: Path, serial: str) -> Finding | None:
     if days * DAY_S > _known("calibration")["updates.stale_after"].default:
         return Finding(
             f"{newest.id} is {days:.0f} days old, and no map has been compared with it since",
-            "./dm check tells whether it is still true, and mends small drifts; else ./dm calibrate",
+            "./dm check says whether it is still true, and mends small drifts; else ./dm calibrate",
             note=True,
         )
     return None

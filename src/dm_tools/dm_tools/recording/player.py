@@ -48,7 +48,7 @@ def play(
 
     Args:
         rate: times faster than recorded.
-        progress: told the time in the recording, s.
+        progress: called with the time in the recording, s.
 
     Raises:
         ValueError: a rate that is not above 0.

@@ -122,9 +122,7 @@ def calibrate(
             min=60, max=2000, help="Identify hysteresis and creep from so many maps: short for --plan hysteresis."
         ),
     ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Tell duration and expected accuracy, move nothing.")
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict duration and accuracy, move nothing.")] = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Begin anew; an interrupted run of the same plan is set aside.")
     ] = False,

@@ -130,7 +130,7 @@ class ActuatorCards:
         self._measure_loop.allow(reason_against("converge", snapshot, session.running))
         self._reason.show(f"Not possible now: {reason}" if reason else "")
         if mirror is None:
-            self._picture.show(None, "The driver has not told its actuators yet.")
+            self._picture.show(None, "The driver has not published its actuators yet.")
             return
         calibration = snapshot.calibration if snapshot.calibration is not None and snapshot.calibration.id else None
         self._cells = cells(mirror, snapshot.actuator_state, calibration)
@@ -151,10 +151,10 @@ class ActuatorCards:
             self._loop_text.show(f"The hysteresis in the calibration cannot be used: {fault}" if fault else "")
             self._loop_picture.show(None, "No hysteresis was identified: the plan “Hysteresis” of a calibration does.")
             return
-        standing = session.ros.observer.now(snapshot.bench_time)
+        settled = session.ros.observer.now(snapshot.bench_time)
         signal, stands = self._cells[session.chosen - 1].signal, None
-        if standing.effective is not None and signal is not None:
-            stands = (signal, round(float(standing.effective[session.chosen - 1]), 4))
+        if settled.effective is not None and signal is not None:
+            stands = (signal, round(float(settled.effective[session.chosen - 1]), 4))
         measured = session.loops.get(session.chosen)
         key = (session.chosen, calibration.id, stands, id(measured))
         if key == self._loop:
@@ -162,6 +162,6 @@ class ActuatorCards:
         self._loop = key
         loop = measured or modelled_loop(law, session.chosen, mirror.signal_min, mirror.signal_max)
         loop = dataclasses.replace(loop, stands=stands)
-        doubt = f" Its place in the loop is a guess: {standing.doubt}." if standing.doubt else ""
+        doubt = f" Its place in the loop is a guess: {settled.doubt}." if settled.doubt else ""
         self._loop_text.show(f"Hysteresis as identified: {loop.text}; the cross is where it stands.{doubt}")
         self._loop_picture.show(loop_chart(loop))

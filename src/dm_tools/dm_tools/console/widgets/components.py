@@ -46,7 +46,7 @@ class ActionButton:
                 self._button.props("outline")
 
     def allow(self, reason: str) -> None:
-        """Enable it when `reason` is empty, else disable it and tell why."""
+        """Enable it when `reason` is empty, else disable it and say why."""
         if reason == self._reason:
             return
         self._reason = reason

@@ -22,7 +22,7 @@ def _empty(text: str) -> str:
     return f'<div class="empty">{escape(text)}</div>'
 
 
-def _table(rows: list[tuple[str, ...]]) -> str:
+def _table(rows: list[tuple[str, str, str]]) -> str:
     if not rows:
         return _empty("Nothing was logged yet.")
     cells = ("".join(f"<td>{_short(cell)}</td>" for cell in row) for row in rows)
@@ -43,7 +43,7 @@ class DiagnosticsCard:
             f'<div class="status"><b>{escape(row.level)}: {escape(row.node)}</b> {_short(row.message)}'
             f'<div class="faint">{_short(row.figures)}</div></div>'
             for row in diagnostic_rows(snapshot.diagnostics)
-        ) or _empty("No node has told its health yet.")
+        ) or _empty("No node has reported its health yet.")
         if content != self._shown:
             self._shown = content
             self._place.set_content(content)
