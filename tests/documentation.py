@@ -94,7 +94,6 @@ WATCHED = {
     "./dm console": "http://127.0.0.1:8037",
     "./dm console --port 9000 --namespace mirror_a": "http://127.0.0.1:9000",
     "./dm record --out runs/monday": "recording",
-    "./dm record": "recording",
 }
 #: The scene itself.
 SCENE = "./dm up --config my_bench.yaml"
@@ -123,19 +122,13 @@ PARSED = {
     "./dm report": "the Python block of read-the-report.md writes the same; test_report_command.py runs it",
     "./dm report PDM30-37_virtual-1_20261121T112233Z --store ~/.ros/dm_bench/calibrations": "an example of an id",
     "./dm report path/to/calibration.h5 --out reports --json figures.json": "an example of a path",
-    "./dm replay FILE": "a placeholder; run with a real file",
     "./dm replay runs/monday": "in its own time; run with --rate 10",
     "./dm replay runs/monday --recalibrate": "needs a recorded calibration; test_recording.py runs it",
-    "./dm compare --plant preisach --seed 5": _LONG + "test_compare.py runs its parts",
     "./dm compare --plant preisach --seed 5 --json runs/compare.json": _LONG + "test_compare.py runs its parts",
     "./dm compare --hysteresis --plant all": _LONG + "test_ablation.py runs its parts",
     "./dm compare --hysteresis --plant all --seed 51 --seed 52 --seed 53": _LONG + "test_ablation.py runs its parts",
-    "./dm bench": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm bench --json runs/bench.json --plot runs/growth.png": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm bench --only focus": _LONG + "test_benchmark_ratios.py runs its jobs",
-    "./dm faults": _LONG + "test_faults_driver.py runs its faults",
-    "./dm security --out policies": "test_security_profile.py runs it",
-    "./dm paper --out runs/paper": _LONG + "test_paper.py runs it",
     "./dm paper --out runs/paper --json runs/paper.json": _LONG + "test_paper.py runs it",
     "./dm doctor --config my_bench.yaml": "must complain while the scene runs; test_doctor.py runs it",
     "./dm exec python -m studies.simulation_plot --output simulation.png": "draws for a minute",
