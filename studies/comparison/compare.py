@@ -54,7 +54,7 @@ class CompareOptions:
         methods: names of solvers; empty = all.
         curvatures: of the spheres, 1/m.
         loop: of the closed-loop rows; by default wavelength / 1000, and three iterations of measuring and correcting.
-        creep: share per decade that the loops foresee, see `closed_loop.Creep`; 0 = they do not.
+        creep: per decade that the loops foresee; 0 = they do not.
     """
 
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
@@ -228,7 +228,7 @@ def _sweep(
         began, computing = bench.time, time.perf_counter()
         maps = 0
         if closed:
-            creep = Creep(options.creep, before, lambda: bench.time)
+            creep = Creep.of_rate(options.creep, before, lambda: bench.time)
             result = converge(solver, target, bench, options.loop, creep=creep)
             before, maps = result.signals, result.maps
         else:

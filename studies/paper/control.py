@@ -232,7 +232,7 @@ def _control(
     command = solver.correct(signals, initial - wanted)
     if reading == "closed loop":
         options = LoopOptions(tolerance=WAVELENGTH / CLAIM_PARTS[1], max_maps=LOOP_MAPS, correct_last=True)
-        creep = Creep(bench.config.creep, signals, lambda: bench.time)
+        creep = Creep.of_rate(samples.hysteresis.law.creep_rate, signals, lambda: bench.time)
         taken = converge(solver, target, bench, options, start=command.signals, creep=creep).maps
     else:
         _go(bench, command.signals)

@@ -39,7 +39,7 @@ LOOP_PARAMETERS = (
     Parameter(
         "converge.creep",
         real(0.01, 0.0, 0.2),
-        "growth of a move per decade of time that the loop foresees; 0 = none",
+        "growth of a move per decade of time that a loop foresees where no creep was identified; 0 = none",
         live=True,
     ),
     Parameter(

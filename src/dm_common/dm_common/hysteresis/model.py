@@ -107,10 +107,10 @@ class HysteresisModel:
             raise ValueError(f"creep_time = {self.creep_time.min():g} s: must be positive")
 
     @classmethod
-    def linear(cls) -> HysteresisModel:
-        """No hysteresis: the effective signal is the signal."""
+    def linear(cls, creep_rate: float = 0.0) -> HysteresisModel:
+        """No hysteresis: but for creep of so much per decade the effective signal is the signal."""
         none = np.zeros(0)
-        return cls(np.zeros(1), np.ones((1, 1)), none, 0.0, 0.0, none)
+        return cls(np.zeros(1), np.ones((1, 1)), none, 0.0, creep_rate, CREEP_TIMES if creep_rate else none)
 
     @property
     def remembers(self) -> bool:

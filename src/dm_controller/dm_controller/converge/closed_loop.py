@@ -8,8 +8,8 @@ beforehand. Two things keep it from diverging:
   the next correction is scaled by the inverse of their ratio (a secant step in one number, within bounds);
 - when the error grew nevertheless, the next correction is halved, once more each time.
 
-Creep goes on while the loop measures: after a large move the surface drifts by a share of that move per decade of time,
-more between two early maps than a correction misses. A loop that is told the share aims at the time of the next map.
+Creep goes on while the loop measures: after a large move the surface drifts more between two early maps than a
+correction misses. A loop that is told the law of the actuators aims at the time of the next map.
 
 The best command seen is kept. Damped corrections lie between two legal commands, so they are legal as well.
 """
@@ -24,6 +24,7 @@ from typing import Protocol
 import numpy as np
 
 from dm_common.errors import Cancelled
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_controller.planning.mirror_model import InfluenceModel
@@ -81,18 +82,20 @@ class Creep:
     """What a loop needs to foresee creep.
 
     Attributes:
-        share: growth of a move per decade of time (piezos: about 0.01); 0 = do not foresee.
-        previous: (N,) signals that stood before the loop's first command.
-        now: the plant's time, s, in steady advance.
+        law: of the actuators; one that does not creep foresees nothing.
+        state: before the loop's first command.
+        now: the plant's time, s, in steady advance, of the clock of `state`.
     """
 
-    share: float
-    previous: Floats
+    law: HysteresisModel
+    state: HysteresisState
     now: Callable[[], float]
 
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.share <= 0.2:
-            raise ValueError(f"creep = {self.share:g} per decade: must be 0 to 0.2")
+    @classmethod
+    def of_rate(cls, rate: float, signals: Floats, now: Callable[[], float]) -> Creep:
+        """Of actuators without hysteresis that creep by `rate` per decade and have long stood at `signals` (N,)."""
+        law = HysteresisModel.linear(rate)
+        return cls(law, law.rested(signals, now()), now)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,21 +158,23 @@ def _response(model: InfluenceModel, change: Floats) -> Shape:
 
 
 class _Foresight:
-    """Drift until the next map: the loop's first move grows by a share per decade of the time since it was made."""
+    """Drift from the map just taken to the next, which will take as long as this one did."""
 
-    def __init__(self, creep: Creep, model: InfluenceModel, first: Floats) -> None:
-        self._creep = creep
-        self._move = _response(model, first - creep.previous)
-        self._began = self._last = creep.now()
+    def __init__(self, creep: Creep, model: InfluenceModel) -> None:
+        self._creep, self._model, self._state = creep, model, creep.state
+        self._last = creep.now()
+
+    def moved(self, signals: Floats) -> None:
+        """The plant went to `signals` (N,) just now."""
+        self._state = self._creep.law.move(self._state, signals, self._creep.now())
 
     def drift(self) -> Shape:
-        """Change of the surface from the map just taken to the next, which will take as long as this one did."""
-        now = self._creep.now()
-        age = max(now - self._began, 1e-3)
-        decades = math.log10(1.0 + max(now - self._last, 0.0) / age)
+        """Change of the surface until the next map."""
+        law, now = self._creep.law, self._creep.now()
+        self._state = law.advance(self._state, now)
+        then = law.advance(self._state, 2.0 * now - self._last)
         self._last = now
-        factor = self._creep.share * decades
-        return Shape(factor * self._move.coefficients, factor * self._move.sag)
+        return _response(self._model, law.effective(then) - law.effective(self._state))
 
 
 def response_ratio(asked: Shape, seen: Shape) -> float:
@@ -212,14 +217,16 @@ def converge(
     wanted = target_shape(target, model)
     command = solver.solve(wanted)
     signals, overflow = (command.signals, command.overflow) if start is None else (start, 0.0)
-    foresight = _Foresight(creep, model, signals) if creep is not None and creep.share > 0.0 else None
+    foresight = _Foresight(creep, model) if creep is not None and creep.law.creep_rate else None
     steps: list[LoopStep] = []
     damping, scale = 1.0, 1.0
     drift = _response(model, np.zeros_like(signals))
     while True:
         if cancelled():
             raise StoppedLoop(tuple(steps))
-        plant.apply(signals)
+        applied = plant.apply(signals)
+        if foresight is not None:
+            foresight.moved(applied)
         if not plant.settle():
             raise StoppedLoop(tuple(steps))
         number = len(steps) + 1
