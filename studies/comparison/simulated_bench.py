@@ -170,9 +170,9 @@ class SimulatedBench:
                 reported = self._moved
                 self._report(known, moving=True)
 
-    def settle(self, dwell: float = 0.0) -> bool:
-        """Let the settle time and `dwell` s pass."""
-        self.time += self.config.settle_time + dwell
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
+        """Let this `share` of the settle time and `dwell` s pass."""
+        self.time += share * self.config.settle_time + dwell
         return True
 
     def measure(self, label: str) -> Measurement:

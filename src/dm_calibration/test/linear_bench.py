@@ -50,7 +50,7 @@ class LinearBench:
         self.applied.append(self.signals)
         return self.signals
 
-    def settle(self, dwell: float = 0.0) -> bool:
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         self.clock_ns += 10**9
         return not self.stopped
 

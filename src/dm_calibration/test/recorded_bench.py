@@ -36,8 +36,8 @@ class RecordingBench:
         self._bench.clock_ns += 10**8
         self.moves.append(Move(self._bench.clock_ns, requested.copy(), applied.copy(), degauss))
 
-    def settle(self, dwell: float = 0.0) -> bool:
-        return self._bench.settle(dwell)
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
+        return self._bench.settle(dwell, share)
 
     def measure(self, label: str) -> Measurement:
         self._bench.clock_ns += 10**8

@@ -44,7 +44,7 @@ class SteadyMirror:
         self.signals = signals
         return signals
 
-    def settle(self, dwell: float = 0.0) -> bool:
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         self.clock_ns += 10**9
         return True
 

@@ -79,8 +79,8 @@ class Bench(Protocol):
     def apply(self, signals: Floats) -> Floats:
         """Command `signals` (N,), wait until they stand, return what was written (N,). Raises Refusal."""
 
-    def settle(self, dwell: float = 0.0) -> bool:
-        """Wait the settle time and `dwell` s more; False when cancelled meanwhile."""
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
+        """Wait this `share` of the settle time and `dwell` s more; False when cancelled meanwhile."""
 
     def measure(self, label: str) -> Measurement:
         """Take one map. Raises MeasurementError, or Refusal when no other try can succeed."""

@@ -1,8 +1,9 @@
 """Commands that show hysteresis and creep of all actuators at once.
 
 Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order:
-sag shows N displacements per map, so one run serves all. Now and then a shape is held for creep to be seen. The last
-fifth are moves as in use, low-order shapes of random size and order, kept to test the law that the others gave.
+sag shows N displacements per map, so one run serves all. Now and then a shape is held for creep to be seen: near a bowl in
+one half of the run, near its inverse in the other, so that creep over minutes shows too. Maps that are taken early show
+creep of the first second. The last fifth are moves as in use, low-order shapes of random size and order, kept to test the law that the others gave.
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ SWINGS = (1.0, 1.0, 0.6, 0.3)
 #: Share of the shapes that are held, and for how long, s.
 HELD_SHARE = 0.1
 HELD_S = (1.0, 20.0)
+#: How far held shapes are drawn to a bowl.
+BOWL = 0.7
+#: Share of the maps that are taken early, and the share of the settle time after which.
+EARLY_SHARE, EARLY = 0.3, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +41,13 @@ class Excitation:
     Attributes:
         signals: (M, N) legal shapes, repeats not included.
         dwell: (M,) s to hold each beyond the settle time before its map.
+        settled: (M,) share of the settle time to wait.
         check: (M,) which test the law.
     """
 
     signals: Floats
     dwell: Floats
+    settled: Floats
     check: NDArray[np.bool_]
 
 
@@ -55,11 +62,13 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
     rng = np.random.default_rng(seed)
     checks = round(CHECK_SHARE * maps)
     shapes = np.vstack((_random(mirror, maps - checks, rng), _as_in_use(mirror, checks, rng)))
+    check = np.arange(maps) >= maps - checks
     held = rng.random(maps) < HELD_SHARE
+    shapes[held & ~check] = _bowls(mirror, shapes[held & ~check])
     low, high = np.log(HELD_S)
     dwell = np.where(held, np.exp(rng.uniform(low, high, maps)), 0.0)
-    check = np.arange(maps) >= maps - checks
-    return Excitation(shapes, dwell, check)
+    early = ~held & ~check & (rng.random(maps) < EARLY_SHARE)
+    return Excitation(shapes, dwell, np.where(early, EARLY, 1.0), check)
 
 
 def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
@@ -69,6 +78,19 @@ def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
     own = swing * min(half_range, 0.5 * mirror.limits.neighbour_difference)
     level = rng.uniform(-1.0, 1.0, (count, 1)) * np.maximum(swing * half_range - own, 0.0)
     return np.asarray(middle + level + own * rng.uniform(-1.0, 1.0, (count, mirror.actuators)))
+
+
+def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
+    """`shapes` (M, N) drawn to a bowl in the first half of the rows, to its inverse in the second."""
+    middle, half_range = mirror.limits.middle, mirror.limits.half_range
+    squares = mirror.x**2 + mirror.y**2
+    bowl = 2.0 * squares / squares.max() - 1.0
+    if len(mirror.limits.pairs):
+        a, b = mirror.limits.pairs.T
+        steepest = half_range * np.abs(bowl[a] - bowl[b]).max()
+        bowl *= min(1.0, 0.999 * mirror.limits.neighbour_difference / max(steepest, 1e-12))
+    sign = np.where(np.arange(len(shapes)) < len(shapes) // 2, 1.0, -1.0)
+    return np.asarray((1.0 - BOWL) * shapes + BOWL * (middle + half_range * sign[:, None] * bowl))
 
 
 def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:

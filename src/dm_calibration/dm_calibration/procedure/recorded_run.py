@@ -109,7 +109,7 @@ class RecordedBench:
             "the recording began late, ended early, or lost messages"
         )
 
-    def settle(self, dwell: float = 0.0) -> bool:
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         """Nothing to wait for."""
         return True
 

@@ -101,9 +101,9 @@ class BenchServices:
         applied = np.array(response.applied, dtype=np.float64)
         return applied if applied.shape == signals.shape else signals
 
-    def settle(self, dwell: float = 0.0) -> bool:
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         try:
-            return sleep(self._node.get_clock(), self.settle_time + dwell, self.cancelled)
+            return sleep(self._node.get_clock(), share * self.settle_time + dwell, self.cancelled)
         except TimeoutError as error:
             raise Refusal(ErrorCode.TIMEOUT, str(error)) from error
 
