@@ -112,6 +112,7 @@ def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
         creep_spectrum=doubles(law.creep_spectrum),
         crept_at=time_message(round(1e9 * law.crept_at)),
         crept=doubles(law.crept),
+        creep_covariance=doubles(law.creep_covariance),
         zernike_sigma=doubles(hysteresis.zernike_sigma),
         held_out_max_zernike=hysteresis.held_out_max_zernike,
         unknown_sigma=hysteresis.unknown_sigma,

@@ -40,6 +40,20 @@ def test_the_last_moves_are_checks() -> None:
     assert commands.check[-int(commands.check.sum()) :].all()
 
 
+def test_held_shapes_lean_to_one_side_for_minutes_and_some_maps_are_early() -> None:
+    mirror = make_mirror(rings=2)
+    commands = excitation(mirror, 300)
+    squares = mirror.x**2 + mirror.y**2
+    lean = commands.signals @ (squares - squares.mean())
+    held = (commands.dwell > 0.0) & ~commands.check
+    first = np.arange(300) < np.median(np.flatnonzero(held))
+    assert (lean[held & first] > 0.0).all()
+    assert (lean[held & ~first] < 0.0).mean() > 0.9  # but for the one in the middle
+    early = commands.settled < 1.0
+    assert 0.15 < early[~commands.check].mean() < 0.4
+    assert not (early & (held | commands.check)).any()
+
+
 def test_a_seed_is_a_sequence() -> None:
     one, same, other = (excitation(make_mirror(rings=1), 80, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.signals, same.signals)

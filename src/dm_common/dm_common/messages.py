@@ -149,6 +149,11 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         raise ValueError(
             f"hysteresis: creep_spectrum has {spectrum.size} values, must be {creep_time.size} or for each"
         )
+    covariance = np.array(message.creep_covariance, dtype=np.float64)
+    if covariance.size not in (0, 2 * (1 + creep_time.size) ** 2):
+        raise ValueError(
+            f"hysteresis: creep_covariance has {covariance.size} values, must be {2 * (1 + creep_time.size) ** 2}"
+        )
     return HysteresisModel(
         radius,
         weight.reshape((-1, radius.size, message.powers) if weight.size > one else (radius.size, message.powers)),
@@ -159,6 +164,7 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         spectrum.reshape(-1, creep_time.size) if spectrum.size > creep_time.size else spectrum,
         1e-9 * stamp_ns(message.crept_at),
         np.array(message.crept, dtype=np.float64),
+        covariance.reshape(2, 1 + creep_time.size, -1) if covariance.size else covariance,
     )
 
 

@@ -1,9 +1,10 @@
 """Commands that show hysteresis and creep of all actuators at once.
 
 Random shapes turn every actuator in nearly every step, over swings from small to the full range, each in its own order:
-sag shows N displacements per map, so one run serves all. Now and then a shape is held for creep to be seen: near a bowl in
-one half of the run, near its inverse in the other, so that creep over minutes shows too. Maps that are taken early show
-creep of the first second. The last fifth are moves as in use, low-order shapes of random size and order, kept to test the law that the others gave.
+sag shows N displacements per map, so one run serves all. Now and then a shape is held for creep to be seen: near a bowl
+in one half of the run, near its inverse in the other, so that creep over minutes shows too. Maps that are taken early
+show creep of the first second. The last fifth are moves as in use, low-order shapes of random size and order, kept to
+test the law that the others gave.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
     if len(mirror.limits.pairs):
         a, b = mirror.limits.pairs.T
         steepest = half_range * np.abs(bowl[a] - bowl[b]).max()
-        bowl *= min(1.0, 0.999 * mirror.limits.neighbour_difference / max(steepest, 1e-12))
+        share = min(1.0, 0.999 * mirror.limits.neighbour_difference / max(steepest, 1e-12))
+        bowl = share * bowl - (1.0 - share)  # its middle at the end of the range
     sign = np.where(np.arange(len(shapes)) < len(shapes) // 2, 1.0, -1.0)
     return np.asarray((1.0 - BOWL) * shapes + BOWL * (middle + half_range * sign[:, None] * bowl))
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
+from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import responses_of
@@ -73,9 +74,12 @@ def fit_hysteresis(
     covariance = _error_covariance(found, run, maps.terms)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
+    law = _followed(maps, found.fit.law)[1]
+    if law.creep_rate:
+        law = replace(law, creep_covariance=creep_covariance(run, law))
     return HysteresisFit(
         name=found.fit.candidate.name,
-        law=_followed(maps, found.fit.law)[1],
+        law=law,
         zernike_sigma=sigma,
         held_out_max_zernike=float(np.quantile(np.abs(draws).max(axis=1), 0.95)),
         unknown_sigma=unknown_history_sigma(found.fit.law),

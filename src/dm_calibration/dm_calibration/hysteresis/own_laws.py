@@ -43,8 +43,8 @@ DUHEM_WEIGHT = 0.3
 #: Prior of the creep spectrum: standard deviation relative to the common rate, correlation over elements, and the
 #: spread between actuators relative to that; the rate where the common law found less.
 SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD, CREEP_RATE_MIN = 0.5, 12.0, 0.3, 1e-3
-#: Rounds of the three solutions in turn. With 6 the slow creep is a third less true and held-out errors up to four times
-#: as large, with 60 hardly better.
+#: Rounds of the three solutions in turn. With 6 the slow creep is a third less true and held-out errors up to four
+#: times as large, with 60 hardly better.
 ROUNDS = 20
 #: Standard deviation of a normal distribution by the median of its absolute values.
 MEDIAN_TO_SIGMA = 1.4826

@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 
 #: Time constants of creep, s: from the shortest dwell to more than a day, two per decade.
 CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
+#: Standard deviation of a shape that was held unseen, in shapes of the whole range.
+UNSEEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,7 @@ class HysteresisState:
         fading: (N,) of the Duhem operator.
         position: (N,) static effective signal: hysteresis without creep.
         crept: (N, J) what the creep elements have followed so far.
+        doubt: (J,) standard deviation of that, in shapes of the whole range, where some were held unseen. Empty = none.
     """
 
     time: float
@@ -51,6 +54,7 @@ class HysteresisState:
     fading: Floats
     position: Floats
     crept: Floats
+    doubt: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,8 @@ class HysteresisModel:
         creep_spectrum: (J,) or (N, J) weight of each creep element relative to an even spectrum; empty = even.
         crept_at, crept: s, and (N,) effective signals that the actuators had crept to by then, just before the maps of
             the calibration: its figure is relative to that. Empty = not told.
+        creep_covariance: (2, 1 + J, 1 + J) of the errors of the weights of `position` and of the creep elements: those
+            that all actuators share, and those of each by itself. Empty = not told.
 
     Raises:
         ValueError: shapes, numbers that are not finite, or a law that cannot be inverted, naming the field.
@@ -81,6 +87,7 @@ class HysteresisModel:
     creep_spectrum: Floats = field(default_factory=lambda: np.zeros(0))
     crept_at: float = 0.0
     crept: Floats = field(default_factory=lambda: np.zeros(0))
+    creep_covariance: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if self.play_radius.ndim != 1 or not self.play_radius.size:
@@ -93,6 +100,9 @@ class HysteresisModel:
             raise ValueError(
                 f"creep_spectrum has the shape {self.creep_spectrum.shape}: must be {len(self.creep_time)} columns"
             )
+        expected = (2, 1 + len(self.creep_time), 1 + len(self.creep_time))
+        if self.creep_covariance.size and self.creep_covariance.shape != expected:
+            raise ValueError(f"creep_covariance has the shape {self.creep_covariance.shape}: must be {expected}")
         own = (self.play_weight.shape[:-2], np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1])
         if len({shape for shape in own if shape}) > 1:
             raise ValueError(f"play_weight, duhem_weight and creep_spectrum are of {own} actuators: must be of as many")
@@ -166,19 +176,21 @@ class HysteresisModel:
         """The state after a degauss that ended at `middle`; creep remembers what was before."""
         waited = self.advance(state, time)
         fresh = self.demagnetised(len(state.signals), waited.time, middle)
-        return replace(fresh, crept=waited.crept)
+        return replace(fresh, crept=waited.crept, doubt=waited.doubt)
 
     def rested(self, signals: Floats, time: float, middle: float = 0.0) -> HysteresisState:
         """The state at `time` (s) of a mirror that stands at `signals` (N,), if it has stood there since a calibration.
 
-        Elements slower than that is ago hold what they held then.
+        Elements slower than that is ago hold what they held then; what was held meanwhile is in doubt.
         """
         moved = self.move(self.demagnetised(len(signals), time, middle), signals, time)
         settled = np.repeat(moved.position[:, None], len(self.creep_time), axis=1)
+        doubt = np.full(len(self.creep_time), UNSEEN)
         if self.crept.shape == signals.shape and time >= self.crept_at:
             left = np.exp(-(time - self.crept_at) / self.creep_time)
             settled += (self.crept[:, None] - settled) * left
-        return replace(moved, crept=settled)
+            doubt *= 1.0 - left
+        return replace(moved, crept=settled, doubt=doubt)
 
     def advance(self, state: HysteresisState, time: float) -> HysteresisState:
         """The same signals at a later time (s). A time before the state's is taken as the state's."""
@@ -189,7 +201,7 @@ class HysteresisModel:
             return replace(state, time=time)
         rest = np.exp(-elapsed / self.creep_time)
         crept = state.position[:, None] + (state.crept - state.position[:, None]) * rest
-        return replace(state, time=time, crept=crept)
+        return replace(state, time=time, crept=crept, doubt=state.doubt * rest if state.doubt.size else state.doubt)
 
     def move(self, state: HysteresisState, signals: Floats, time: float) -> HysteresisState:
         """Wait until `time` (s), then go to `signals` (N,) on a straight way."""

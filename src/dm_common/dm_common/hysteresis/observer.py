@@ -96,7 +96,7 @@ class HysteresisTracker:
             # The figure of a calibration is relative to what the actuators had crept to, as it found.
             state = law.advance(self.state, law.crept_at)
             crept = np.repeat(law.crept[:, None], len(law.creep_time), axis=1)
-            self.state, self._set_off = replace(state, crept=crept), None
+            self.state, self._set_off = replace(state, crept=crept, doubt=np.zeros(0)), None
         if report.time < self.state.time:
             # Hysteresis knows no time; creep stands still until the clock has caught up.
             self.state = replace(self.state, time=report.time)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
+from dm_controller.planning.creep_error import CreepBound, CreepError
 from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
@@ -29,11 +30,8 @@ Floats = NDArray[np.float64]
 SETTLE_S = 0.05
 #: Draws for the 95 % quantile of the largest of many errors.
 DRAWS = 4000
-#: Shortest time after a move at which a calibration sees the surface, s: one map takes about that long. Creep of less
-#: age is extrapolated.
-YOUNGEST_MAP_S = 1.0
-#: Uncertainty of that extrapolation.
-YOUNG_SHARE = 0.2
+#: Largest coefficient error of what counts as within the range of the mirror, m.
+RANGE_TOLERANCE = 20e-9
 #: Effective signals that a limit denies count from here on, normalised.
 MISSED_MAX = 1e-6
 #: A message's constants are properties of its class, which take longer to look up.
@@ -169,9 +167,11 @@ class Planner:
             plan = mirror.predict(target, reached if effective is None else aim)
             if error is not None:
                 plan = replace(plan, max_zernike=largest, max_zernike_upper=error)
-            # But for creep, how far the actuators go.
-            step = (aim if missed is None else aim - missed) - law.effective(law.advance(begun, arrival))
-            return self._bounded(plan, signals, known, self._young_creep(step, ahead), error)
+            creep = CreepBound(0.0, 0.0)
+            if law.creep_rate:
+                at = law.advance(begun, arrival)
+                creep = self._creep_error.bound(at, law.position_at(at, signals), ahead)
+            return self._bounded(plan, signals, known, creep, error)
 
         return Move(target, signals, reached if effective is None else aim, largest, known, travel + ahead, predict)
 
@@ -208,20 +208,16 @@ class Planner:
         """Largest coefficient beyond tilt, m, of effective signals (N,)."""
         return float(np.abs(self._zernike @ effective).max())
 
-    def _young_creep(self, step: Floats, ahead: float) -> tuple[float, float]:
-        """What extrapolation adds to the largest coefficient error and to the rms sag error of a move, m.
+    @cached_property
+    def _creep_error(self) -> CreepError:
+        """Relative to shapes as large as the mirror takes, of the sign that it takes further."""
+        sphere = FocusTarget(0.0)
+        ends = self.mirror.reachable_range(sphere, RANGE_TOLERANCE)
+        far = max((end for end in ends if math.isfinite(end)), key=abs, default=0.0)
+        whole = self.mirror.command(sphere.with_curvature(far))[0]
+        return CreepError(self.law, self._zernike, self.mirror.sag_root, whole)
 
-        Creep within `ahead` s of a step (N,) follows from the law, which no map younger than YOUNGEST_MAP_S confirms:
-        what it says of the time between is taken to be right to YOUNG_SHARE.
-        """
-        if not 0.0 < ahead < YOUNGEST_MAP_S:
-            return 0.0, 0.0
-        share = YOUNG_SHARE * self.law.creep_rate * math.log10(YOUNGEST_MAP_S / ahead)
-        return share * self._largest(step), share * float(np.linalg.norm(self.mirror.sag_root @ step))
-
-    def _bounded(
-        self, plan: Plan, signals: Floats, known: bool, young: tuple[float, float], error: float | None
-    ) -> Plan:
+    def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound, error: float | None) -> Plan:
         hysteresis = self.hysteresis
         assert hysteresis is not None
         rms_spread = self.mirror.model.held_out_rms
@@ -229,13 +225,13 @@ class Planner:
         if not known:
             rms_spread = float(np.hypot(rms_spread, self._unknown_rms))
             largest_spread = float(np.hypot(largest_spread, self.unknown_max_zernike))
-        rms_lower, rms_upper = rms_bounds(plan.rms, float(np.hypot(rms_spread, young[1] / 1.96)))
+        rms_lower, rms_upper = rms_bounds(plan.rms, float(np.hypot(rms_spread, creep.rms / 1.96)))
         return replace(
             plan,
             signals=signals,
             rms_lower=rms_lower,
             rms_upper=rms_upper,
-            max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, young[0])),
+            max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, creep.max_zernike)),
             saturated=self.mirror.limits.at_limit(signals),
         )
 

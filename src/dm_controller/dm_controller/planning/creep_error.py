@@ -1,0 +1,89 @@
+"""How far off a shape may be by creep that is not known: of the first second, of hours, and of what was held unseen."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+
+Floats = NDArray[np.float64]
+
+#: Ages of a shape that a bound holds for, s, beside the moment when it is to be right.
+AGES = (1.0, 10.0, 100.0)
+#: Time since which creep counts as in the figure of a calibration, s: half of a typical run.
+IN_FIGURE_S = 200.0
+#: 95 % quantile of one error, and of the largest of as many independent ones as a mirror has coefficients.
+ONE, LARGEST = 1.96, 2.5
+#: Share of creep that is known no better, of an element that a calibration of before told nothing of: by its time
+#: constant, s, below which and above which.
+UNTOLD_SHARE, UNTOLD_BELOW, UNTOLD_ABOVE = 0.5, 1.0, 300.0
+
+
+class CreepBound(NamedTuple):
+    """95 % bounds, m.
+
+    Attributes:
+        max_zernike: of the largest coefficient error beyond tilt.
+        rms: of the rms sag error, piston and tilt removed.
+    """
+
+    max_zernike: float
+    rms: float
+
+
+class CreepError:
+    """Errors of creep of one mirror under one law.
+
+    Args:
+        law: of N actuators.
+        zernike: (K - 3, N) m per unit effective signal, coefficients beyond tilt.
+        sag_root: (N, N) m; its product with effective signals is as long as their rms sag.
+        whole: (N,) effective signals of a shape of the whole range.
+    """
+
+    def __init__(self, law: HysteresisModel, zernike: Floats, sag_root: Floats, whole: Floats) -> None:
+        self._law = law
+        covariance = law.creep_covariance if law.creep_covariance.size else _untold(law)
+        size, axes = np.linalg.eigh(covariance[0])
+        root = axes * np.sqrt(np.maximum(size, 0.0))
+        self._each = covariance[1]
+        rows = np.vstack((zernike, sag_root))
+        self._rows, self._coefficients, self._root = rows, len(zernike), root
+        self._in_figure = np.zeros((len(whole), len(law.creep_time)))
+        if law.crept.shape == whole.shape:
+            self._in_figure = law.crept[:, None] * np.exp(-IN_FIGURE_S / law.creep_time)
+        # What a shape of the whole range held unseen would leave, by element.
+        self._unseen = (rows @ whole)[:, None] * np.atleast_2d(law.creep_share).mean(axis=0)
+
+    def bound(self, state: HysteresisState, position: Floats, ahead: float) -> CreepBound:
+        """Of a move from `state` to the static effective signals `position` (N,), `ahead` s after it and at AGES.
+
+        The largest of these, for a shape is corrected by the same law while it is held.
+        """
+        ages = np.array([ahead, *(age for age in AGES if age > ahead)])
+        faded = np.exp(-ages[:, None] / self._law.creep_time)  # (T, J)
+        followed = position[:, None] + (state.crept - position[:, None]) * faded[:, None]
+        features = np.concatenate(
+            (np.broadcast_to(position[:, None], (*followed.shape[:2], 1)), followed - self._in_figure), axis=2
+        )
+        shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
+        if state.doubt.size:
+            shared += np.square(self._unseen * (state.doubt * faded)[:, None]).sum(axis=2)
+        each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True) @ np.square(self._rows).T
+        count = self._coefficients
+        largest = ONE**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)
+        rms = (shared + each)[:, count:].sum(axis=1)
+        return CreepBound(float(np.sqrt(largest.max())), ONE * float(np.sqrt(rms.max())))
+
+
+def _untold(law: HysteresisModel) -> Floats:
+    """Covariances for a calibration that does not tell them."""
+    time = law.creep_time
+    vague = (time < UNTOLD_BELOW) | (time > UNTOLD_ABOVE)
+    sigma = np.where(vague, UNTOLD_SHARE, 0.0) * np.atleast_2d(law.creep_share).mean(axis=0)
+    covariance = np.zeros((2, 1 + len(time), 1 + len(time)))
+    covariance[0, 1:, 1:] = np.diag(np.square(sigma))
+    return covariance

@@ -1,0 +1,100 @@
+"""What is not known of creep: how well a run shows its spectrum, and the bounds that follow from that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dm_calibration.hysteresis.candidate_fit import Run
+from dm_calibration.hysteresis.creep_uncertainty import SPECTRUM, creep_covariance
+from dm_calibration.hysteresis.excitation import excitation
+from dm_calibration.hysteresis.features import follow
+from dm_calibration.hysteresis.responses import Responses
+from dm_common.hysteresis.model import CREEP_TIMES, UNSEEN, HysteresisModel
+from dm_controller.planning.creep_error import CreepError
+from linear_mirror import make_mirror
+
+Floats = NDArray[np.float64]
+
+MIRROR = make_mirror(rings=1)
+COUNT = MIRROR.actuators
+#: m per unit signal of each coefficient.
+RESPONSE = 1e-6 * np.random.default_rng(5).standard_normal((12, COUNT))
+CREEPS = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES)
+
+
+def run_of(law: HysteresisModel, maps: int, noise: float = 2e-10, seed: int = 1) -> Run:
+    commands = excitation(MIRROR, maps)
+    time = np.cumsum(0.5 + 0.5 * commands.settled + commands.dwell)
+    effective, _ = follow(law, law.demagnetised(COUNT, 0.0), commands.signals, time)
+    values = effective @ RESPONSE.T + noise * np.random.default_rng(seed).standard_normal((maps, len(RESPONSE)))
+    return Run(commands.signals, time, Responses(values, len(RESPONSE), np.ones(maps, dtype=bool)), 0.0)
+
+
+def relative(covariance: Floats) -> Floats:
+    """(J,) standard deviation of each element's weight as a share of it."""
+    return np.asarray(np.sqrt(np.diag(covariance)[1:]) / CREEPS.creep_share)
+
+
+def test_maps_tell_creep_of_their_own_age_and_leave_the_rest_to_the_prior() -> None:
+    shared, each = creep_covariance(run_of(CREEPS, 300), CREEPS)
+    sigma = relative(shared)
+    seconds = (CREEP_TIMES > 0.5) & (CREEP_TIMES < 30.0)
+    assert (sigma[seconds] < 0.3 * SPECTRUM).all()
+    assert sigma[-1] == pytest.approx(SPECTRUM, rel=0.2)
+    assert sigma[0] > 0.5 * SPECTRUM
+    assert (relative(each) < SPECTRUM).all()
+    few, _ = creep_covariance(run_of(CREEPS, 80, noise=2e-9), CREEPS)
+    assert (relative(few)[seconds] > sigma[seconds]).all()
+
+
+def test_a_run_is_as_sure_of_creep_as_it_may_be() -> None:
+    """Spectra drawn from the prior: what creep adds over ten minutes lies within three standard deviations."""
+    rng = np.random.default_rng(3)
+    apart = np.abs(np.subtract.outer(np.arange(len(CREEP_TIMES)), np.arange(len(CREEP_TIMES))))
+    root = np.linalg.cholesky(np.exp(-apart / 6.0))
+    grown = np.concatenate(([0.0], 1.0 - np.exp(-600.0 / CREEP_TIMES)))
+    covariance = creep_covariance(run_of(CREEPS, 150), CREEPS)[0]
+    sigma = float(np.sqrt(grown @ covariance @ grown))
+    spread = float(np.std([grown[1:] @ (0.01 * 0.5 * SPECTRUM * (root @ rng.standard_normal(15))) for _ in range(200)]))
+    assert sigma < 0.5 * spread
+
+
+def creep_error(law: HysteresisModel) -> CreepError:
+    return CreepError(law, RESPONSE, 1e-6 * np.eye(COUNT), np.full(COUNT, 0.8))
+
+
+def test_what_was_held_unseen_widens_the_bound_until_it_has_faded() -> None:
+    law = replace(CREEPS, creep_covariance=creep_covariance(run_of(CREEPS, 150), CREEPS))
+    error, position = creep_error(law), np.linspace(-0.5, 0.5, COUNT)
+    known = law.demagnetised(COUNT, 0.0)
+    guessed = law.rested(np.zeros(COUNT), 0.0)
+    bounds = [error.bound(law.advance(guessed, 10.0**decade), position, 0.05).max_zernike for decade in range(7)]
+    assert (np.diff(bounds) < 0.0).all()
+    assert bounds[0] > 1.5 * error.bound(known, position, 0.05).max_zernike
+    assert bounds[-1] == pytest.approx(error.bound(known, position, 0.05).max_zernike, rel=0.2)
+
+
+def test_a_degauss_does_not_make_old_creep_known() -> None:
+    guessed = CREEPS.rested(np.zeros(COUNT), 0.0)
+    after = CREEPS.degaussed(CREEPS.advance(guessed, 5.0), 10.0)
+    assert after.doubt[-1] == pytest.approx(UNSEEN, rel=1e-3)
+    assert after.doubt[0] < 1e-9
+
+
+def test_after_a_calibration_only_what_came_later_is_in_doubt() -> None:
+    law = replace(CREEPS, crept_at=1000.0, crept=np.full(COUNT, 0.3))
+    soon, late = (law.rested(np.zeros(COUNT), 1000.0 + elapsed).doubt for elapsed in (60.0, 86_400.0))
+    assert soon[-1] < 1e-3
+    assert late[-4] > 0.9 * UNSEEN
+
+
+def test_a_longer_move_is_known_less_well() -> None:
+    error = creep_error(CREEPS)
+    state = CREEPS.demagnetised(COUNT, 0.0)
+    small, large = (error.bound(state, size * np.linspace(-0.5, 0.5, COUNT), 0.05) for size in (0.1, 1.0))
+    assert large.max_zernike == pytest.approx(10.0 * small.max_zernike)
+    assert large.rms == pytest.approx(10.0 * small.rms)
