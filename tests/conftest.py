@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,14 @@ from typing import Any
 import pytest
 
 from support import NodeProcess
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _own_ros_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Nodes keep nothing in the home of who runs the tests, and find nothing there."""
+    os.environ["ROS_HOME"] = str(tmp_path_factory.mktemp("ros_home"))
+    yield
+    del os.environ["ROS_HOME"]
 
 
 @pytest.fixture

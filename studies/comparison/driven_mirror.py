@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import copy
 
+import numpy as np
+
 from dm_calibration.procedure.applied_history import SettledState
-from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.hysteresis.creep_record import CreepRecord
+from dm_common.hysteresis.tracker import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move, Planner
@@ -25,14 +28,21 @@ class DrivenMirror:
         holds: whether shapes are corrected while they are held.
         book: recipes to go by; each of their moves begins with a degauss.
         seen: reports of the bench that the suite, started only later, has missed.
+        record: what the suite before it has left on disk.
     """
 
     def __init__(
-        self, bench: SimulatedBench, planner: Planner, holds: bool = True, book: RecipeBook = NO_RECIPES, seen: int = 0
+        self,
+        bench: SimulatedBench,
+        planner: Planner,
+        holds: bool = True,
+        book: RecipeBook = NO_RECIPES,
+        seen: int = 0,
+        record: CreepRecord | None = None,
     ) -> None:
         self.bench = bench
         self._planner, self._holds, self._book = planner, holds, book
-        self._tracker = HysteresisTracker(planner.law)
+        self._tracker = HysteresisTracker(planner.law, record=record)
         self._seen = seen
         self._follow()
 
@@ -53,6 +63,15 @@ class DrivenMirror:
         state, law = self._tracker.state, self._planner.law
         assert state is not None
         return SettledState(law.effective(law.advance(state, self.bench.time)), self.bench.reports[-1].time)
+
+    def record(self) -> CreepRecord:
+        """What the suite leaves on disk."""
+        self._follow()
+        state = self._tracker.state
+        assert state is not None
+        state = self._planner.law.advance(state, self.bench.time)
+        doubt = state.doubt if state.doubt.size else np.zeros(len(self._planner.law.creep_time))
+        return CreepRecord(state.time, self._planner.law.creep_time, state.crept, doubt)
 
     def plan(self, target: FocusTarget) -> Move:
         """The move to `target` from where the mirror stands, or by a recipe after a degauss, which is carried out."""

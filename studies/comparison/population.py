@@ -21,7 +21,8 @@ from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_common.errors import Refusal
-from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.hysteresis.creep_record import CreepRecord
+from dm_common.hysteresis.tracker import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.converge.goals import UnreachableError
 from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
@@ -122,13 +123,15 @@ def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -
         bench.piezo.stuck[rng.integers(bench.mirror.actuators)] = True
 
 
-def _restarted(bench: SimulatedBench, active: ActiveCalibration, off: float) -> DrivenMirror:
-    """Electronics off for `off` s, the suite started anew, and a degauss."""
+def _restarted(
+    bench: SimulatedBench, active: ActiveCalibration, off: float, record: CreepRecord | None = None
+) -> DrivenMirror:
+    """Electronics off for `off` s, the suite started anew, with what it finds on disk, and a degauss."""
     bench.power_cycle(off)
     seen = len(bench.reports) - 1
     bench.degauss()
     bench.settle()
-    return DrivenMirror(bench, active.planner, seen=seen)
+    return DrivenMirror(bench, active.planner, seen=seen, record=record)
 
 
 def _checked(
@@ -196,7 +199,7 @@ def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lam
     first = draw_targets(active, FIRST_REQUESTS + 1, rng)
     driven = DrivenMirror(other, active.planner)
     driven.hold(driven.go(driven.plan(first[0])), HELD_S)
-    driven = _restarted(other, active, OFF_S)
+    driven = _restarted(other, active, OFF_S, driven.record())
     groups[RESTARTED] = judge_requests(driven, active, surface, first[1:], short)
     progress(f"seed {seed}: check maps")
     checked = _checked(other, calibration, driven, draw_targets(active, CHECK_MAPS, rng))

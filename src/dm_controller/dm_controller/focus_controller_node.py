@@ -23,6 +23,7 @@ from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import never_silent
+from dm_controller.creep_recorder import CreepRecorder
 from dm_controller.degauss_client import DegaussClient
 from dm_controller.focus_actions import LoopHost, MoveFocusAction, serve_loops
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
@@ -62,6 +63,7 @@ class FocusControllerNode(Node):
         self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.LATCHED)
         self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._recorder = CreepRecorder(self, self._controller.observer, values["state_folder"], steady)
         self._quick = self.create_timer(values["hold.period"], self._tick)
         self._states_due = self.create_timer(STATE_DELAY_S, self._publish_states, clock=steady, autostart=False)
         self.create_timer(SLOW_PERIOD_S, self._tick)
@@ -88,6 +90,7 @@ class FocusControllerNode(Node):
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror, self._diagnostics.hardware_id = message, message.serial
+        self._recorder.recall(message.serial)
         self._use()
 
     def _on_calibration(self, message: Calibration) -> None:

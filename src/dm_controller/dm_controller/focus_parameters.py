@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from dm_common.mirror import APERTURE_TOLERANCE
-from dm_common.ros.parameters import Parameter, real, switch, whole
+from dm_common.ros.parameters import Parameter, real, switch, text, whole
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.focus_actions import LOOP_PARAMETERS
 from dm_controller.planning.planner import SETTLE_S
@@ -66,6 +66,11 @@ PARAMETERS: Final = (
         real(2_592_000.0, 0.0, 1e9, "s"),
         "age from which a calibration that no map has confirmed is called stale; it is still used; 0 = never",
         live=True,
+    ),
+    Parameter(
+        "state_folder",
+        text("~/.ros/focus_controller"),
+        "folder that keeps what the actuators of each mirror have crept to, for the next start; empty = keep nothing",
     ),
     Parameter(
         "aperture_tolerance",

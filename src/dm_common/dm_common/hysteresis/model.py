@@ -24,6 +24,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.hysteresis.creep_record import CreepRecord
 from dm_common.hysteresis.duhem import DuhemOperator
 
 Floats = NDArray[np.float64]
@@ -178,18 +179,24 @@ class HysteresisModel:
         fresh = self.demagnetised(len(state.signals), waited.time, middle)
         return replace(fresh, crept=waited.crept, doubt=waited.doubt)
 
-    def rested(self, signals: Floats, time: float, middle: float = 0.0) -> HysteresisState:
-        """The state at `time` (s) of a mirror that stands at `signals` (N,), if it has stood there since a calibration.
+    def rested(
+        self, signals: Floats, time: float, middle: float = 0.0, record: CreepRecord | None = None
+    ) -> HysteresisState:
+        """The state at `time` (s) of a mirror that stands at `signals` (N,), if it has stood there since it was known.
 
-        Elements slower than that is ago hold what they held then; what was held meanwhile is in doubt.
+        That is since `record`, or since a calibration. Elements slower than that is ago hold what they held then; what
+        was held meanwhile is in doubt.
         """
         moved = self.move(self.demagnetised(len(signals), time, middle), signals, time)
         settled = np.repeat(moved.position[:, None], len(self.creep_time), axis=1)
         doubt = np.full(len(self.creep_time), UNSEEN)
-        if self.crept.shape == signals.shape and time >= self.crept_at:
-            left = np.exp(-(time - self.crept_at) / self.creep_time)
-            settled += (self.crept[:, None] - settled) * left
-            doubt *= 1.0 - left
+        if record is None or record.time > time or not np.array_equal(record.creep_time, self.creep_time):
+            held = np.repeat(self.crept[:, None], len(self.creep_time), axis=1)
+            record = CreepRecord(self.crept_at, self.creep_time, held, np.zeros(len(self.creep_time)))
+        if record.crept.shape == settled.shape and time >= record.time:
+            left = np.exp(-(time - record.time) / self.creep_time)
+            settled += (record.crept - settled) * left
+            doubt = np.hypot(doubt * (1.0 - left), record.doubt * left)
         return replace(moved, crept=settled, doubt=doubt)
 
     def advance(self, state: HysteresisState, time: float) -> HysteresisState:

@@ -168,7 +168,7 @@ class Planner:
             if error is not None:
                 plan = replace(plan, max_zernike=largest, max_zernike_upper=error)
             creep = CreepBound(0.0, 0.0)
-            if law.creep_rate:
+            if law.creep_rate and error is None:
                 at = law.advance(begun, arrival)
                 creep = self._creep_error.bound(at, law.position_at(at, signals), ahead)
             return self._bounded(plan, signals, known, creep, error)

@@ -1,0 +1,75 @@
+"""What the actuators have crept to, kept on disk: the next start knows what was held before it, and for how long."""
+
+from __future__ import annotations
+
+import os
+import re
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class CreepRecord(NamedTuple):
+    """Creep of one mirror at one moment.
+
+    Attributes:
+        time: s, of the clock that commands are stamped with.
+        creep_time: (J,) s, of the elements.
+        crept: (N, J) effective signals that they have followed so far.
+        doubt: (J,) see :class:`~dm_common.hysteresis.model.HysteresisState`.
+    """
+
+    time: float
+    creep_time: Floats
+    crept: Floats
+    doubt: Floats
+
+
+def record_file(folder: str, serial: str) -> Path | None:
+    """The file of a mirror in `folder`, where ~/.ros is $ROS_HOME if that is set; None for an empty folder name."""
+    if not folder:
+        return None
+    stem = re.sub(r"[^A-Za-z0-9.-]+", "-", serial).strip("-.")[:200] or "mirror"
+    home = os.environ.get("ROS_HOME")
+    place = Path(home + folder.removeprefix("~/.ros")) if home and folder.startswith("~/.ros") else Path(folder)
+    return place.expanduser() / f"{stem}.creep.npz"
+
+
+def write_record(file: Path, record: CreepRecord) -> None:
+    """Replace `file` as a whole.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(f"{file.name}.part")
+    with part.open("wb") as stream:
+        np.savez(stream, **{name: np.asarray(value) for name, value in record._asdict().items()})
+    part.replace(file)
+
+
+def read_record(file: Path, now: float) -> CreepRecord | None:
+    """The record in `file`; None when there is none.
+
+    Raises:
+        ValueError: it cannot be used, with the reason; `now` (s) is before it was written: the clock was set.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            values = [np.asarray(stored[name], dtype=np.float64) for name in CreepRecord._fields]
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{file}: {error}: what was held before is not known") from error
+    time, creep_time, crept, doubt = values
+    whole = time.ndim == 0 and crept.ndim == 2 and crept.shape[1:] == creep_time.shape == doubt.shape
+    if not whole or not all(np.isfinite(value).all() for value in values):
+        raise ValueError(f"{file}: its arrays do not fit together: what was held before is not known")
+    if float(time) > now:
+        raise ValueError(f"{file}: written {float(time) - now:.0f} s from now: was the clock set back?")
+    return CreepRecord(float(time), creep_time, crept, doubt)

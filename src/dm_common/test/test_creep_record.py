@@ -1,0 +1,89 @@
+"""The record of creep on disk: what it brings back, and what becomes of one that cannot be used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dm_common.hysteresis.creep_record import CreepRecord, read_record, record_file, write_record
+from dm_common.hysteresis.model import CREEP_TIMES, UNSEEN, HysteresisModel
+from dm_common.hysteresis.observer import HysteresisObserver
+from dm_common.hysteresis.tracker import Applied
+
+LAW = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES)
+DAY = 86_400.0
+
+
+def report(time: float, signal: float) -> Applied:
+    return Applied(time, np.full(3, signal), 0, None, 1, True)
+
+
+def test_the_next_start_knows_what_was_held_for_a_day(tmp_path: Path) -> None:
+    file = tmp_path / "mirror.creep.npz"
+    before = HysteresisObserver()
+    before.use(LAW, 0.0)
+    before.observe(report(0.0, 0.5))
+    record = before.record(DAY)
+    assert record is not None
+    write_record(file, record)
+
+    after = HysteresisObserver()
+    after.recall(read_record(file, DAY + 600.0))
+    after.observe(report(DAY + 600.0, -1.0))
+    after.use(LAW, 0.0)  # the calibration arrives later
+    state = after.state
+    assert state is not None
+    hours = np.searchsorted(CREEP_TIMES, 3600.0)
+    assert (state.crept[:, hours:-1] > 0.2).all()
+    assert state.crept[:, 0] == pytest.approx(-1.0)
+    assert state.doubt[0] == pytest.approx(UNSEEN)
+    assert state.doubt[hours + 1] < 0.3 * UNSEEN
+
+    blind = HysteresisObserver()
+    blind.use(LAW, 0.0)
+    blind.observe(report(DAY + 600.0, -1.0))
+    assert blind.state is not None
+    assert (blind.state.crept == -1.0).all()
+    assert blind.state.doubt == pytest.approx(np.full(len(CREEP_TIMES), UNSEEN))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"crept": np.zeros((3, 2))}, "do not fit together"),
+        ({"doubt": np.full(len(CREEP_TIMES), np.nan)}, "do not fit together"),
+        ({"time": 1e6}, "was the clock set back"),
+    ],
+)
+def test_a_record_that_makes_no_sense_is_named(tmp_path: Path, change: dict[str, object], text: str) -> None:
+    file = tmp_path / "mirror.creep.npz"
+    good = CreepRecord(10.0, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
+    write_record(file, good._replace(**change))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=text):
+        read_record(file, 100.0)
+
+
+def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "mirror.creep.npz"
+    assert read_record(file, 0.0) is None
+    file.write_bytes(b"PK\x03\x04 torn")
+    with pytest.raises(ValueError, match=r"mirror\.creep\.npz"):
+        read_record(file, 0.0)
+
+
+def test_a_record_of_another_law_or_mirror_is_not_used() -> None:
+    elements = np.geomspace(1.0, 100.0, 5)
+    other = CreepRecord(0.0, elements, np.ones((3, 5)), np.zeros(5))
+    larger = CreepRecord(0.0, CREEP_TIMES, np.ones((4, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
+    for record in (other, larger):
+        assert (LAW.rested(np.zeros(3), 1.0, 0.0, record).crept == 0.0).all()
+
+
+def test_files_are_named_for_the_mirror(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_HOME", "/var/ros")
+    assert record_file("", "a") is None
+    assert record_file("~/.ros/focus_controller", "PDM 30/1") == Path("/var/ros/focus_controller/PDM-30-1.creep.npz")
+    assert record_file("/srv", "..") == Path("/srv/mirror.creep.npz")
