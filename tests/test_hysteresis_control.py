@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dm_common.hysteresis.inverse import invert
-from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_controller.solvers.base import MISS, Shape
 from studies.comparison.simulated_bench import SimulationConfig
 from studies.paper.hysteresis_control import Estimate

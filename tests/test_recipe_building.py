@@ -10,7 +10,7 @@ import pytest
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
-from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS

@@ -9,7 +9,7 @@ from dm_calibration.calibrator import fit_effective
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions
-from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
 from dm_controller.planning.mirror_model import CalibratedMirror

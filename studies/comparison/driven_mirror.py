@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import copy
 
-import numpy as np
-
 from dm_calibration.procedure.applied_history import SettledState
-from dm_common.hysteresis.creep_record import CreepRecord
-from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.hysteresis.creep_record import CreepRecord, record_of
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move, Planner
@@ -64,14 +62,10 @@ class DrivenMirror:
         assert state is not None
         return SettledState(law.effective(law.advance(state, self.bench.time)), self.bench.reports[-1].time)
 
-    def record(self) -> CreepRecord:
+    def record(self) -> CreepRecord | None:
         """What the suite leaves on disk."""
         self._follow()
-        state = self._tracker.state
-        assert state is not None
-        state = self._planner.law.advance(state, self.bench.time)
-        doubt = state.doubt if state.doubt.size else np.zeros(len(self._planner.law.creep_time))
-        return CreepRecord(state.time, self._planner.law.creep_time, state.crept, doubt)
+        return record_of(self._planner.law, self._tracker.state, self.bench.time)
 
     def plan(self, target: FocusTarget) -> Move:
         """The move to `target` from where the mirror stands, or by a recipe after a degauss, which is carried out."""

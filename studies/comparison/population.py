@@ -22,7 +22,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_common.errors import Refusal
 from dm_common.hysteresis.creep_record import CreepRecord
-from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
 from dm_controller.converge.goals import UnreachableError
 from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book

@@ -21,7 +21,7 @@ from dm_calibration.optics.aperture import Aperture, configured_aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dm_common.hysteresis.model import HysteresisState
-from dm_common.hysteresis.tracker import HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.solvers.base import MISS, Floats, Shape, Solver, measured_shape

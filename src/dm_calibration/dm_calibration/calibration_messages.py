@@ -77,7 +77,12 @@ def calibration_message(
 
 
 def put_updates(
-    message: CalibrationMsg, updates: Drift, fit: InfluenceFit, doubts: list[str], mirror_changed: bool
+    message: CalibrationMsg,
+    updates: Drift,
+    fit: InfluenceFit,
+    doubts: list[str],
+    mirror_changed: bool,
+    disagreement: float,
 ) -> None:
     """What later maps have shown, into the `message` of the calibration that they update.
 
@@ -85,9 +90,12 @@ def put_updates(
         fit: the influence function as it is now.
         doubts: sentences, added to the known limitations.
         mirror_changed: the calibration no longer counts as CALIBRATED.
+        disagreement: largest coefficient error that maps have shown since one last agreed, m: no bound is below it.
     """
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
+    message.held_out_max_zernike = max(message.held_out_max_zernike, disagreement)
+    message.hysteresis.held_out_max_zernike = max(message.hysteresis.held_out_max_zernike, disagreement)
     message.revision = updates.revision
     message.checked = time_message(updates.checked_ns)
     message.gain_drift = abs(updates.largest_gain[0])

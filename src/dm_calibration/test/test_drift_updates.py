@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.drift_filter import Drift, DriftRates
@@ -124,6 +125,22 @@ def test_actuators_that_stick_are_named(
         assert verdict.comparison.displaced[actuator] == pytest.approx(-wanted, abs=0.01)
         assert f"actuator {actuator + 1} stands at " in verdict.reason
         assert f"instead of {wanted:+.2f}" in verdict.reason
+
+
+def test_a_bad_map_widens_the_bound_at_once_and_a_good_one_restores_it(
+    bench: SteadyMirror, updates: RecalibrationManager
+) -> None:
+    told = {}
+    for name, bump in (("first", 0.0), ("bad", 40e-9), ("good", 0.0)):
+        updates.take(bench.measure(name, bump=bump), bench.settled())
+        fit, known = updates.changed_fit(), updates.updates
+        assert fit is not None
+        assert known is not None
+        message = calibration_message(updates.calibration, None, "mirror", 1.0)
+        put_updates(message, known, fit, [], False, updates.disagreement)
+        told[name] = message.held_out_max_zernike
+    assert told["bad"] > 20e-9
+    assert told["good"] == told["first"] < 5e-9
 
 
 def test_a_map_of_another_shape_is_refused(bench: SteadyMirror, updates: RecalibrationManager) -> None:

@@ -81,7 +81,7 @@ def test_what_later_maps_changed(store: CalibrationStore) -> None:
     updates, fit = manager.updates, manager.changed_fit()
     assert updates is not None
     assert fit is not None
-    put_updates(message, updates, fit, [], False)
+    put_updates(message, updates, fit, [], False, 0.0)
     check(message, "updated")
     drift = (message.revision, message.gain_drift, message.offset_drift)
     np.testing.assert_allclose(drift, EXPECTED["updated/drift"], rtol=1e-12)

@@ -13,7 +13,7 @@ from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror

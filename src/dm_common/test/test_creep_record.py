@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dm_common.hysteresis.creep_record import CreepRecord, read_record, record_file, write_record
+from dm_common.hysteresis.creep_record import CreepRecord, read_record, record_file, record_of, write_record
 from dm_common.hysteresis.model import CREEP_TIMES, UNSEEN, HysteresisModel
-from dm_common.hysteresis.observer import HysteresisObserver
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied, HysteresisObserver
 
 LAW = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES)
 DAY = 86_400.0
@@ -26,7 +25,7 @@ def test_the_next_start_knows_what_was_held_for_a_day(tmp_path: Path) -> None:
     before = HysteresisObserver()
     before.use(LAW, 0.0)
     before.observe(report(0.0, 0.5))
-    record = before.record(DAY)
+    record = record_of(before.law, before.state, DAY)
     assert record is not None
     write_record(file, record)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dm_common.hysteresis.tracker import Applied, HysteresisTracker
+from dm_common.hysteresis.observer import Applied, HysteresisTracker
 from example_hysteresis import rich
 
 LAW = rich()

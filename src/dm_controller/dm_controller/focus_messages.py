@@ -10,7 +10,6 @@ import numpy as np
 from dm_msgs.msg import ActuatorState, Capabilities, FocusState, MirrorInfo
 
 from dm_common.errors import Refusal
-from dm_common.hysteresis.observer import CURE
 from dm_common.messages import applied_from, doubles, stamp_ns, time_message
 from dm_common.ros import diagnostics
 from dm_controller.focus_controller import FocusController
@@ -18,6 +17,9 @@ from dm_controller.focus_types import DriverReport, Moment, Outcome
 from dm_controller.forecast import HysteresisShare
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
+
+#: What to do about an unknown history.
+CURE = "a degauss over the full range (service degauss) makes it known"
 
 
 def driver_report_from(message: ActuatorState) -> DriverReport:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.errors import Refusal
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move, Planner
 from dm_controller.planning.target import Request

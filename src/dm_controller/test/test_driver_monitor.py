@@ -9,7 +9,7 @@ import pytest
 from dm_msgs.msg import ActuatorState
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied
 from dm_controller.driver_monitor import DriverMonitor
 from dm_controller.focus_types import CommandedShape, DriverReport, Order, Outcome, SendCommand, Sent
 from dm_controller.planning.planner import Move

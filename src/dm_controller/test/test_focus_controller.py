@@ -14,7 +14,7 @@ from dm_msgs.msg import ActuatorHysteresis, ActuatorState, Calibration, FocusReq
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_common.hysteresis.tracker import Applied
+from dm_common.hysteresis.observer import Applied
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
 from dm_controller.focus_controller import FocusController

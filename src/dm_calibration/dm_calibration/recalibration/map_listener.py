@@ -100,7 +100,8 @@ class MapListener:
         updates, fit = self._updates.updates, self._updates.changed_fit()
         if updates is not None and fit is not None:
             self._published_at, self._dirty = time.monotonic(), False
-            put_updates(message, updates, fit, self._doubts(), self._updates.mirror_changed)
+            changed, disagreement = self._updates.mirror_changed, self._updates.disagreement
+            put_updates(message, updates, fit, self._doubts(), changed, disagreement)
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""

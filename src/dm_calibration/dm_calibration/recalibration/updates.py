@@ -87,6 +87,7 @@ class RecalibrationManager:
 
     def _forget_repeats(self) -> None:
         self._repeat, self._since, self._first_ns = 0, float("nan"), 0
+        self._disagreement = 0.0
 
     @property
     def calibration(self) -> Calibration | None:
@@ -105,6 +106,12 @@ class RecalibrationManager:
         """Whether so many maps in a row disagreed that the calibration is in doubt."""
         with self._lock:
             return self._updates is not None and self._updates.surprising >= self._options().surprises_max
+
+    @property
+    def disagreement(self) -> float:
+        """Largest coefficient error that maps have shown since one last agreed, m."""
+        with self._lock:
+            return self._disagreement
 
     def begin(self, calibration: Calibration | None) -> str:
         """Keep `calibration` true from now on, with what is stored of it. Returns a remark on damaged files, "" = none.
@@ -174,6 +181,7 @@ class RecalibrationManager:
             with storing(f"the update of {calibration.id} was not stored in {self._folder}"):
                 write_updates(self._file(calibration.id), calibration.id, self._basis, changed)
             self._updates = changed
+            self._disagreement = 0.0 if accepted else max(self._disagreement, comparison.max_zernike)
             if accepted:
                 if not repeat:
                     self._since, self._first_ns = settled.since, measured.stamp_ns

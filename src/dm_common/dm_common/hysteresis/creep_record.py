@@ -6,10 +6,13 @@ import os
 import re
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
 Floats = NDArray[np.float64]
 
@@ -73,3 +76,12 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
     if float(time) > now:
         raise ValueError(f"{file}: written {float(time) - now:.0f} s from now: was the clock set back?")
     return CreepRecord(float(time), creep_time, crept, doubt)
+
+
+def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -> CreepRecord | None:
+    """What the actuators have crept to by `now` (s); None without an identified creep, or without a state."""
+    if state is None or not law.creep_rate:
+        return None
+    state = law.advance(state, now)
+    doubt = state.doubt if state.doubt.size else np.zeros(len(law.creep_time))
+    return CreepRecord(state.time, law.creep_time, state.crept, doubt)

@@ -19,7 +19,7 @@ from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.tracker import Applied, HysteresisTracker
+from dm_common.hysteresis.observer import Applied, HysteresisTracker
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import RecipeError
 from dm_common.ros.worker import ServiceCallError, call, wait_for_clock

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_msgs.msg import FocusRequest
@@ -19,10 +20,12 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
-from dm_controller.planning.creep_error import CreepBound, CreepError
 from dm_controller.planning.fast_path import ClosedForm, PreparedInverse
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_bounds
 from dm_controller.planning.target import FocusTarget
+
+if TYPE_CHECKING:
+    from dm_controller.planning.creep_error import CreepError
 
 Floats = NDArray[np.float64]
 
@@ -167,7 +170,7 @@ class Planner:
             plan = mirror.predict(target, reached if effective is None else aim)
             if error is not None:
                 plan = replace(plan, max_zernike=largest, max_zernike_upper=error)
-            creep = CreepBound(0.0, 0.0)
+            creep = (0.0, 0.0)
             if law.creep_rate and error is None:
                 at = law.advance(begun, arrival)
                 creep = self._creep_error.bound(at, law.position_at(at, signals), ahead)
@@ -215,9 +218,13 @@ class Planner:
         ends = self.mirror.reachable_range(sphere, RANGE_TOLERANCE)
         far = max((end for end in ends if math.isfinite(end)), key=abs, default=0.0)
         whole = self.mirror.command(sphere.with_curvature(far))[0]
+        from dm_controller.planning.creep_error import CreepError  # a command does not wait for it
+
         return CreepError(self.law, self._zernike, self.mirror.sag_root, whole)
 
-    def _bounded(self, plan: Plan, signals: Floats, known: bool, creep: CreepBound, error: float | None) -> Plan:
+    def _bounded(
+        self, plan: Plan, signals: Floats, known: bool, creep: tuple[float, float], error: float | None
+    ) -> Plan:
         hysteresis = self.hysteresis
         assert hysteresis is not None
         rms_spread = self.mirror.model.held_out_rms
@@ -225,13 +232,13 @@ class Planner:
         if not known:
             rms_spread = float(np.hypot(rms_spread, self._unknown_rms))
             largest_spread = float(np.hypot(largest_spread, self.unknown_max_zernike))
-        rms_lower, rms_upper = rms_bounds(plan.rms, float(np.hypot(rms_spread, creep.rms / 1.96)))
+        rms_lower, rms_upper = rms_bounds(plan.rms, float(np.hypot(rms_spread, creep[1] / 1.96)))
         return replace(
             plan,
             signals=signals,
             rms_lower=rms_lower,
             rms_upper=rms_upper,
-            max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, creep.max_zernike)),
+            max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, creep[0])),
             saturated=self.mirror.limits.at_limit(signals),
         )
 
