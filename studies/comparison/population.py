@@ -147,7 +147,7 @@ def _checked(
         message = calibration_message(calibration, None, "mirror", 1.0)
         found, fit = updates.updates, updates.changed_fit()
         assert found is not None and fit is not None
-        put_updates(message, found, fit, [], updates.mirror_changed)
+        put_updates(message, found, fit, [], updates.mirror_changed, updates.disagreement)
     return active_of(bench, message)
 
 

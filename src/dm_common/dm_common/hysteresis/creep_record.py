@@ -52,7 +52,7 @@ def write_record(file: Path, record: CreepRecord) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f"{file.name}.part")
     with part.open("wb") as stream:
-        np.savez(stream, **{name: np.asarray(value) for name, value in record._asdict().items()})
+        np.savez(stream, time=record.time, creep_time=record.creep_time, crept=record.crept, doubt=record.doubt)
     part.replace(file)
 
 
