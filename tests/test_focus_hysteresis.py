@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,8 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 
 from dm_common.errors import Refusal
-from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.creep_record import CreepRecord, record_file, write_record
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_controller.planning.active_calibration import active_calibration
 from focus_bench import RememberingBench, make_law, mirror_info, recipe, remembering_calibration
 from support import NodeProcess, Observer, wait_until
@@ -62,7 +65,14 @@ def shapes() -> tuple[np.ndarray, ...]:
     return tuple(random.uniform(-0.9, 0.9, 37) for _ in range(6))
 
 
-def test_unknown_history_is_told_and_cured_by_a_degauss(observer: Observer, start: Start) -> None:
+def test_unknown_history_is_told_and_cured_by_a_degauss(
+    observer: Observer, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What was held before, the node finds on disk: nothing.
+    monkeypatch.setenv("ROS_HOME", str(tmp_path))
+    file = record_file("~/.ros/focus_controller", mirror_info().serial)
+    assert file is not None
+    write_record(file, CreepRecord(time.time() - 1.0, CREEP_TIMES, np.zeros((37, 15)), np.zeros(15)))
     bench = make(observer, start)
     health: list[DiagnosticArray] = observer.record(DiagnosticArray, "/diagnostics")
     before = bench.set_focus(dry_run=True, curvature=0.02).state

@@ -13,6 +13,7 @@ import pytest
 from dm_msgs.msg import ActuatorHysteresis, ActuatorState, Calibration, FocusRequest, MirrorInfo, Recipe, RecipeBook
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.hysteresis.creep_record import CreepRecord
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import Applied
 from dm_common.messages import doubles
@@ -287,8 +288,21 @@ def test_a_closed_loop_has_the_mirror_for_itself(bench: Bench) -> None:
     assert len(bench.commands) == 1
 
 
+def test_a_degauss_does_not_cure_old_creep() -> None:
+    bench = Bench()
+    bench.degauss()
+    soon = bench.ask(dry_run=True)
+    bench.time += 86_400.0
+    bench.report()
+    later = bench.ask(dry_run=True)
+    assert move_of(later).plan.max_zernike_upper < 0.3 * move_of(soon).plan.max_zernike_upper
+
+
 def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:
     bench = Bench()
+    rested = CreepRecord(bench.time - 1.0, LAW.creep_time, np.zeros((ACTUATORS, 15)), np.zeros(15))
+    bench.controller.observer.recall(rested)
+    bench.report()
     before = bench.ask(dry_run=True)
     assert before.outcome is not None and "moved before" in before.outcome.unknown
     told = bench.capabilities
