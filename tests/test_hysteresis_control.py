@@ -33,7 +33,7 @@ def shape(*coefficients: float) -> Shape:
 
 def test_a_command_leads_where_it_was_asked_to(samples: Samples, tracker: HysteresisTracker) -> None:
     law, state = samples.hysteresis.law, tracker.state
-    assert tracker.known and state is not None
+    assert not tracker.unknown and state is not None
     random = np.random.default_rng(5)
     for _ in range(20):
         wanted = random.uniform(-0.7, 0.7, 37)

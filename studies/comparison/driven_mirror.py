@@ -75,8 +75,10 @@ class DrivenMirror:
             effective, error = found.effective, found.error
             self.bench.degauss()
         self._follow()
-        tracker = self._tracker
-        return self._planner.plan(target, tracker.state, self.bench.time, tracker.known, effective, SETTLE_S, error)
+        state, known = self._tracker.state, not self._tracker.unknown
+        return self._planner.plan(target, state, self.bench.time, known, effective, SETTLE_S, error)
+            target, tracker.state, self.bench.time, not tracker.unknown, effective, SETTLE_S, error
+        )
 
     def go(self, move: Move) -> Move:
         """Carry out `move`, whose prediction is made beforehand.

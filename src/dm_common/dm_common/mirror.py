@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.geometry import rings
 from dm_common.limits import Limits
 
 Floats = NDArray[np.float64]
@@ -58,6 +57,8 @@ class Mirror:
     @property
     def rings(self) -> NDArray[np.int64]:
         """(N,) ring of each actuator: see :func:`~dm_common.geometry.rings`."""
+        from dm_common.geometry import rings  # only calibrations ask
+
         return rings(self.x, self.y)
 
 

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
@@ -19,7 +18,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_common.errors import Refusal
-from dm_common.hysteresis.creep_record import read_record, record_file, record_of, write_record
+from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
@@ -66,8 +65,8 @@ class FocusControllerNode(Node):
         self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.LATCHED)
         self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._record_file: Path | None = None
-        self.create_timer(RECORD_PERIOD_S, self._write_record, clock=steady)
+        self._recorder = CreepRecorder(values["state_folder"], self._controller.observer)
+        self.create_timer(RECORD_PERIOD_S, self._keep_record, clock=steady)
         self._quick = self.create_timer(values["hold.period"], self._tick)
         self._states_due = self.create_timer(STATE_DELAY_S, self._publish_states, clock=steady, autostart=False)
         self.create_timer(SLOW_PERIOD_S, self._tick)
@@ -94,27 +93,17 @@ class FocusControllerNode(Node):
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror, self._diagnostics.hardware_id = message, message.serial
-        file, self._record_file = self._record_file, record_file(self._values["state_folder"], message.serial)
-        if self._record_file not in (file, None):
-            self._read_record()
+        with self.controller() as (_, now):
+            self._warn(self._recorder.recall(message.serial, now.time))
         self._use()
 
-    def _read_record(self) -> None:
-        assert self._record_file is not None
-        try:
-            with self.controller() as (controller, now):
-                controller.observer.recall(read_record(self._record_file, now.time))
-        except ValueError as error:
-            self.get_logger().warning(str(error))
+    def _keep_record(self) -> None:
+        with self.controller() as (_, now):
+            self._warn(self._recorder.keep(now.time))
 
-    def _write_record(self) -> None:
-        with self.controller() as (controller, now):
-            record = record_of(controller.observer.law, controller.observer.state, now.time)
-        if self._record_file is not None and record is not None:
-            try:
-                write_record(self._record_file, record)
-            except OSError as error:
-                self.get_logger().warning(f"state_folder: {error}: the next start will not know of creep", once=True)
+    def _warn(self, text: str) -> None:
+        if text:
+            self.get_logger().warning(text, throttle_duration_sec=60.0)
 
     def _on_calibration(self, message: Calibration) -> None:
         self._calibration = message

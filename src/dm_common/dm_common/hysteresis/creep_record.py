@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+    from dm_common.hysteresis.observer import HysteresisObserver
 
 Floats = NDArray[np.float64]
 
@@ -85,3 +86,34 @@ def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -
     state = law.advance(state, now)
     doubt = state.doubt if state.doubt.size else np.zeros(len(law.creep_time))
     return CreepRecord(state.time, law.creep_time, state.crept, doubt)
+
+
+class CreepRecorder:
+    """Keeps the record of the mirror that an observer follows, in `folder`; empty = keeps nothing.
+
+    Its methods return the reason why something could not be done; "" = it was.
+    """
+
+    def __init__(self, folder: str, observer: HysteresisObserver) -> None:
+        self._folder, self._observer = folder, observer
+        self._file: Path | None = None
+
+    def recall(self, serial: str, now: float) -> str:
+        """Go on from the record of the mirror `serial`, if there is one."""
+        before, self._file = self._file, record_file(self._folder, serial)
+        try:
+            if self._file is not None and self._file != before:
+                self._observer.recall(read_record(self._file, now))
+        except ValueError as error:
+            return str(error)
+        return ""
+
+    def keep(self, now: float) -> str:
+        """Put on disk what the actuators have crept to."""
+        record = record_of(self._observer.law, self._observer.state, now)
+        try:
+            if self._file is not None and record is not None:
+                write_record(self._file, record)
+        except OSError as error:
+            return f"state_folder: {error}: the next start will not know of creep"
+        return ""

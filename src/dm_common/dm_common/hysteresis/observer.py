@@ -71,11 +71,6 @@ class HysteresisTracker:
         self._last: Applied | None = None
         self._set_off: HysteresisState | None = None  # the state when the move under way began
 
-    @property
-    def known(self) -> bool:
-        """Whether the state can be trusted."""
-        return not self.unknown
-
     def observe(self, report: Applied) -> None:
         """Take the next report.
 
