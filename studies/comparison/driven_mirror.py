@@ -77,8 +77,6 @@ class DrivenMirror:
         self._follow()
         state, known = self._tracker.state, not self._tracker.unknown
         return self._planner.plan(target, state, self.bench.time, known, effective, SETTLE_S, error)
-            target, tracker.state, self.bench.time, not tracker.unknown, effective, SETTLE_S, error
-        )
 
     def go(self, move: Move) -> Move:
         """Carry out `move`, whose prediction is made beforehand.

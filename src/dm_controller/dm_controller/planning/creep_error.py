@@ -80,10 +80,9 @@ class CreepError:
 
 
 def _untold(law: HysteresisModel) -> Floats:
-    """Covariances for a calibration that does not tell them."""
+    """Covariances for a calibration that does not tell them: its gains hold what fast elements follow at once."""
     time = law.creep_time
-    vague = (time < UNTOLD_BELOW) | (time > UNTOLD_ABOVE)
-    sigma = np.where(vague, UNTOLD_SHARE, 0.0) * np.atleast_2d(law.creep_share).mean(axis=0)
-    covariance = np.zeros((2, 1 + len(time), 1 + len(time)))
-    covariance[0, 1:, 1:] = np.diag(np.square(sigma))
-    return covariance
+    share = UNTOLD_SHARE * np.atleast_2d(law.creep_share).mean(axis=0)
+    rows = np.hstack((np.where(time < UNTOLD_BELOW, -1.0, 0.0)[:, None], np.eye(len(time))))
+    rows *= np.where((time < UNTOLD_BELOW) | (time > UNTOLD_ABOVE), share, 0.0)[:, None]
+    return np.stack((rows.T @ rows, np.zeros((1 + len(time),) * 2)))
