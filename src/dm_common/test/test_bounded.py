@@ -57,7 +57,8 @@ def test_result_is_feasible_and_optimal(seed: int, demand: float, difference: fl
         {"type": "ineq", "fun": lambda s: difference + (s[:-1] - s[1:])},
     ]
     other = minimize(cost, np.zeros(6), method="SLSQP", bounds=[(-1, 1)] * 6, constraints=constraints, tol=1e-12)
-    assert cost(signals) <= cost(np.clip(other.x, -1, 1)) * (1 + 1e-6) + 1e-6
+    # The general solver may stop outside the limits.
+    assert cost(signals) <= cost(limits.scaled(other.x)[0]) * (1 + 1e-6) + 1e-6
 
 
 @settings(max_examples=30, deadline=None)
