@@ -99,10 +99,10 @@ def test_the_worse_neighbour_counts() -> None:
 
 def test_a_single_recipe_claims_nothing_of_other_shapes_beyond_the_model() -> None:
     missed = scaled(np.ones(ACTUATORS), 225e-9)
-    alone = book(recipe(0.0, missed))
-    errors = [find(alone, FocusTarget(c), PLANNER).error for c in (0.001, 0.005, 0.02)]
+    alone = book(recipe(0.04, missed))
+    errors = [find(alone, FocusTarget(0.04, conic), PLANNER).error for conic in (-1.0, -50.0, -200.0)]
     assert errors == sorted(errors)
-    assert errors[-1] > 225e-9
+    assert errors[-1] > 100e-9
 
 
 def test_merging_recipes_that_contradict_each_other_widens_the_bound() -> None:
@@ -127,7 +127,8 @@ def test_the_bound_holds_on_laws_that_really_err() -> None:
             for c in np.sort(rng.uniform(-0.05, 0.05, count))
         ]
         recipes = book(*[recipe(c, values, measured=noise) for c, values in missed])
-        target = FocusTarget(float(rng.uniform(-0.05, 0.05)))
+        curvatures = [curvature for curvature, _ in missed]
+        target = FocusTarget(float(rng.uniform(min(curvatures), max(curvatures))), float(rng.uniform(-300.0, 300.0)))
         try:
             found = find(recipes, target, planner)
         except RecipeError:
@@ -148,14 +149,16 @@ def test_other_shapes_are_served_where_recipes_are_near() -> None:
     assert find(mixed, FocusTarget(0.02, -1.0), PLANNER).error < conic.error
 
 
-def test_far_from_all_recipes_there_is_none() -> None:
+def test_nothing_is_extrapolated_and_far_from_all_recipes_there_is_none() -> None:
     alone = book(recipe(-0.02, conic=-1.0), recipe(-0.03))
-    words = (
-        r"curvature = \+0\.0510 1/m: no recipe is near this shape; there are 1 from -0\.0200 to -0\.0200 1/m with "
-        r"conic_constant = -1, 1 from -0\.0300 to -0\.0300 1/m with conic_constant = 0"
+    there = (
+        r"there are 1 from -0\.0200 to -0\.0200 1/m with conic_constant = -1, 1 from -0\.0300 to -0\.0300 1/m with "
+        "conic_constant = 0"
     )
-    with pytest.raises(RecipeError, match=words):
+    with pytest.raises(RecipeError, match=rf"curvature = \+0\.0510 1/m: nothing is extrapolated; {there}"):
         find(alone, FocusTarget(0.051), PLANNER)
+    with pytest.raises(RecipeError, match=rf"curvature = -0\.0250 1/m: no recipe is near this shape; {there}"):
+        find(alone, FocusTarget(-0.025, 3000.0), PLANNER)
 
 
 def test_an_empty_book_says_so() -> None:

@@ -119,10 +119,15 @@ class Corrections:
         return np.asarray(np.abs(effective @ influence.T).max(axis=1))
 
     def find(self, target: FocusTarget) -> FoundRecipe:
-        """What makes `target`. Raises RecipeError when no recipe is near it."""
+        """What makes `target`. Raises RecipeError when it is beyond all curvatures there are, or no recipe is near."""
         for recipe in self._recipes:
             if _same(recipe, target):
                 return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0), False)
+        curvatures = [recipe.curvature for recipe in self._recipes]
+        if not min(curvatures) - SAME_CURVATURE <= target.curvature <= max(curvatures) + SAME_CURVATURE:
+            raise RecipeError(
+                f"curvature = {target.curvature:+.4f} 1/m: nothing is extrapolated; there are {self._there()}"
+            )
         own = self._mirror.command(target)[0]
         weights, left = self._kriging.at(own)
         if left > LEFT_MAX:
