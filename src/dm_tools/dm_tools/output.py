@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -55,12 +54,11 @@ def _plain(value: Any) -> Any:
 
 def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     """Write figures whole or not at all; None writes nothing."""
+    from dm_calibration.store.atomic_write import write_whole
+
     if path is None:
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n")
-    temporary.replace(path)
+    write_whole(path, (json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n").encode())
     console.print(f"figures: {path}")
 
 

@@ -21,13 +21,11 @@ class SurfaceError:
         residual: (H, W) m, NaN outside the aperture and where there are no data.
         rms: m, over the valid pixels of the aperture.
         max_zernike: m, largest coefficient error beyond tilt.
-        zernike: (21,) m, coefficient errors.
     """
 
     residual: NDArray[np.float64]
     rms: float
     max_zernike: float
-    zernike: NDArray[np.float64]
 
 
 def map_of(image: Any) -> NDArray[np.float32]:
@@ -59,5 +57,4 @@ def surface_error(sag: NDArray[np.floating[Any]], info: Any, target: FocusTarget
         residual=residual,
         rms=float(np.sqrt(np.nanmean(residual**2))),
         max_zernike=float(np.abs(fit.coefficients[PISTON_TILT:]).max()),
-        zernike=fit.coefficients,
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import shutil
 import socket
 from collections.abc import Iterator
@@ -50,16 +49,16 @@ def bench_config(
         ValueError: it has no virtual bench, or the parts of one that a run changes are missing.
     """
     from dm_bringup.suite import load_config
-    from dm_tools.verbs.up import shared_config
+    from dm_tools.verbs.up import move_trigger, shared_config
 
     source = source if source is not None else shared_config("bench.yaml")
-    config = copy.deepcopy(load_config(source))
+    config = load_config(source)
     for node in ("virtual_bench", "pdm_driver", "interferometer", "calibration", "focus_controller"):
         if node not in config:
             raise ValueError(f"{source}: no section for {node}: a demo needs a virtual bench and all nodes")
     bench, driver = config["virtual_bench"], config["pdm_driver"]
     tcp, udp, discovery, trigger = free_ports(4)
-    old_trigger = str(bench.get("trigger.port", ""))
+    move_trigger(config, trigger)
     own_ports = {"electronics.tcp_port": tcp, "electronics.udp_port": udp, "electronics.discovery_port": discovery}
     bench |= {name: port for name, port in own_ports.items() if bench.get(name) != OFF}
     bench |= {
@@ -67,17 +66,13 @@ def bench_config(
         "piezo.law": "none" if law == "off" else law,
         "piezo.creep": creep,
         **({} if law.startswith("drawn") else SAME_ACTUATORS),
-        "trigger.port": trigger,
         "clock.speed": speed,
         "output_folder": str(folder / "maps"),
     }
     if bench.get("electronics.pty_link"):
         bench["electronics.pty_link"] = driver["electronics.serial_port"] = str(folder / "tty")
     driver |= {"electronics.port": tcp, "state_folder": str(folder / "driver")}
-    command = [
-        str(trigger) if part == old_trigger else part for part in config["interferometer"].get("trigger_command", [])
-    ]
-    config["interferometer"] |= {"watch_folder": str(folder / "maps"), "trigger_command": command}
+    config["interferometer"]["watch_folder"] = str(folder / "maps")
     config["calibration"] |= {"calibration_folder": str(folder / "calibrations"), "load_on_start": ""}
     (folder / "maps").mkdir(parents=True, exist_ok=True)
     if speed > 0:

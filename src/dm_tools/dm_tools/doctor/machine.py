@@ -156,14 +156,16 @@ def _skew(client: Any) -> Finding | None:
     """How far the clocks of the machines that the nodes run on are from ours; every node reports once a second."""
     from diagnostic_msgs.msg import DiagnosticArray
 
+    from dm_common.messages import seconds
+
     if client.node.get_publishers_info_by_topic("/clock"):
         return None  # the bench has a time of its own
     late: list[tuple[float, str]] = []
 
     def on_report(report: Any) -> None:
-        stamp = report.header.stamp.sec + 1e-9 * report.header.stamp.nanosec
-        if report.status and abs(time.time() - stamp) > CLOCK_SKEW_S:
-            late.append((time.time() - stamp, report.status[0].name))
+        skew = time.time() - seconds(report.header.stamp)
+        if report.status and abs(skew) > CLOCK_SKEW_S:
+            late.append((skew, report.status[0].name))
 
     client.node.create_subscription(DiagnosticArray, "/diagnostics", on_report, 10)
     if client.wait(lambda: late, REPORTS_S):

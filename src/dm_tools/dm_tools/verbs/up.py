@@ -92,8 +92,8 @@ def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
     own = copy.deepcopy(configuration)
     simulation, driver = own["virtual_bench"], own["pdm_driver"]
     shift = PORTS_APART * number
-    old_trigger = str(simulation["trigger.port"])
-    for key in ("electronics.tcp_port", "electronics.udp_port", "electronics.discovery_port", "trigger.port"):
+    move_trigger(own, simulation["trigger.port"] + shift)
+    for key in ("electronics.tcp_port", "electronics.udp_port", "electronics.discovery_port"):
         simulation[key] += shift
     driver["electronics.port"] += shift
     simulation["seed"] += number
@@ -101,8 +101,13 @@ def virtual_mirror(configuration: Config, name: str, number: int) -> Config:
     folder = f"~/.ros/dm_bench/{name}"
     simulation["output_folder"] = own["interferometer"]["watch_folder"] = f"{folder}/maps"
     own["calibration"]["calibration_folder"] = f"{folder}/calibrations"
-    command = own["interferometer"]["trigger_command"]
-    own["interferometer"]["trigger_command"] = [
-        str(simulation["trigger.port"]) if part == old_trigger else part for part in command
-    ]
     return own
+
+
+def move_trigger(config: Config, port: int) -> None:
+    """Put the trigger of the virtual bench on another port, in the interferometer's command too."""
+    bench, interferometer = config["virtual_bench"], config["interferometer"]
+    old = str(bench.get("trigger.port", ""))
+    bench["trigger.port"] = port
+    command = interferometer.get("trigger_command", [])
+    interferometer["trigger_command"] = [str(port) if part == old else part for part in command]
