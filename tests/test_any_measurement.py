@@ -27,7 +27,7 @@ NOISE = 4e-7  # rad, of a slope
 
 
 @cache
-def record(squared: bool, drift: float = 0.0, count: int = 300) -> tuple[Floats, Floats, Floats]:
+def record(squared: bool, drift: float = 0.0, count: int = 160) -> tuple[Floats, Floats, Floats]:
     """Commands (M, 19), slopes (M, 2 lenslets) rad and times (M,) s of random volts, or random volts squared."""
     config = MembraneConfig(actuators=19, pitch=2.6e-3, electrode_diameter=2.4e-3, drift=drift, drift_time=2e3)
     rng = np.random.default_rng(1919)
@@ -43,7 +43,7 @@ def record(squared: bool, drift: float = 0.0, count: int = 300) -> tuple[Floats,
         ]
     )
     commands = rng.uniform(-1.0, 1.0, (count, 19))
-    times = 5.0 * np.arange(count, dtype=np.float64)
+    times = 9.0 * np.arange(count, dtype=np.float64)
     measured = np.empty((count, len(slopes)))
     for row, (signals, time) in enumerate(zip(commands, times, strict=True)):
         share = 0.5 * (signals + 1.0)
@@ -99,7 +99,7 @@ def test_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_what_is_refused() -> None:
     commands, measured, times = record(True)
-    with pytest.raises(ValueError, match=r"measured has the shape \(5, \d+\): must be \(300, numbers"):
+    with pytest.raises(ValueError, match=r"measured has the shape \(5, \d+\): must be \(160, numbers"):
         identify_response(commands, measured[:5], times)
     with pytest.raises(ValueError, match="commands reach 200: must be normalised"):
         identify_response(200.0 * commands / np.abs(commands).max(), measured, times)

@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 
 pytestmark = pytest.mark.slow
 
-SEED, PIXELS, MAPS = 2037, 200, 120
+SEED, PIXELS, MAPS = 2037, 120, 100
 WAVELENGTH = 632.8e-9
 
 
