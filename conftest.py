@@ -21,6 +21,7 @@ PROCESS_FIXTURES = {"domain", "observer", "start"}
 LONGEST = (
     "test_documentation",
     "test_end_to_end",
+    "test_whole_runs",
     "test_console_operations",
     "test_console_page",
     "test_faults_calibration",
@@ -71,6 +72,7 @@ TEST_BY_TEST = frozenset(
         "test_many_mirrors",
         "test_recipe_action",
         "test_virtual_bench_node",
+        "test_whole_runs",
     }
 )
 _COMMAND = re.compile(r"\brun it with: (.+)$")

@@ -103,7 +103,7 @@ REPLAYED = ("./dm replay runs/monday --rate 10",)
 _LONG = "takes minutes; "
 #: Only their names, options and values are checked, against the command itself; why, and what runs them.
 PARSED = {
-    "./dm demo": _LONG + "test_end_to_end.py runs it",
+    "./dm demo": _LONG + "test_whole_runs.py runs it",
     "./dm demo --camera": _LONG + "its parts run in test_autofocus_node.py",
     "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
@@ -115,7 +115,7 @@ PARSED = {
     "./dm calibrate --hysteresis 300": _LONG + "test_calibration_node.py and the demo run the plan",
     "./dm calibrate --plan hysteresis": _LONG + "the same plan",
     "./dm calibrate --plan surfaces --surfaces p06,p07,pz02": _LONG + "test_calibration_node.py runs the plan",
-    "./dm calibrate --plan poke-check": _LONG + "test_end_to_end.py runs the plan",
+    "./dm calibrate --plan poke-check": _LONG + "test_whole_runs.py runs the plan",
     "./dm recipes": _LONG + "test_recipe_action.py runs the action",
     "./dm recipes --curvatures=-0.02,0,0.02": "needs a hysteresis plan first; test_recipe_action.py runs the action",
     "./dm recipes --conic=-1 --curvatures=-0.05:0.05:11": "needs a hysteresis plan first",

@@ -14,9 +14,21 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
+from dm_tools.demo.demo_bench import bench_config
 from ros_fixtures import Observer, wait_until
 
-__all__ = ["NodeProcess", "Observer", "bench_figures", "wait_until"]
+__all__ = ["NodeProcess", "Observer", "bench_figures", "fast_bench", "wait_until"]
+
+
+def fast_bench(folder: Path, seed: int, source: Path | None = None) -> dict[str, dict[str, Any]]:
+    """Configuration of a bench with ideal actuators, twenty times as fast as real ones.
+
+    Such actuators care for no time between two ticks of the clock; what a report says is tested elsewhere.
+    """
+    config = bench_config(folder, "off", 0.0, seed, 20.0, source)
+    config["virtual_bench"]["clock.period"] = 0.005
+    config["calibration"]["write_report"] = False
+    return config
 
 
 def bench_figures(node: Node, timeout_s: float = 60.0) -> dict[str, str]:

@@ -23,10 +23,9 @@ from dm_common.ros.domains import own_domain
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
-from dm_tools.demo.demo_bench import bench_config
 from dm_tools.verbs.up import shared_config
 from dm_tools.verify import map_of, surface_error
-from support import bench_figures
+from support import bench_figures, fast_bench
 
 pytestmark = pytest.mark.processes
 
@@ -38,9 +37,7 @@ MIRROR_19 = shared_config("mirror_19.yaml")
 def mirror(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirrorClient]:
     """A client of the running suite."""
     folder = tmp_path_factory.mktemp("mirror_19")
-    config = bench_config(folder, "off", 0.0, SEED, 20.0, MIRROR_19)
-    config["virtual_bench"]["clock.period"] = 0.005
-    config["calibration"]["write_report"] = False
+    config = fast_bench(folder, SEED, MIRROR_19)
     config["calibration"]["updates.enable"] = False  # what is judged is this calibration, not what follows from maps
     with (
         own_domain() as domain,
