@@ -144,7 +144,9 @@ def test_two_pages_show_the_same_and_either_dismisses(page: Browser, bench: tupl
 
 def test_a_calibration_started_elsewhere_is_shown_and_can_be_cancelled(page: Browser, bench: tuple[int, str]) -> None:
     with Observer(bench[0]) as observer:
-        handle, result = observer.send_goal(Calibrate, "calibrate", Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES))
+        # Long enough that it still runs when a slow browser comes to cancel it.
+        goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, maps_per_state=20)
+        handle, result = observer.send_goal(Calibrate, "calibrate", goal)
         assert handle.accepted
         page.wait_for("A calibration that was started elsewhere", 30)
         page.wait_for("Step ", 30)
