@@ -17,6 +17,8 @@ AGES = (1.0, 10.0, 100.0)
 IN_FIGURE_S = 200.0
 #: 95 % quantile of one error, and of the largest of as many independent ones as a mirror has coefficients.
 ONE, LARGEST = 1.96, 2.5
+#: Ages at which recipes are measured, s.
+MEASURED_S = (1.0, 5.0)
 #: Share of creep that is known no better, of an element that a calibration of before told nothing of: by its time
 #: constant, s, below which and above which.
 UNTOLD_SHARE, UNTOLD_BELOW, UNTOLD_ABOVE = 0.5, 1.0, 300.0
@@ -58,10 +60,14 @@ class CreepError:
         # What a shape of the whole range held unseen would leave, by element.
         self._unseen = (rows @ whole)[:, None] * np.atleast_2d(law.creep_share).mean(axis=0)
 
-    def bound(self, state: HysteresisState, position: Floats, ahead: float) -> CreepBound:
+    def bound(self, state: HysteresisState, position: Floats, ahead: float, measured: bool = False) -> CreepBound:
         """Of a move from `state` to the static effective signals `position` (N,), `ahead` s after it and at AGES.
 
         The largest of these, for a shape is corrected by the same law while it is held.
+
+        Args:
+            measured: the same shape was measured at ages within MEASURED_S, by a mirror without older creep (a recipe):
+                what differs from then counts.
         """
         ages = np.array([ahead, *(age for age in AGES if age > ahead)])
         faded = np.exp(-ages[:, None] / self._law.creep_time)  # (T, J)
@@ -69,6 +75,10 @@ class CreepError:
         features = np.concatenate(
             (np.broadcast_to(position[:, None], (*followed.shape[:2], 1)), followed - self._in_figure), axis=2
         )
+        if measured:
+            then = np.exp(-np.clip(ages, *MEASURED_S)[:, None] / self._law.creep_time)
+            features[:, :, 0] = 0.0
+            features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
         shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
         if state.doubt.size:
             shared += np.square(self._unseen * (state.doubt * faded)[:, None]).sum(axis=2)

@@ -171,9 +171,9 @@ class Planner:
             if error is not None:
                 plan = replace(plan, max_zernike=largest, max_zernike_upper=error)
             creep = (0.0, 0.0)
-            if law.creep_rate and error is None:
+            if law.creep_rate:
                 at = law.advance(begun, arrival)
-                creep = self._creep_error.bound(at, law.position_at(at, signals), ahead)
+                creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, error is not None)
             return self._bounded(plan, signals, known, creep, error)
 
         return Move(target, signals, reached if effective is None else aim, largest, known, travel + ahead, predict)
