@@ -12,6 +12,8 @@ from dm_tools.output import as_wavelengths, console, nanometres, progress_bar
 
 #: Processes at most: a mirror takes a core and some 300 MB.
 WORKERS_MAX = 2
+#: Columns that the table needs.
+TABLE_WIDTH = 136
 #: Kinds of requests, as JSON names them.
 GROUPS = ("any_order", "recipes", "restarted", "checked", "power_cut")
 
@@ -113,7 +115,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
         what = row["plant"].removeprefix("drawn_") + (" *" if row["changes"] else "")
         cells = [""] * (len(figures) - 1) if row["failure"] else _cells(row)
         table.add_row(str(row["seed"]), what, *cells, f"{row['seconds']:.0f}")
-    console.print(table)
+    console.print(table, width=max(console.width, TABLE_WIDTH), crop=False)
     console.print(
         "bound: median of those told; recipes: p90; restart: largest error of the first requests after a day's hold "
         "and 10 min without power; checked: the same after three maps more; cut: after a power cut in a move; each "
