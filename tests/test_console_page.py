@@ -30,7 +30,7 @@ pytestmark = [pytest.mark.processes, needs_browser]
 
 
 @dataclass
-class Bench:
+class RunningConsole:
     """A bench of its own with its console; `suite` may be replaced."""
 
     config: dict[str, dict[str, Any]]
@@ -41,12 +41,12 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningConsole]:
     folder = tmp_path_factory.mktemp("console")
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 3, 20.0)
-    config["virtual_bench"]["interferometer.pixels"] = 236
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.005}
     with own_domain() as domain, served(domain, folder) as address:
-        bench = Bench(config, folder, domain, address, Suite(config, folder, domain).__enter__())
+        bench = RunningConsole(config, folder, domain, address, Suite(config, folder, domain).__enter__())
         try:
             yield bench
             bench.suite.check()
@@ -55,7 +55,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 
 @pytest.fixture(scope="module")
-def page(bench: Bench) -> Iterator[Browser]:
+def page(bench: RunningConsole) -> Iterator[Browser]:
     """Its page; the tests run in order and find what the ones before left."""
     browser = Browser(bench.address, *DESKTOP)
     yield browser
@@ -104,7 +104,7 @@ def test_a_calibration_shows_progress_and_residual_and_is_used(page: Browser, sh
     assert page.alerts() == ""
 
 
-def test_what_the_calibration_cannot_predict_is_logged_once(page: Browser, bench: Bench) -> None:
+def test_what_the_calibration_cannot_predict_is_logged_once(page: Browser, bench: RunningConsole) -> None:
     log = bench.folder / "calibration.log"
     wait_until(lambda: "none of the surfaces p01 to p58" in log.read_text(), 60, "the warning")
     page.wait_for("Predicted residual", 60)
@@ -172,7 +172,7 @@ def test_a_click_on_a_hexagon_chooses_it(page: Browser) -> None:
     wait_until(clicked, 60, "actuator 12")
 
 
-def test_nodes_that_are_started_again_are_found_again(page: Browser, bench: Bench) -> None:
+def test_nodes_that_are_started_again_are_found_again(page: Browser, bench: RunningConsole) -> None:
     bench.suite.stop()
     page.wait_for("No node of the suite is heard.", 60)
     assert not page.find("Move", "button").is_enabled()

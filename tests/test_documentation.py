@@ -274,7 +274,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         (folder / name).symlink_to(ROOT / name)
     home = folder / "home"
     config = bench_config(folder / "bench", "off", 0.0, 2026, 20.0)
-    config["virtual_bench"]["interferometer.pixels"] = 236
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.005}
     config["calibration"]["calibration_folder"] = "~/.ros/dm_calibrations"
     config["calibration"]["load_on_start"] = "newest"
     home.mkdir()

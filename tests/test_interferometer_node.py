@@ -37,7 +37,7 @@ def surface(tilt: float = 1e-7) -> np.ndarray:
     return np.where(x**2 + y**2 <= 1, fringes, INVALID)
 
 
-class Bench:
+class StartedInterferometer:
     """The observer's view of a started node."""
 
     def __init__(self, observer: Observer, start: Start, **parameters: Any) -> None:
@@ -79,7 +79,7 @@ class Bench:
 
 
 def test_ingested_map_is_published_whole(observer: Observer, start: Start, tmp_path: Path) -> None:
-    bench = Bench(observer, start)
+    bench = StartedInterferometer(observer, start)
     path = tmp_path / "map.dat"
     counts = disc_counts(100, amplitude=20000)
     path.write_bytes(dat_bytes(counts, pitch=PITCH))
@@ -135,7 +135,7 @@ def test_map_of_a_large_fizeau(observer: Observer, start: Start, tmp_path: Path)
     path = tmp_path / "fizeau.dat"
     path.write_bytes(dat_bytes(counts, **fields))
     sag = np.where(counts < 2147483640, counts * 0.5 * WAVELENGTH / 32768, np.nan)
-    bench = Bench(observer, start)
+    bench = StartedInterferometer(observer, start)
     answer = bench.ingest(path)
     assert answer.error_code == ErrorCode.OK
     assert answer.info.pv == pytest.approx(np.ptp(sag[np.isfinite(sag)]), rel=1e-6)
@@ -148,7 +148,7 @@ def test_map_of_a_large_fizeau(observer: Observer, start: Start, tmp_path: Path)
 def test_bad_files_get_their_code_and_words_and_the_node_goes_on(
     observer: Observer, start: Start, tmp_path: Path
 ) -> None:
-    bench = Bench(observer, start, wavelength__expected=WAVELENGTH)
+    bench = StartedInterferometer(observer, start, wavelength__expected=WAVELENGTH)
     good = dat_bytes(disc_counts(60), pitch=PITCH)
     bad: dict[str, tuple[bytes | None, int, str]] = {
         "absent.dat": (None, ErrorCode.MAP_UNREADABLE, "No such file"),
@@ -184,7 +184,7 @@ def test_watched_folder_takes_whole_new_files_once(observer: Observer, start: St
     folder = tmp_path / "maps"
     folder.mkdir()
     write_datx(folder / "old.datx", surface(), pitch=PITCH)
-    bench = Bench(observer, start, watch_folder=str(folder), remove_piston_tilt=True)
+    bench = StartedInterferometer(observer, start, watch_folder=str(folder), remove_piston_tilt=True)
     write_datx(tmp_path / "new.datx", surface(), pitch=PITCH)
     content = (tmp_path / "new.datx").read_bytes()
     with (folder / "growing.datx").open("wb") as file:
@@ -218,7 +218,7 @@ def test_triggered_measurement_is_published_once(observer: Observer, start: Star
     folder.mkdir()
     write_datx(tmp_path / "source.datx", surface(), pitch=PITCH)
     code = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
-    bench = Bench(
+    bench = StartedInterferometer(
         observer,
         start,
         watch_folder=str(folder),
@@ -254,7 +254,7 @@ def test_triggered_measurement_is_published_once(observer: Observer, start: Star
 def test_failing_trigger(
     observer: Observer, start: Start, tmp_path: Path, code: str, expected: int, words: str
 ) -> None:
-    bench = Bench(
+    bench = StartedInterferometer(
         observer,
         start,
         watch_folder=str(tmp_path),
@@ -274,7 +274,7 @@ def test_lifecycle(observer: Observer, start: Start, tmp_path: Path) -> None:
     write_datx(path, surface(), pitch=PITCH)
     folder = tmp_path / "maps"
     folder.mkdir()
-    bench = Bench(observer, start, autostart=False, watch_folder=str(folder))
+    bench = StartedInterferometer(observer, start, autostart=False, watch_folder=str(folder))
     assert bench.measure().error_code == ErrorCode.INTERFEROMETER_INACTIVE
     assert bench.ingest(path).error_code == ErrorCode.INTERFEROMETER_INACTIVE
     assert bench.change(Transition.TRANSITION_CONFIGURE)
@@ -299,7 +299,7 @@ def test_lifecycle(observer: Observer, start: Start, tmp_path: Path) -> None:
 def test_deactivation_ends_a_measurement(observer: Observer, start: Start, tmp_path: Path) -> None:
     marker = tmp_path / "started"
     code = "import sys, time; open(sys.argv[1], 'w').close(); time.sleep(600)"
-    bench = Bench(
+    bench = StartedInterferometer(
         observer,
         start,
         watch_folder=str(tmp_path),
@@ -318,7 +318,7 @@ def test_deactivation_ends_a_measurement(observer: Observer, start: Start, tmp_p
 def test_map_without_pitch_has_an_unknown_radius(observer: Observer, start: Start, tmp_path: Path) -> None:
     path = tmp_path / "map.dat"
     path.write_bytes(dat_bytes(disc_counts(60), pitch=0.0))
-    bench = Bench(observer, start)
+    bench = StartedInterferometer(observer, start)
     answer = bench.ingest(path)
     assert answer.error_code == ErrorCode.OK
     assert (answer.info.pitch, answer.info.aperture_radius, answer.zernike.radius, answer.samples.radius) == (0,) * 4
@@ -335,6 +335,6 @@ def test_settings_that_contradict_each_other_are_told_and_the_node_stays(observe
 
 
 def test_neither_trigger_nor_folder(observer: Observer, start: Start) -> None:
-    answer = Bench(observer, start).measure()
+    answer = StartedInterferometer(observer, start).measure()
     assert answer.error_code == ErrorCode.NOT_SUPPORTED
     assert "neither trigger_command nor watch_folder" in answer.message

@@ -1,4 +1,4 @@
-"""The bench of most tests of the calibration without ROS: driver and interferometer around a linear mirror."""
+"""The bench of tests of the calibration without ROS: driver and interferometer around a linear mirror."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.procedure.recorded_run import Move
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
@@ -16,13 +17,22 @@ Floats = NDArray[np.float64]
 
 
 class LinearBench:
-    """Implements dm_common.measurement.Bench; a map takes no time, the settling before it a second.
+    """Implements dm_common.measurement.Bench, and keeps what was done on it as a recording does.
+
+    A move and a map take a tenth of a second each, the settling between them a second.
 
     Args:
         mirror: what the driver tells of it.
         plant: what it does; by default without noise.
         backlash: half-width, in signals, within which an actuator stays where it is.
         share: of the move that lags behind so.
+
+    Attributes:
+        moves, maps: what the driver and the interferometer did, in order.
+        tries: labels of all maps that were asked for.
+        failing: {label: measurements that still fail}.
+        changes: {label: fields of the measurement to replace}.
+        stop_at: label of the map during which the run is stopped.
     """
 
     def __init__(
@@ -31,24 +41,33 @@ class LinearBench:
         self.plant = plant or LinearMirror(mirror.x, mirror.y)
         self.backlash, self.share = backlash, share
         self.rest = self.signals = self.lag = mirror.rest
-        self.applied: list[Floats] = []
-        self.degaussed = 0
         self.clock_ns = 0
-        self.failing: dict[str, int] = {}  # label: measurements that still fail
-        self.changes: dict[str, dict[str, object]] = {}  # label: fields of the measurement to replace
+        self.moves: list[Move] = []
+        self.maps: list[Measurement] = []
         self.tries: list[str] = []
+        self.failing: dict[str, int] = {}
+        self.changes: dict[str, dict[str, object]] = {}
         self.stop_at = ""
         self.stopped = False
 
     def degauss(self) -> None:
-        self.degaussed += 1
-        self.lag = self.rest
+        self.signals = self.lag = self.rest
+        self._moved(self.rest, True)
 
     def apply(self, signals: Floats) -> Floats:
         self.signals = np.round(signals * 32768) / 32768  # a 16-bit converter
         self.lag = np.clip(self.lag, self.signals - self.backlash, self.signals + self.backlash)
-        self.applied.append(self.signals)
+        self._moved(signals, False)
         return self.signals
+
+    def _moved(self, requested: Floats, degauss: bool) -> None:
+        self.clock_ns += 10**8
+        self.moves.append(Move(self.clock_ns, requested.copy(), self.signals.copy(), degauss))
+
+    @property
+    def applied(self) -> list[Floats]:
+        """Signals (N,) of all commands."""
+        return [move.applied for move in self.moves if not move.degauss]
 
     def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         self.clock_ns += 10**9
@@ -60,6 +79,7 @@ class LinearBench:
 
     def measure(self, label: str) -> Measurement:
         self.tries.append(label)
+        self.clock_ns += 10**8
         if label == self.stop_at:
             self.stopped = True
         if self.failing.get(label, 0) > 0:
@@ -78,5 +98,7 @@ class LinearBench:
             wavelength=632.8e-9,
             file=f"{label}.dat",
             sha256="00",
+            moved_ns=self.moves[-1].stamp_ns if self.moves else 0,
         )
-        return replace(measured, **self.changes.get(label, {}))  # type: ignore[arg-type]
+        self.maps.append(replace(measured, **self.changes.get(label, {})))  # type: ignore[arg-type]
+        return self.maps[-1]

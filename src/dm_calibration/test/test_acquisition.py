@@ -32,7 +32,7 @@ def wait_until(condition: Callable[[], Any], what: str) -> None:
         time.sleep(0.01)
 
 
-class Bench:
+class WatchedFolder:
     """An Acquisition on a folder, with what it reported."""
 
     def __init__(self, folder: Path | None, command: list[str] | None = None, **settings: Any) -> None:
@@ -51,10 +51,10 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Any]:
-    made: list[Bench] = []
+    made: list[WatchedFolder] = []
 
-    def make(*arguments: Any, **settings: Any) -> Bench:
-        made.append(Bench(*arguments, **settings))
+    def make(*arguments: Any, **settings: Any) -> WatchedFolder:
+        made.append(WatchedFolder(*arguments, **settings))
         return made[-1]
 
     yield make

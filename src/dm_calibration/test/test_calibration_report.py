@@ -89,7 +89,7 @@ def test_the_page_says_what_was_measured_and_how_well(page: str, calibration: Ca
 
 
 def test_the_page_names_what_was_dropped_and_every_limitation(page: str, calibration: Calibration) -> None:
-    assert "<tr><td>poke+03</td><td>no new file within 5 s (2 tries)</td></tr>" in page
+    assert "<tr><td>poke+03</td><td>no map within 5 s (2 tries)</td></tr>" in page
     text = page.replace("&#x27;", "'")
     for sentence in calibration.limitations:
         assert sentence.removeprefix("Poke check: ") in text

@@ -231,7 +231,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-class Bench:
+class ServedUnit:
     """A server on free ports, and what it told."""
 
     def __init__(self, folder: Path) -> None:
@@ -257,13 +257,13 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    made = Bench(tmp_path)
+def bench(tmp_path: Path) -> Iterator[ServedUnit]:
+    made = ServedUnit(tmp_path)
     yield made
     made.server.close()
 
 
-def test_tcp_frames_in_any_pieces_and_in_order(bench: Bench) -> None:
+def test_tcp_frames_in_any_pieces_and_in_order(bench: ServedUnit) -> None:
     stream = b"".join(edac40_all(code) for code in (1, 2, 3, 400))
     with bench.connect() as client:
         client.sendall(stream[:7])
@@ -274,7 +274,7 @@ def test_tcp_frames_in_any_pieces_and_in_order(bench: Bench) -> None:
     assert bench.server.malformed_count == 0
 
 
-def test_a_question_sees_every_frame_sent_before_it(bench: Bench) -> None:
+def test_a_question_sees_every_frame_sent_before_it(bench: ServedUnit) -> None:
     with bench.connect() as client:
         client.sendall(edac40_all(7))
         wait_for(lambda: bench.updates == 1)
@@ -283,7 +283,7 @@ def test_a_question_sees_every_frame_sent_before_it(bench: Bench) -> None:
             assert bench.codes() == [code] * 40
 
 
-def test_a_question_asked_while_another_is_answered_sees_the_frames_before_it(bench: Bench) -> None:
+def test_a_question_asked_while_another_is_answered_sees_the_frames_before_it(bench: ServedUnit) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
     def slow() -> None:
@@ -303,7 +303,7 @@ def test_a_question_asked_while_another_is_answered_sees_the_frames_before_it(be
         assert second.result(10) == [2] * 40
 
 
-def test_a_second_tcp_client_is_refused_until_the_first_has_gone(bench: Bench) -> None:
+def test_a_second_tcp_client_is_refused_until_the_first_has_gone(bench: ServedUnit) -> None:
     first = bench.connect()
     first.sendall(edac40_all(5))
     wait_for(lambda: bench.updates == 1)
@@ -317,7 +317,7 @@ def test_a_second_tcp_client_is_refused_until_the_first_has_gone(bench: Bench) -
         wait_for(lambda: bench.updates == 2)
 
 
-def test_malformed_frames_are_recorded_and_change_nothing(bench: Bench) -> None:
+def test_malformed_frames_are_recorded_and_change_nothing(bench: ServedUnit) -> None:
     with bench.connect() as client:
         client.sendall(bytes.fromhex("40 00 00 00 00 09 34 12"))
         wait_for(lambda: bench.server.malformed_count == 1)
@@ -330,7 +330,7 @@ def test_malformed_frames_are_recorded_and_change_nothing(bench: Bench) -> None:
     assert bench.codes() == [9] * 40
 
 
-def test_udp_and_discovery(bench: Bench) -> None:
+def test_udp_and_discovery(bench: ServedUnit) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(5)
         client.sendto(edac40_all(77), ("127.0.0.1", bench.port("udp_port")))
@@ -345,7 +345,7 @@ def test_udp_and_discovery(bench: Bench) -> None:
     assert len(answer[17:34].split(b"-")) == 6
 
 
-def test_usb_dac40_on_a_pseudo_terminal(bench: Bench) -> None:
+def test_usb_dac40_on_a_pseudo_terminal(bench: ServedUnit) -> None:
     codes = [(101 * channel) % 4096 for channel in range(40)]
     with serial.Serial(str(bench.link), 115200, timeout=1) as port:
         port.write(bytes(130))
@@ -363,7 +363,7 @@ def test_usb_dac40_on_a_pseudo_terminal(bench: Bench) -> None:
     assert bench.server.run(lambda: np.rint(bench.unit.outputs * 4095).astype(int).tolist()) == [1] * 40
 
 
-def test_unplugging_and_plugging_in_again(bench: Bench) -> None:
+def test_unplugging_and_plugging_in_again(bench: ServedUnit) -> None:
     client = bench.connect()
     client.sendall(edac40_all(50))
     wait_for(lambda: bench.updates == 1)
@@ -393,13 +393,13 @@ def test_unplugging_and_plugging_in_again(bench: Bench) -> None:
         wait_for(lambda: bench.updates == 2)
 
 
-def test_a_taken_port_is_named(bench: Bench) -> None:
+def test_a_taken_port_is_named(bench: ServedUnit) -> None:
     taken = bench.port("tcp_port")
     with pytest.raises(OSError, match=f"electronics.tcp_port = {taken}"):
         ElectronicsServer(bench.unit, PortsConfig(taken, -1, -1), lambda: None)
 
 
-def test_a_link_that_is_a_file_is_left_alone(bench: Bench, tmp_path: Path) -> None:
+def test_a_link_that_is_a_file_is_left_alone(bench: ServedUnit, tmp_path: Path) -> None:
     precious = tmp_path / "precious"
     precious.write_text("data")
     with pytest.raises(OSError, match="pty_link"):
