@@ -49,17 +49,21 @@ LONGEST = (
     "test_focus_controller_node",
     "test_interferometer_node",
     "test_driver_node",
+    "test_actuator_writer",
+    "test_electronics_contract",
 )
 #: Modules whose tests share nothing that takes long to make: a worker takes one test of them at a time. Of all others
 #: it takes the whole module.
 TEST_BY_TEST = frozenset(
     {
+        "test_actuator_writer",
         "test_autofocus_node",
         "test_calibration_faults",
         "test_calibration_node",
         "test_calibration_watch",
         "test_converge_action",
         "test_driver_node",
+        "test_electronics_contract",
         "test_faults_calibration",
         "test_faults_controller",
         "test_faults_driver",

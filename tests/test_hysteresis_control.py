@@ -31,6 +31,7 @@ def shape(*coefficients: float) -> Shape:
     return Shape(np.array([0.0, 0.0, 0.0, *coefficients]), np.zeros(4))
 
 
+@pytest.mark.slow
 def test_a_command_leads_where_it_was_asked_to(samples: Samples, tracker: HysteresisTracker) -> None:
     law, state = samples.hysteresis.law, tracker.state
     assert not tracker.unknown and state is not None
@@ -43,6 +44,7 @@ def test_a_command_leads_where_it_was_asked_to(samples: Samples, tracker: Hyster
         np.testing.assert_allclose(law.effective(state), wanted, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_signals_from_two_sides_differ(samples: Samples, tracker: HysteresisTracker) -> None:
     law, reached = samples.hysteresis.law, []
     for side in (-1.0, 1.0):
@@ -54,6 +56,7 @@ def test_signals_from_two_sides_differ(samples: Samples, tracker: HysteresisTrac
     assert np.mean(reached[1] - reached[0]) / 2.0 == pytest.approx(0.1, abs=0.04)
 
 
+@pytest.mark.slow
 def test_positions_creep_by_the_share_per_decade_of_the_mirror(samples: Samples) -> None:
     law = samples.hysteresis.law
     rested = law.demagnetised(37, 0.0)

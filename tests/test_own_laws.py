@@ -12,6 +12,8 @@ from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
 from linear_mirror import make_mirror
 
+pytestmark = pytest.mark.slow
+
 Floats = NDArray[np.float64]
 
 #: Relays of each actuator; one of them that flips moves it by a few 1e-6 of its range.
