@@ -97,7 +97,7 @@ def test_a_calibration_shows_progress_and_residual_and_is_used(page: Browser, sh
     page.press("Calibrate")
     page.wait_for("Step ", 30)
     wait_until(lambda: page.pictures("residual of"), 60, "residuals of the run")
-    assert page.find("Cancel calibration", "button").is_enabled()
+    wait_until(lambda: page.find("Cancel calibration", "button").is_enabled(), 10, "the button")
     page.shoot(shots / "console-calibrating.png")
     page.wait_for(": held-out residual ", 900)
     page.wait_for("Reachable ")

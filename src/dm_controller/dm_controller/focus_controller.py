@@ -89,7 +89,7 @@ class FocusController:
                 self.hold.end("another calibration is used")
             elif not before.planner.law.same_as(active.planner.law):
                 self.hold.end("the hysteresis model changed")
-            self.observer.use(active.planner.law, active.middle)
+            self.observer.use(active.planner.law, active.middle, active.planner.hysteresis is not None)
             self.active, self._at_rest = active, None
             effects.append(Log("info", f"using calibration {active.calibration.id} of {mirror.serial}"))
         except Refusal as refusal:

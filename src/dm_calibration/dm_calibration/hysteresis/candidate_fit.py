@@ -25,10 +25,10 @@ Rows = NDArray[np.bool_]
 
 #: Ridge on the weights, relative to their mean evidence: keeps neighbours alike where the data do not tell them apart.
 RIDGE = 1e-6
-#: Rounds of alternating solutions.
-ROUNDS = 6
-#: Creep that explains less than this many squared standard deviations of the maps is none.
-CREEP_SHOWN = 10.0
+#: Rounds of alternating solutions. With 6 a run of 100 maps predicts held-out ones three times worse; 60 gain nothing.
+ROUNDS = 20
+#: Creep that explains less than this share of what is left without it is none: slow drift of the figure looks like it.
+CREEP_SHOWN = 0.03
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class CandidateProblem:
             ftol=1e-6,
         )
         nonlinear, still = found.x, np.append(found.x[:-1], 0.0)
-        if np.square(residual(still)).sum() - 2.0 * found.cost < CREEP_SHOWN:
+        if 2.0 * found.cost > (1.0 - CREEP_SHOWN) * np.square(residual(still)).sum():
             nonlinear = still
         solved, left = self._solve(self._features(nonlinear), keep, weights[0])
         return LawFit(self.candidate, self._law(solved, nonlinear), left * self._scatter)

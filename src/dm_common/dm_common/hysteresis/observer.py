@@ -184,15 +184,16 @@ class HysteresisObserver:
         self._lock = threading.RLock()
         self.law = HysteresisModel.linear()
         self.latest: Applied | None = None
-        self._middle = 0.0
+        self._middle, self._identified = 0.0, True
         self._record: CreepRecord | None = None
         self._tracker = HysteresisTracker(self.law)
         self._log: deque[Applied] = deque(maxlen=LOG_LENGTH)
         self._observed: deque[Observed] = deque(maxlen=ESTIMATES_KEPT)
 
-    def use(self, law: HysteresisModel, middle: float) -> None:
-        """Follow another law, through all that was reported so far; a degauss ends at `middle`."""
+    def use(self, law: HysteresisModel, middle: float, identified: bool = True) -> None:
+        """Follow another law, or one for want of any, through all reports so far; a degauss ends at `middle`."""
         with self._lock:
+            self._identified = identified
             same = law.same_as(self.law) and middle == self._middle
             self.law, self._middle = law, middle
             if not same:
@@ -251,9 +252,9 @@ class HysteresisObserver:
         tracker = self._tracker
         if tracker.state is None or latest is None:
             return tracker.unknown
+        lost = "" if latest.history_known else tracker.unknown or "writes were lost, or a degauss is under way"
         if not self.law.remembers:
-            return ""
-        lost = "" if latest.history_known else "writes were lost, or a degauss is under way"
+            return "" if self._identified else lost
         return tracker.unknown or lost
 
     def estimate(self, now: float, slew_rate: float = np.inf) -> ActuatorEstimate:
