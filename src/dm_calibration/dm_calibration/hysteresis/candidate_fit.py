@@ -27,8 +27,9 @@ Rows = NDArray[np.bool_]
 RIDGE = 1e-6
 #: Rounds of alternating solutions. With 6 a run of 100 maps predicts held-out ones three times worse; 60 gain nothing.
 ROUNDS = 20
-#: Creep that explains less than this share of what is left without it is none: slow drift of the figure looks like it.
-CREEP_SHOWN = 0.03
+#: Creep that explains less than so many squared standard deviations of the maps is none, and, of actuators without
+#: hysteresis, less than this share of what is left without it: slow drift of the figure looks like it.
+CREEP_SHOWN, CREEP_SHARE = 10.0, 0.03
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,10 @@ class CandidateProblem:
             ftol=1e-6,
         )
         nonlinear, still = found.x, np.append(found.x[:-1], 0.0)
-        if 2.0 * found.cost > (1.0 - CREEP_SHOWN) * np.square(residual(still)).sum():
+        without, least = float(np.square(residual(still)).sum()), CREEP_SHOWN
+        if not (self.candidate.plays or slopes):
+            least = max(least, CREEP_SHARE * without)
+        if without - 2.0 * found.cost < least:
             nonlinear = still
         solved, left = self._solve(self._features(nonlinear), keep, weights[0])
         return LawFit(self.candidate, self._law(solved, nonlinear), left * self._scatter)
