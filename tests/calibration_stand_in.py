@@ -37,7 +37,7 @@ class StandIn:
         self.disturbed_at = ""
         self.on_label: dict[str, Callable[[], object]] = {}  # called as a map of the label is asked for
         self.on_degauss_done: Callable[[], object] | None = None
-        self.other: dict[str, Any] = {}  # what the maps tell of aperture and instrument, where not as usual
+        self.other: dict[str, Any] = {}  # what the maps say of aperture and instrument, where not as usual
         self.bump: dict[str, float] = {}  # tilt (m), shift_px, figure (m) of a mirror that was bumped
         self.driver_state, self.history_known = ActuatorState.STATE_ACTIVE, True
         self.turns, self.turned_at, self.written = 0, mirror.rest, node.get_clock().now()
@@ -108,7 +108,7 @@ class StandIn:
             response.zernike.radius = 10e-3
         if request.label in self.other_wavelength:
             response.zernike.wavelength = 635e-9
-        self.tell_instrument(response)
+        self.fill_instrument(response)
         response.info.file, response.info.sha256 = f"/maps/{request.label}.dat", "00"
         return response
 
@@ -116,8 +116,8 @@ class StandIn:
         response.error_code, response.message = ErrorCode.MAP_TIMEOUT, "no new file within 5 s"
         return response
 
-    def tell_instrument(self, response: Any) -> None:
-        """What the file would tell, and what a bump does to it."""
+    def fill_instrument(self, response: Any) -> None:
+        """What the file would say of the instrument, and what a bump does to it."""
         info, zernike = response.info, response.zernike
         info.instrument, info.pitch, info.width, info.height = "Verifire, serial 1", 25e-6, 944, 944
         info.centre_x = info.centre_y = 471.5

@@ -65,7 +65,7 @@ class StandIn:
         return response
 
 
-def mirror_info(x: NDArray[np.float64], y: NDArray[np.float64]) -> MirrorInfo:
+def mirror_info(x: NDArray[np.float64], y: NDArray[np.float64], radius: float = RADIUS) -> MirrorInfo:
     a, b = neighbour_pairs(x, y).T
     return MirrorInfo(
         name="MIRROR",
@@ -75,24 +75,24 @@ def mirror_info(x: NDArray[np.float64], y: NDArray[np.float64]) -> MirrorInfo:
         actuator_y=array("d", y),
         neighbour_a=array("I", a.tolist()),
         neighbour_b=array("I", b.tolist()),
-        working_aperture_diameter=2 * RADIUS,
+        working_aperture_diameter=2 * radius,
         signal_min=-1.0,
         signal_max=1.0,
         neighbour_difference_max=2.0,
     )
 
 
-def calibration(actuators: int) -> Calibration:
+def calibration(actuators: int, radius: float = RADIUS) -> Calibration:
     """Of random surfaces made of the 21 terms."""
-    points = edge_clustered_points(200)
+    points = edge_clustered_points(300)
     influence = np.random.default_rng(5).normal(size=(21, actuators)) * 1e-7
     sag = basis(points.x, points.y) @ influence
     return Calibration(
         id="c19",
         actuators=actuators,
         terms=21,
-        points=200,
-        aperture_radius=RADIUS,
+        points=300,
+        aperture_radius=radius,
         quality=Calibration.CALIBRATED,
         influence_zernike=array("d", influence.ravel()),
         zernike_offset=array("d", np.zeros(21)),
@@ -100,5 +100,5 @@ def calibration(actuators: int) -> Calibration:
         sample_y=array("d", points.y),
         sample_weight=array("d", points.weight),
         influence_sag=array("d", sag.ravel()),
-        sag_offset=array("d", np.zeros(200)),
+        sag_offset=array("d", np.zeros(300)),
     )

@@ -51,15 +51,7 @@ class Plant:
         self.maps += 1
         moved = self.gains * (self.position + self.drift * math.log10(max(self.time - self.began, 0.1)) * self.first)
         sag = MIRROR.sag(moved) + MIRROR.modes[:, 3] * self.disturb.get(self.maps, 0.0)
-        return Measurement(
-            points=MIRROR.points,
-            sag=sag,
-            coefficients=MIRROR.fit_terms(sag),
-            sigma=np.zeros(21),
-            stamp_ns=round(self.time * 1e9),
-            residual_rms=0.0,
-            valid_fraction=1.0,
-        )
+        return MIRROR.measurement(sag, round(self.time * 1e9), sigma=np.zeros(21), residual_rms=0.0, valid_fraction=1.0)
 
 
 @pytest.fixture(scope="module")

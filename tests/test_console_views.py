@@ -15,9 +15,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, MirrorInfo, SurfaceMapInfo, ZernikeCoefficients
 from matplotlib.image import imread
 
-from dm_common.geometry import hexagonal_positions, neighbour_pairs
+import console_stand_in
+from dm_common.geometry import hexagonal_positions
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_tools.console import status, view_models
 from dm_tools.console.charts.command_map import command_map, outlines
@@ -36,21 +36,7 @@ LAW = HysteresisModel(np.array([0.0, 0.1, 0.3]), np.array([[0.8], [0.1], [0.1]])
 
 
 def mirror_info() -> MirrorInfo:
-    x, y = hexagonal_positions(COUNT)
-    a, b = neighbour_pairs(x, y).T
-    return MirrorInfo(
-        name="T",
-        serial="1",
-        actuators=COUNT,
-        actuator_x=x.tolist(),
-        actuator_y=y.tolist(),
-        neighbour_a=a.tolist(),
-        neighbour_b=b.tolist(),
-        working_aperture_diameter=2 * RADIUS,
-        signal_min=-1.0,
-        signal_max=1.0,
-        neighbour_difference_max=2.0,
-    )
+    return console_stand_in.mirror_info(*hexagonal_positions(COUNT), RADIUS)
 
 
 def state(applied: list[float], **fields: Any) -> ActuatorState:
@@ -61,25 +47,8 @@ def state(applied: list[float], **fields: Any) -> ActuatorState:
 
 def calibration() -> tuple[Calibration, np.ndarray]:
     """A calibration whose surfaces are sums of the 21 terms, and its (21, N) influence."""
-    points = edge_clustered_points(300)
-    influence = np.random.default_rng(5).normal(size=(21, COUNT)) * 1e-7
-    terms = basis(points.x, points.y)
-    message = Calibration(
-        id="c1",
-        actuators=COUNT,
-        terms=21,
-        points=300,
-        aperture_radius=RADIUS,
-        quality=Calibration.CALIBRATED,
-        influence_zernike=influence.ravel().tolist(),
-        zernike_offset=np.zeros(21).tolist(),
-        sample_x=points.x.tolist(),
-        sample_y=points.y.tolist(),
-        sample_weight=points.weight.tolist(),
-        influence_sag=(terms @ influence).ravel().tolist(),
-        sag_offset=np.zeros(300).tolist(),
-    )
-    return message, influence
+    message = console_stand_in.calibration(COUNT, RADIUS)
+    return message, np.array(message.influence_zernike).reshape(21, COUNT)
 
 
 def map_of_terms(coefficients: np.ndarray, pixels: int = 300) -> tuple[np.ndarray, SurfaceMapInfo]:
@@ -264,9 +233,9 @@ def test_a_measured_way_comes_back_and_stays_inside() -> None:
 
 def test_the_change_of_an_effective_signal_is_read_off_two_maps() -> None:
     message, _ = calibration()
-    influence = np.array(message.influence_sag).reshape(300, COUNT)
+    influence = np.array(message.influence_sag).reshape(message.points, COUNT)
     x, y = np.array(message.sample_x), np.array(message.sample_y)
-    before = SimpleNamespace(x=x, y=y, sag=np.zeros(300))
+    before = SimpleNamespace(x=x, y=y, sag=np.zeros(message.points))
     after = SimpleNamespace(x=x, y=y, sag=0.37 * influence[:, 2] + 1e-6 + 3e-7 * x - 2e-7 * y)
     after.sag[5] = np.nan
     assert effective_change(before, after, message, 3) == pytest.approx(0.37)

@@ -22,7 +22,8 @@ FOLDER_MODULES_MAX = 12
 MODULE_LINES_MAX = 300
 #: A module shorter than this has more than one importer, or is one that something outside of Python starts.
 SMALL_MODULE_LINES = 40
-#: Modules that the focus controller's node may load of this project, __init__ counted too.
+#: Modules of this project that the focus controller's node may load at its start, __init__ counted too; what a request
+#: or an action imports later is not among them.
 NODE_MODULES_MAX = 45
 
 

@@ -59,7 +59,7 @@ class Stand:
     def replay(
         self, target: FocusTarget, effective: np.ndarray, state: HysteresisState
     ) -> tuple[float, HysteresisState]:
-        """Condition, go, wait 0.5 s: the largest coefficient error of the true surface, and the memory then."""
+        """Condition, go, wait 0.5 s: the largest coefficient error of the true surface, and the state then."""
         bench, law = self.bench, self.loop.law
         began = bench.time
         bench.degauss()
@@ -102,7 +102,7 @@ def test_what_was_built_makes_the_shape_again(stand: Stand) -> None:
 
 
 class LinearPlant:
-    """A linear mirror without memory whose gains differ from its calibration; each map has its own low-order error."""
+    """A linear mirror without hysteresis whose gains differ from its calibration; each map errs in low orders."""
 
     def __init__(self, noise: float = 0.0) -> None:
         self.mirror = LinearMirror(*hexagon())
@@ -134,15 +134,7 @@ class LinearPlant:
         sag = mirror.sag(self.gains * self.signals) + mirror.modes @ (
             self.noise * self.random.standard_normal(21) / TERM_RMS
         )
-        return Measurement(
-            points=mirror.points,
-            sag=sag,
-            coefficients=mirror.fit_terms(sag),
-            sigma=np.zeros(21),
-            stamp_ns=round(self.time * 1e9),
-            residual_rms=0.0,
-            valid_fraction=1.0,
-        )
+        return mirror.measurement(sag, round(self.time * 1e9), sigma=np.zeros(21), residual_rms=0.0, valid_fraction=1.0)
 
     def left(self, recipe: Recipe) -> float:
         """Largest coefficient error that the recipe truly leaves, m."""

@@ -42,7 +42,7 @@ def test_poke_check_tells_what_is_wired_wrongly(tmp_path: Path) -> None:
     ):
         client.wait_until_active()
         with pytest.raises(DeformableMirrorError) as found:
-            client.calibrate(Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKE_CHECK, skip_degauss=True))
+            client.calibrate(Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKE_CHECK))
     assert found.value.error_code == ErrorCode.POKE_CHECK_FAILED
     findings = " ".join(found.value.response.poke_findings)
     assert "3 and 7" in findings

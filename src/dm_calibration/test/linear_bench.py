@@ -11,7 +11,7 @@ from dm_calibration.procedure.recorded_run import Move
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
-from linear_mirror import RADIUS, LinearMirror
+from linear_mirror import LinearMirror
 
 Floats = NDArray[np.float64]
 
@@ -85,17 +85,9 @@ class LinearBench:
         if self.failing.get(label, 0) > 0:
             self.failing[label] -= 1
             raise MeasurementError(302, "no map within 5 s")
-        sag = self.sag()
-        measured = Measurement(
-            points=self.plant.points,
-            sag=sag,
-            coefficients=self.plant.fit_terms(sag),
-            sigma=np.full(21, 1e-10),
-            stamp_ns=self.clock_ns,
-            residual_rms=2e-9,
-            valid_fraction=0.98,
-            radius=RADIUS,
-            wavelength=632.8e-9,
+        measured = self.plant.measurement(
+            self.sag(),
+            self.clock_ns,
             file=f"{label}.dat",
             sha256="00",
             moved_ns=self.moves[-1].stamp_ns if self.moves else 0,

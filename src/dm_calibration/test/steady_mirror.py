@@ -14,7 +14,7 @@ from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
-from linear_mirror import RADIUS, LinearMirror, make_mirror
+from linear_mirror import LinearMirror, make_mirror
 
 Floats = NDArray[np.float64]
 
@@ -52,17 +52,7 @@ class SteadyMirror:
         """One map, `days` later; `bump` (m) is astigmatism that the mirror does not have."""
         self.clock_ns += 10**9 + round(days * 86400e9)
         sag = self.plant.sag(self.signals) + bump * self.plant.modes[:, 4]
-        return Measurement(
-            points=self.plant.points,
-            sag=sag,
-            coefficients=self.plant.fit_terms(sag),
-            sigma=np.full(21, 1e-10),
-            stamp_ns=self.clock_ns,
-            residual_rms=2e-9,
-            valid_fraction=0.98,
-            radius=RADIUS,
-            wavelength=632.8e-9,
-        )
+        return self.plant.measurement(sag, self.clock_ns)
 
     def settled(self) -> SettledState:
         """What stands at the mirror, as if it had just come."""
