@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import Run
-from dm_calibration.hysteresis.creep_uncertainty import SPECTRUM, creep_covariance
+from dm_calibration.hysteresis.creep_uncertainty import SPECTRUM, SPREAD, creep_covariance
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.responses import Responses
@@ -26,11 +26,11 @@ RESPONSE = 1e-6 * np.random.default_rng(5).standard_normal((12, COUNT))
 CREEPS = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES)
 
 
-def run_of(law: HysteresisModel, maps: int, noise: float = 2e-10, seed: int = 1) -> Run:
+def run_of(law: HysteresisModel, maps: int, noise: float = 2e-10, seed: int = 1, response: Floats = RESPONSE) -> Run:
     commands = excitation(MIRROR, maps)
     time = np.cumsum(0.5 + 0.5 * commands.settled + commands.dwell)
     effective, _ = follow(law, law.demagnetised(COUNT, 0.0), commands.signals, time)
-    values = effective @ RESPONSE.T + noise * np.random.default_rng(seed).standard_normal((maps, len(RESPONSE)))
+    values = effective @ response.T + noise * np.random.default_rng(seed).standard_normal((maps, len(response)))
     return Run(commands.signals, time, Responses(values, len(RESPONSE), np.ones(maps, dtype=bool)), 0.0)
 
 
@@ -49,6 +49,25 @@ def test_maps_tell_creep_of_their_own_age_and_leave_the_rest_to_the_prior() -> N
     assert (relative(each) < SPECTRUM).all()
     few, _ = creep_covariance(run_of(CREEPS, 80, noise=2e-9), CREEPS)
     assert (relative(few)[seconds] > sigma[seconds]).all()
+
+
+@pytest.mark.parametrize("dead", [1, 4])
+def test_a_dead_actuator_is_known_no_better_than_before_the_run(dead: int) -> None:
+    alive = np.ones(COUNT)
+    alive[:dead] = 0.0
+    run = run_of(CREEPS, 150, response=RESPONSE * alive)
+    each = creep_covariance(run, CREEPS)[1]
+    # A mean over actuators, of which the dead ones have what the prior gives.
+    assert (relative(each) > np.sqrt(dead / COUNT) * SPREAD * SPECTRUM).all()
+    assert (relative(each) < SPREAD * SPECTRUM).all()
+    assert np.linalg.eigvalsh(each).min() > 0.0
+
+
+def test_data_without_noise_are_believed_as_far_as_they_can_be() -> None:
+    covariance = creep_covariance(run_of(CREEPS, 150, noise=0.0), CREEPS)
+    assert np.isfinite(covariance).all()
+    for one in covariance:
+        assert np.linalg.eigvalsh(one).min() > 0.0
 
 
 def test_a_run_is_as_sure_of_creep_as_it_may_be() -> None:

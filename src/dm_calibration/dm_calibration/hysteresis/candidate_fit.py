@@ -27,6 +27,8 @@ Rows = NDArray[np.bool_]
 RIDGE = 1e-6
 #: Rounds of alternating solutions. With 6 a run of 100 maps predicts held-out ones three times worse; 60 gain nothing.
 ROUNDS = 20
+#: Least uncertainty of a response, m, that of data without noise.
+SCATTER_MIN = 1e-11
 #: Creep that explains less than so many squared standard deviations of the maps is none, and, of actuators without
 #: hysteresis, less than this share of what is left without it: slow drift of the figure looks like it.
 CREEP_SHOWN, CREEP_SHARE = 10.0, 0.03

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import Run
+from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Run
 from dm_calibration.hysteresis.features import PER_ELEMENT, creep_states, follow
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, starts_of
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 #: Prior standard deviation of the elements' weights relative to the mean rate, and their correlation over elements;
 #: that of a position, relative; the spread of both between actuators, relative to that.
 SPECTRUM, CORRELATION, POSITION, SPREAD = 0.6, 6.0, 0.03, 0.3
+#: An actuator whose gains are less than this share of the largest is dead.
+DEAD = 0.01
 #: The rate where a law has found less.
 RATE_MIN = 1e-3
 
@@ -53,7 +55,7 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     design = np.hstack((figure, (features[:, 0] + creep)[keep]))
     solution = np.linalg.lstsq(design, values[keep], rcond=1e-10)[0]
     left = values[keep] - design @ solution
-    scatter = np.sqrt(np.square(left).sum(axis=0) / max(len(left) - design.shape[1], 1))
+    scatter = np.maximum(np.sqrt(np.square(left).sum(axis=0) / max(len(left) - design.shape[1], 1)), SCATTER_MIN)
     scatter[: run.responses.coefficients] = np.median(scatter[: run.responses.coefficients])
     gains = solution[figure.shape[1] :] / scatter
     free = basis_of(figure)
@@ -65,8 +67,13 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     prior[0, 0], prior[1:, 1:] = POSITION**2, (SPECTRUM * rate) ** 2 * np.exp(-apart / CORRELATION)
     together = seen @ gains
     shared = np.linalg.inv(np.einsum("mjd,mkd->jk", together, together) + np.linalg.inv(prior))
-    # What one actuator shows beside all others, but for piston and tilt, which no response holds.
+    # What one actuator shows beside all others, but for piston and tilt, which no response holds; a dead one nothing.
+    # It takes the place of one of those three: it does not follow them, so the others show that pattern.
+    moves = np.linalg.norm(gains, axis=1)
+    alive = moves > DEAD * moves.max()
+    hidden = max(PISTON_TILT, int((~alive).sum()))
     size, axes = np.linalg.eigh(gains @ gains.T)
-    evidence = 1.0 / (np.square(axes[:, PISTON_TILT:]) / size[PISTON_TILT:]).sum(axis=1)
+    evidence = np.zeros(len(gains))
+    evidence[alive] = 1.0 / (np.square(axes[alive, hidden:]) / size[hidden:]).sum(axis=1)
     each = np.einsum("mjn,mkn,n->njk", seen, seen, evidence, optimize=True) + np.linalg.inv(SPREAD**2 * prior)
     return np.stack((shared, np.linalg.inv(each).mean(axis=0)))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, CandidateProblem, LawFit, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, SCATTER_MIN, Candidate, CandidateProblem, LawFit, Run
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.influence.regression import TooFewMapsError
 
@@ -150,6 +150,6 @@ def _scatter(run: Run, keep: Rows) -> Floats:
         left = CandidateProblem(run, richest, scatter).fit(keep, evaluations=4).residual[keep]
         # Robust: maps that no law explains must not set the scale.
         size = 1.4826 * np.median(np.abs(left), axis=0)
-        scatter = np.maximum(size, 1e-11)
-        scatter[: responses.coefficients] = max(float(np.median(size[: responses.coefficients])), 1e-11)
+        scatter = np.maximum(size, SCATTER_MIN)
+        scatter[: responses.coefficients] = max(float(np.median(size[: responses.coefficients])), SCATTER_MIN)
     return scatter

@@ -22,7 +22,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Run
+from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Candidate, LawFit, Run
 from dm_calibration.hysteresis.features import PER_ELEMENT, creep_states, fading_feature, play_values
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, starts_of
 from dm_common.hysteresis.duhem import DuhemOperator
@@ -180,7 +180,8 @@ class OwnLaws:
         """(D,) m, one value for all coefficients; maps that no law explains do not set it."""
         count, coefficients = len(residual), self.run.responses.coefficients
         freedom = max(count - self._figure.shape[1] - self._features.shape[2], 1)
-        scatter = np.maximum(MEDIAN_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0), 1e-11)
+        size = MEDIAN_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
+        scatter = np.maximum(size, SCATTER_MIN)
         scatter[:coefficients] = np.median(scatter[:coefficients])
         return np.asarray(scatter)
 
