@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dm_common.hysteresis.creep_record import CreepRecord, read_record, record_file, record_of, write_record
+from dm_common.hysteresis.creep_record import (
+    CreepRecord,
+    CreepRecorder,
+    read_record,
+    record_file,
+    record_of,
+    write_record,
+)
 from dm_common.hysteresis.model import CREEP_TIMES, UNSEEN, HysteresisModel
 from dm_common.hysteresis.observer import Applied, HysteresisObserver
 
@@ -38,22 +45,22 @@ def test_the_next_start_knows_what_was_held_for_a_day(tmp_path: Path) -> None:
     hours = np.searchsorted(CREEP_TIMES, 3600.0)
     assert (state.crept[:, hours:-1] > 0.2).all()
     assert state.crept[:, 0] == pytest.approx(-1.0)
-    assert state.doubt[0] == pytest.approx(UNSEEN)
-    assert state.doubt[hours + 1] < 0.3 * UNSEEN
+    assert state.crept_sigma[0] == pytest.approx(UNSEEN)
+    assert state.crept_sigma[hours + 1] < 0.3 * UNSEEN
 
     blind = HysteresisObserver()
     blind.use(LAW, 0.0)
     blind.observe(report(DAY + 600.0, -1.0))
     assert blind.state is not None
     assert (blind.state.crept == -1.0).all()
-    assert blind.state.doubt == pytest.approx(np.full(len(CREEP_TIMES), UNSEEN))
+    assert blind.state.crept_sigma == pytest.approx(np.full(len(CREEP_TIMES), UNSEEN))
 
 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
         ({"crept": np.zeros((3, 2))}, "do not fit together"),
-        ({"doubt": np.full(len(CREEP_TIMES), np.nan)}, "do not fit together"),
+        ({"crept_sigma": np.full(len(CREEP_TIMES), np.nan)}, "do not fit together"),
         ({"time": 1e6}, "was the clock set back"),
     ],
 )
@@ -86,3 +93,30 @@ def test_files_are_named_for_the_mirror(monkeypatch: pytest.MonkeyPatch) -> None
     assert record_file("", "a") is None
     assert record_file("~/.ros/focus_controller", "PDM 30/1") == Path("/var/ros/focus_controller/PDM-30-1.creep.npz")
     assert record_file("/srv", "..") == Path("/srv/mirror.creep.npz")
+
+
+def test_another_mirror_begins_with_its_own_record_and_no_reports(tmp_path: Path) -> None:
+    observer = HysteresisObserver()
+    observer.use(LAW, 0.0)
+    recorder = CreepRecorder(str(tmp_path), observer)
+    held = CreepRecord(10.0, CREEP_TIMES, np.full((3, len(CREEP_TIMES)), 0.5), np.zeros(len(CREEP_TIMES)))
+    write_record(tmp_path / "a.creep.npz", held)
+    (tmp_path / "c.creep.npz").write_bytes(b"torn")
+    observer.observe(report(20.0, 0.0))  # reports may come before who the mirror is
+    assert recorder.recall("a", 20.0) == ""
+    assert observer.state is not None and (observer.state.crept[:, -1] > 0.4).all()
+    assert recorder.recall("a", 30.0) == ""
+    for other in ("b", "c"):
+        failure = recorder.recall(other, 30.0)
+        assert ("c.creep.npz" in failure) == (other == "c")
+        assert observer.state is None
+        observer.observe(report(30.0, 0.0))
+        assert (observer.state.crept == 0.0).all()
+
+
+def test_a_clock_that_does_not_run_yet_refuses_no_record(tmp_path: Path) -> None:
+    file = tmp_path / "mirror.creep.npz"
+    record = CreepRecord(1e6, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
+    write_record(file, record)
+    found = read_record(file, 0.0)
+    assert found is not None and found.time == 1e6

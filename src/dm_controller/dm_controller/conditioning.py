@@ -98,12 +98,11 @@ class Conditioning:
             self.order, order.pending = None, False
         return waits
 
-    def answered(self, number: int, duration: float, now: float) -> None:
-        """The driver has answered run `number`, which took `duration` s, as done."""
-        run = self.run
-        if run is not None and run.number == number:
-            run.answered = now
-            self._learnt[run.steps] = duration
+    def answered(self, duration: float, now: float) -> None:
+        """The driver has answered the run under way, which took `duration` s, as done."""
+        if self.run is not None:
+            self.run.answered = now
+            self._learnt[self.run.steps] = duration
 
     def reported(self, monitor: DriverMonitor) -> bool:
         """Whether the driver has answered and reported the degauss as complete."""

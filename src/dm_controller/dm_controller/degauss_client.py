@@ -10,6 +10,7 @@ from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import answers_arrive
+from dm_controller.conditioning import Run
 from dm_controller.focus_types import StartDegauss
 
 
@@ -35,11 +36,16 @@ class DegaussClient:
     def start(self, run: StartDegauss) -> None:
         """Call the driver, or keep `run` until the driver has discovered the client: its answer would be lost."""
         self._waiting = run
-        self.retry()
+        self._call()
 
-    def retry(self) -> None:
-        """Call the driver for a run that is kept; to be asked now and then."""
-        if not answers_arrive(self._client, self._client.service_is_ready) or self._waiting is None:
+    def retry(self, run: Run | None) -> None:
+        """Call the driver for a run that is kept, if it is still the one under way; to be asked now and then."""
+        if self._waiting is not None and (run is None or run.number != self._waiting.number):
+            self._waiting = None  # given up: the mirror must not swing when a driver comes back
+        self._call()
+
+    def _call(self) -> None:
+        if self._waiting is None or not answers_arrive(self._client, self._client.service_is_ready):
             return
         number, steps = self._waiting
         self._waiting = None

@@ -7,7 +7,7 @@ out the effects in the order given.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from dm_msgs.msg import ActuatorState, FocusRequest
@@ -57,7 +57,7 @@ class FocusController:
         hold: corrects the shape that stands for creep.
         conditioning: a degauss on the way, and the order that waits for it.
         requests, refused: counts since the start.
-        degauss_offered: the driver offers the service `degauss`, as far as whoever drives this knows.
+        degauss_offered: asked whether the driver offers the service `degauss`.
         reserved: what has the mirror for itself, as a sentence; "" = nothing does.
     """
 
@@ -70,7 +70,7 @@ class FocusController:
         self._reported: tuple[object, ...] = ()  # what the last capabilities said of the driver
         self._at_rest: ActuatorEstimate | None = None  # what a mirror at rest holds until its next report
         self.requests = self.refused = 0
-        self.degauss_offered = False
+        self.degauss_offered: Callable[[], bool] = lambda: False
         self.reserved = ""
 
     # --- what is known ---
@@ -222,7 +222,7 @@ class FocusController:
 
     def _condition(self, order: Order, move: Move, now: Moment) -> list[Effect]:
         """Have the mirror degaussed before `order` is carried out, unless it is already."""
-        if not self.degauss_offered:
+        if not self.degauss_offered():
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "service degauss: pdm_driver does not offer it (yet)")
         self.hold.end("the mirror is conditioned")
         effects: list[Effect] = []
@@ -244,7 +244,7 @@ class FocusController:
             return []
         if refusal is not None:
             return self._degauss_ended(now, refusal)
-        self.conditioning.answered(number, duration, now.steady)
+        self.conditioning.answered(duration, now.steady)
         ended = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
         return [PublishCapabilities(), *ended]
 

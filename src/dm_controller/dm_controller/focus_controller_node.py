@@ -64,6 +64,7 @@ class FocusControllerNode(Node):
         self._focus_state = self.create_publisher(FocusState, "focus_state", qos.STATE)
         self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.LATCHED)
         self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
+        self._controller.degauss_offered = lambda: self._degauss.offered
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._recorder = CreepRecorder(values["state_folder"], self._controller.observer)
         self.create_timer(RECORD_PERIOD_S, self._keep_record, clock=steady)
@@ -93,13 +94,14 @@ class FocusControllerNode(Node):
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror, self._diagnostics.hardware_id = message, message.serial
-        with self.controller() as (_, now):
-            self._warn(self._recorder.recall(message.serial, now.time))
+        self._warn(self._recorder.recall(message.serial, 1e-9 * self.get_clock().now().nanoseconds))
         self._use()
 
     def _keep_record(self) -> None:
-        with self.controller() as (_, now):
-            self._warn(self._recorder.keep(now.time))
+        with self.controller() as (controller, now):
+            # Of a mirror that nobody reports of, the last record stands: what comes after it is in doubt.
+            record = None if controller.monitor.stopped(now.steady) else self._recorder.record(now.time)
+        self._warn(self._recorder.keep(record))
 
     def _warn(self, text: str) -> None:
         if text:
@@ -117,7 +119,6 @@ class FocusControllerNode(Node):
     def _on_actuator_state(self, message: ActuatorState) -> None:
         report = driver_report_from(message)
         with self.controller() as (controller, now):
-            controller.degauss_offered = self._degauss.offered
             self._do(controller.driver_report(report, now), now)
 
     def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
@@ -133,9 +134,8 @@ class FocusControllerNode(Node):
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):
-            controller.degauss_offered = self._degauss.offered
-            self._degauss.retry()
             self._do(controller.tick(now), now)
+            self._degauss.retry(controller.conditioning.run)
 
     def _degauss_ended(self, number: int, duration: float, refusal: Refusal | None) -> None:
         with self.controller() as (controller, now):

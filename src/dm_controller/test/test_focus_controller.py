@@ -117,7 +117,7 @@ class Bench:
 
     def __init__(self, **values: Any) -> None:
         self.controller = FocusController(VALUES | values)
-        self.controller.degauss_offered = True
+        self.controller.degauss_offered = lambda: True
         self.time = 1000.0
         self.signals, self.requested = np.zeros(ACTUATORS), np.zeros(0)
         self.turns = self.degausses = self.sequence = 0

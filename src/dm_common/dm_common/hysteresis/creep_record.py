@@ -25,13 +25,13 @@ class CreepRecord(NamedTuple):
         time: s, of the clock that commands are stamped with.
         creep_time: (J,) s, of the elements.
         crept: (N, J) effective signals that they have followed so far.
-        doubt: (J,) see :class:`~dm_common.hysteresis.model.HysteresisState`.
+        crept_sigma: (J,) see :class:`~dm_common.hysteresis.model.HysteresisState`.
     """
 
     time: float
     creep_time: Floats
     crept: Floats
-    doubt: Floats
+    crept_sigma: Floats
 
 
 def record_file(folder: str, serial: str) -> Path | None:
@@ -53,15 +53,20 @@ def write_record(file: Path, record: CreepRecord) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f"{file.name}.part")
     with part.open("wb") as stream:
-        np.savez(stream, time=record.time, creep_time=record.creep_time, crept=record.crept, doubt=record.doubt)
+        np.savez(
+            stream, time=record.time, creep_time=record.creep_time, crept=record.crept, crept_sigma=record.crept_sigma
+        )
     part.replace(file)
 
 
 def read_record(file: Path, now: float) -> CreepRecord | None:
     """The record in `file`; None when there is none.
 
+    Args:
+        now: s; 0 = not known, as before a simulator has told the time.
+
     Raises:
-        ValueError: it cannot be used, with the reason; `now` (s) is before it was written: the clock was set.
+        ValueError: it cannot be used, with the reason; `now` is before it was written: the clock was set.
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
@@ -70,13 +75,13 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
         return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file}: {error}: what was held before is not known") from error
-    time, creep_time, crept, doubt = values
-    whole = time.ndim == 0 and crept.ndim == 2 and crept.shape[1:] == creep_time.shape == doubt.shape
+    time, creep_time, crept, sigma = values
+    whole = time.ndim == 0 and crept.ndim == 2 and crept.shape[1:] == creep_time.shape == sigma.shape
     if not whole or not all(np.isfinite(value).all() for value in values):
         raise ValueError(f"{file}: its arrays do not fit together: what was held before is not known")
-    if float(time) > now:
+    if 0.0 < now < float(time):
         raise ValueError(f"{file}: written {float(time) - now:.0f} s from now: was the clock set back?")
-    return CreepRecord(float(time), creep_time, crept, doubt)
+    return CreepRecord(float(time), creep_time, crept, sigma)
 
 
 def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -> CreepRecord | None:
@@ -84,8 +89,7 @@ def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -
     if state is None or not law.creep_rate:
         return None
     state = law.advance(state, now)
-    doubt = state.doubt if state.doubt.size else np.zeros(len(law.creep_time))
-    return CreepRecord(state.time, law.creep_time, state.crept, doubt)
+    return CreepRecord(state.time, law.creep_time, state.crept, state.crept_sigma)
 
 
 class CreepRecorder:
@@ -96,24 +100,31 @@ class CreepRecorder:
 
     def __init__(self, folder: str, observer: HysteresisObserver) -> None:
         self._folder, self._observer = folder, observer
-        self._file: Path | None = None
+        self._serial: str | None = None
 
     def recall(self, serial: str, now: float) -> str:
-        """Go on from the record of the mirror `serial`, if there is one."""
-        before, self._file = self._file, record_file(self._folder, serial)
+        """Go on from the record of the mirror `serial`, if there is one; reports of another one are forgotten."""
+        if serial == self._serial:
+            return ""
+        another, self._serial = self._serial is not None, serial
+        file, record, failure = record_file(self._folder, serial), None, ""
         try:
-            if self._file is not None and self._file != before:
-                self._observer.recall(read_record(self._file, now))
+            record = read_record(file, now) if file is not None else None
         except ValueError as error:
-            return str(error)
-        return ""
+            failure = str(error)
+        self._observer.recall(record, another)
+        return failure
 
-    def keep(self, now: float) -> str:
-        """Put on disk what the actuators have crept to."""
-        record = record_of(self._observer.law, self._observer.state, now)
+    def record(self, now: float) -> CreepRecord | None:
+        """What is to be kept: see :func:`record_of`."""
+        return record_of(self._observer.law, self._observer.state, now)
+
+    def keep(self, record: CreepRecord | None) -> str:
+        """Put it on disk, if there is anything to keep."""
+        file = record_file(self._folder, self._serial) if self._serial is not None else None
         try:
-            if self._file is not None and record is not None:
-                write_record(self._file, record)
+            if file is not None and record is not None:
+                write_record(file, record)
         except OSError as error:
             return f"state_folder: {error}: the next start will not know of creep"
         return ""

@@ -46,7 +46,7 @@ class HysteresisState:
         fading: (N,) of the Duhem operator.
         position: (N,) static effective signal: hysteresis without creep.
         crept: (N, J) what the creep elements have followed so far.
-        doubt: (J,) standard deviation of that, in shapes of the whole range, where some were held unseen. Empty = none.
+        crept_sigma: (J,) its standard deviation, in shapes of the whole range: 0 but where some were held unseen.
     """
 
     time: float
@@ -55,7 +55,7 @@ class HysteresisState:
     fading: Floats
     position: Floats
     crept: Floats
-    doubt: Floats = field(default_factory=lambda: np.zeros(0))
+    crept_sigma: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,7 @@ class HysteresisModel:
         none = np.zeros(0)
         return cls(np.zeros(1), np.ones((1, 1)), none, 0.0, creep_rate, CREEP_TIMES if creep_rate else none)
 
-    @property
+    @cached_property
     def remembers(self) -> bool:
         """Whether the effective signal depends on anything but the signal."""
         return bool((self.play_radius > 0.0).any()) or bool(self.duhem_slope.size) or self.creep_rate > 0.0
@@ -169,6 +169,7 @@ class HysteresisModel:
             np.zeros(actuators),
             np.zeros(actuators),
             np.zeros((actuators, len(self.creep_time))),
+            np.zeros(len(self.creep_time)),
         )
         position = self._position(play, state.fading)
         return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
@@ -177,7 +178,7 @@ class HysteresisModel:
         """The state after a degauss that ended at `middle`; creep remembers what was before."""
         waited = self.advance(state, time)
         fresh = self.demagnetised(len(state.signals), waited.time, middle)
-        return replace(fresh, crept=waited.crept, doubt=waited.doubt)
+        return replace(fresh, crept=waited.crept, crept_sigma=waited.crept_sigma)
 
     def rested(
         self, signals: Floats, time: float, middle: float = 0.0, record: CreepRecord | None = None
@@ -189,15 +190,15 @@ class HysteresisModel:
         """
         moved = self.move(self.demagnetised(len(signals), time, middle), signals, time)
         settled = np.repeat(moved.position[:, None], len(self.creep_time), axis=1)
-        doubt = np.full(len(self.creep_time), UNSEEN)
+        sigma = np.full(len(self.creep_time), UNSEEN)
         if record is None or record.time > time or not np.array_equal(record.creep_time, self.creep_time):
             held = np.repeat(self.crept[:, None], len(self.creep_time), axis=1)
             record = CreepRecord(self.crept_at, self.creep_time, held, np.zeros(len(self.creep_time)))
         if record.crept.shape == settled.shape and time >= record.time:
             left = np.exp(-(time - record.time) / self.creep_time)
             settled += (record.crept - settled) * left
-            doubt = np.hypot(doubt * (1.0 - left), record.doubt * left)
-        return replace(moved, crept=settled, doubt=doubt)
+            sigma = np.hypot(sigma * (1.0 - left), record.crept_sigma * left)
+        return replace(moved, crept=settled, crept_sigma=sigma)
 
     def advance(self, state: HysteresisState, time: float) -> HysteresisState:
         """The same signals at a later time (s). A time before the state's is taken as the state's."""
@@ -208,7 +209,7 @@ class HysteresisModel:
             return replace(state, time=time)
         rest = np.exp(-elapsed / self.creep_time)
         crept = state.position[:, None] + (state.crept - state.position[:, None]) * rest
-        return replace(state, time=time, crept=crept, doubt=state.doubt * rest if state.doubt.size else state.doubt)
+        return replace(state, time=time, crept=crept, crept_sigma=state.crept_sigma * rest)
 
     def move(self, state: HysteresisState, signals: Floats, time: float) -> HysteresisState:
         """Wait until `time` (s), then go to `signals` (N,) on a straight way."""
@@ -272,8 +273,8 @@ class HysteresisModel:
         slope = np.where(2.0 * radius <= behind, slope, 0.0)
         smallest = np.cumsum(slope, axis=-1).min(axis=(-3, -2, -1))
         if self._duhem is not None:
-            low, high = self._duhem.slope_range
-            smallest = smallest + np.minimum(self.duhem_weight * low, self.duhem_weight * high)
+            least, most = self._duhem.slope_range
+            smallest = smallest + np.minimum(self.duhem_weight * least, self.duhem_weight * most)
         return float(np.min(smallest))
 
     def span(self) -> Floats:

@@ -90,7 +90,7 @@ class HysteresisTracker:
             # The figure of a calibration is relative to what the actuators had crept to, as it found.
             state = law.advance(self.state, law.crept_at)
             crept = np.repeat(law.crept[:, None], len(law.creep_time), axis=1)
-            self.state, self._set_off = replace(state, crept=crept, doubt=np.zeros(0)), None
+            self.state, self._set_off = replace(state, crept=crept, crept_sigma=np.zeros(len(law.creep_time))), None
         if report.time < self.state.time:
             # Hysteresis knows no time; creep stands still until the clock has caught up.
             self.state = replace(self.state, time=report.time)
@@ -199,10 +199,12 @@ class HysteresisObserver:
             if not same:
                 self.recall(self._record)
 
-    def recall(self, record: CreepRecord | None) -> None:
-        """Follow all that was reported so far anew, from what the actuators had crept to before."""
+    def recall(self, record: CreepRecord | None, another: bool = False) -> None:
+        """Follow all reports so far anew, from what the actuators had crept to before; or none, of `another` mirror."""
         with self._lock:
             self._record = record
+            if another:
+                self._log.clear()
             self._tracker = HysteresisTracker(self.law, self._middle, record)
             self._observed.clear()
             for report in list(self._log):
@@ -227,9 +229,7 @@ class HysteresisObserver:
             try:
                 self._track(report)
             except ValueError as error:
-                self._log.clear()
-                self._observed.clear()
-                self._tracker = HysteresisTracker(self.law, self._middle, self._record)
+                self.recall(self._record, another=True)
                 self._tracker.unknown = f"actuator_state: {error}"
                 raise
 

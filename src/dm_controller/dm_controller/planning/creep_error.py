@@ -19,9 +19,9 @@ IN_FIGURE_S = 200.0
 ONE, LARGEST = 1.96, 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)
-#: Share of creep that is known no better, of an element that a calibration of before told nothing of: by its time
+#: Share of creep that is known no better, of an element that the calibration says nothing of: by its time
 #: constant, s, below which and above which.
-UNTOLD_SHARE, UNTOLD_BELOW, UNTOLD_ABOVE = 0.5, 1.0, 300.0
+UNKNOWN_SHARE, UNKNOWN_BELOW, UNKNOWN_ABOVE = 0.5, 1.0, 300.0
 
 
 class CreepBound(NamedTuple):
@@ -48,7 +48,7 @@ class CreepError:
 
     def __init__(self, law: HysteresisModel, zernike: Floats, sag_root: Floats, whole: Floats) -> None:
         self._law = law
-        covariance = law.creep_covariance if law.creep_covariance.size else _untold(law)
+        covariance = law.creep_covariance if law.creep_covariance.size else _default_covariance(law)
         size, axes = np.linalg.eigh(covariance[0])
         root = axes * np.sqrt(np.maximum(size, 0.0))
         self._each = covariance[1]
@@ -80,8 +80,7 @@ class CreepError:
             features[:, :, 0] = 0.0
             features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
         shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
-        if state.doubt.size:
-            shared += np.square(self._unseen * (state.doubt * faded)[:, None]).sum(axis=2)
+        shared += np.square(self._unseen * (state.crept_sigma * faded)[:, None]).sum(axis=2)
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True) @ np.square(self._rows).T
         count = self._coefficients
         largest = ONE**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)
@@ -89,10 +88,10 @@ class CreepError:
         return CreepBound(float(np.sqrt(largest.max())), ONE * float(np.sqrt(rms.max())))
 
 
-def _untold(law: HysteresisModel) -> Floats:
-    """Covariances for a calibration that does not tell them: its gains hold what fast elements follow at once."""
+def _default_covariance(law: HysteresisModel) -> Floats:
+    """Covariances where the calibration holds none: its gains hold what fast elements follow at once."""
     time = law.creep_time
-    share = UNTOLD_SHARE * np.atleast_2d(law.creep_share).mean(axis=0)
-    rows = np.hstack((np.where(time < UNTOLD_BELOW, -1.0, 0.0)[:, None], np.eye(len(time))))
-    rows *= np.where((time < UNTOLD_BELOW) | (time > UNTOLD_ABOVE), share, 0.0)[:, None]
+    share = UNKNOWN_SHARE * np.atleast_2d(law.creep_share).mean(axis=0)
+    rows = np.hstack((np.where(time < UNKNOWN_BELOW, -1.0, 0.0)[:, None], np.eye(len(time))))
+    rows *= np.where((time < UNKNOWN_BELOW) | (time > UNKNOWN_ABOVE), share, 0.0)[:, None]
     return np.stack((rows.T @ rows, np.zeros((1 + len(time),) * 2)))
