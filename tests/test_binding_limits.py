@@ -33,7 +33,7 @@ def law(rng: np.random.Generator) -> HysteresisModel:
 
 def planner(difference: float, rng: np.random.Generator) -> Planner:
     mirror = CalibratedMirror(perfect_model(LinearMirror(*hexagon())), Limits(-1.0, 1.0, PAIRS, difference))
-    return Planner(mirror, HysteresisFigures(law(rng), np.full(21, 1e-10), 1e-9, 0.05), slew_rate=20.0)
+    return Planner(mirror, HysteresisFigures(law(rng), 1e-9, 0.05), slew_rate=20.0)
 
 
 def written(signals: Floats) -> Floats:

@@ -100,13 +100,13 @@ def test_what_was_held_unseen_widens_the_bound_until_it_has_faded() -> None:
 def test_a_degauss_does_not_make_old_creep_known() -> None:
     guessed = CREEPS.rested(np.zeros(COUNT), 0.0)
     after = CREEPS.degaussed(CREEPS.advance(guessed, 5.0), 10.0)
-    assert after.doubt[-1] == pytest.approx(UNSEEN, rel=1e-3)
-    assert after.doubt[0] < 1e-9
+    assert after.crept_sigma[-1] == pytest.approx(UNSEEN, rel=1e-3)
+    assert after.crept_sigma[0] < 1e-9
 
 
 def test_after_a_calibration_only_what_came_later_is_in_doubt() -> None:
     law = replace(CREEPS, crept_at=1000.0, crept=np.full(COUNT, 0.3))
-    soon, late = (law.rested(np.zeros(COUNT), 1000.0 + elapsed).doubt for elapsed in (60.0, 86_400.0))
+    soon, late = (law.rested(np.zeros(COUNT), 1000.0 + elapsed).crept_sigma for elapsed in (60.0, 86_400.0))
     assert soon[-1] < 1e-3
     assert late[-4] > 0.9 * UNSEEN
 

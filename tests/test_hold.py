@@ -35,7 +35,7 @@ class Shape:
         mirror = CalibratedMirror(
             perfect_model(LinearMirror(*hexagon())), Limits(-1.0, 1.0, make_mirror().limits.pairs, 2.0)
         )
-        self.planner = Planner(mirror, HysteresisFigures(law, np.full(21, 3e-10), 1e-9, 0.05))
+        self.planner = Planner(mirror, HysteresisFigures(law, 1e-9, 0.05))
         self.hold = CreepHold(DEFAULTS | dict(values))
         state = law.demagnetised(37, 0.0)
         move = self.planner.plan(FocusTarget(0.03), state, 0.0, known, ahead=0.05)

@@ -46,9 +46,7 @@ class Stand:
         hysteresis = calibration.hysteresis
         assert hysteresis is not None
         mirror = CalibratedMirror(influence_model(calibration.fit, calibration.aperture_radius), self.bench.limits)
-        figures = HysteresisFigures(
-            hysteresis.law, hysteresis.zernike_sigma, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma
-        )
+        figures = HysteresisFigures(hysteresis.law, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma)
         self.loop = Planner(mirror, figures)
         tracker = HysteresisTracker(hysteresis.law)
         for report in self.bench.reports:

@@ -72,7 +72,7 @@ def identified_law(name: str) -> HysteresisModel:
 
 def figures(law: HysteresisModel) -> HysteresisFigures:
     """What a calibration would say of `law`."""
-    return HysteresisFigures(law, np.full(len(TERMS), SIGMA), 1e-9, 0.05)
+    return HysteresisFigures(law, 1e-9, 0.05)
 
 
 def influence_model(actuators: int = 37) -> InfluenceModel:
@@ -127,7 +127,7 @@ def calibration(name: str, serial: str = SERIAL) -> Calibration:
     model, law = influence_model(), identified_law(name)
     known = figures(law)
     hysteresis = HysteresisFit(
-        name, law, known.zernike_sigma, known.held_out_max_zernike, known.unknown_sigma, MAPS, ()
+        name, law, np.full(len(TERMS), SIGMA), known.held_out_max_zernike, known.unknown_sigma, MAPS, ()
     )
     return Calibration(
         id=SERIAL,

@@ -70,5 +70,5 @@ def _variant(
         return Variant(name, Planner(mirror, slew_rate=bench.slew_rate), holds)
     # A law without creep was not what the held-out maps tested: then its influence function's own figure counts.
     held_out = hysteresis.held_out_max_zernike if hysteresis.law.creep_rate else fit.held_out_max_zernike
-    figures = HysteresisFigures(hysteresis.law, hysteresis.zernike_sigma, held_out, hysteresis.unknown_sigma)
+    figures = HysteresisFigures(hysteresis.law, held_out, hysteresis.unknown_sigma)
     return Variant(name, Planner(mirror, figures, bench.slew_rate), holds)

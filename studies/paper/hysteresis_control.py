@@ -68,7 +68,7 @@ class HysteresisControl:
     def __init__(self, samples: Samples, bench: SimulatedBench, solver: Solver) -> None:
         self._bench, self._solver, self._noise = bench, solver, samples.noise
         self._stored, found = samples.effective_maps, samples.hysteresis
-        figures = HysteresisFigures(found.law, found.zernike_sigma, found.held_out_max_zernike, found.unknown_sigma)
+        figures = HysteresisFigures(found.law, found.held_out_max_zernike, found.unknown_sigma)
         self._planner = Planner(CalibratedMirror(solver.model, bench.limits), figures, bench.slew_rate)
         self._tracker = HysteresisTracker(found.law)
         self._seen = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -109,6 +110,7 @@ def faults(
     long_run: SoakResult | None = None
     with tempfile.TemporaryDirectory(prefix="dm-faults-") as name, own_domain() as domain, progress_bar() as bar:
         folder = Path(name)
+        os.environ["ROS_HOME"] = name  # what nodes keep of these mirrors goes with them
         if chosen:
             task = bar.add_task("faults", total=len(chosen))
             records = run_faults(

@@ -33,7 +33,8 @@ class Laboratory:
 
     def __init__(self, domain: int, folder: Path) -> None:
         self.folder = folder
-        self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "OPENBLAS_NUM_THREADS": "1"}
+        own = {"ROS_DOMAIN_ID": str(domain), "ROS_HOME": str(self.folder), "OPENBLAS_NUM_THREADS": "1"}
+        self._environment = {**os.environ, **own}
         self._processes: dict[subprocess.Popen[bytes], Path] = {}
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)

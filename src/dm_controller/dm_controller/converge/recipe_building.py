@@ -31,7 +31,7 @@ from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag, t
 #: Limits that deny a larger coefficient, m, make a shape unreachable from the condition.
 DENIED_MAX = 2e-8
 #: Effective signals that limits deny count from here on.
-MISSED_MAX = 1e-3
+MISS_IGNORED = 1e-3
 #: Maps of a round go on until their mean is as sure as this share of the tolerance, but fewer do not tell their noise.
 SURE_SHARE, MAPS_MIN = 0.2, 3
 
@@ -145,7 +145,7 @@ class RecipeBuilder:
         self._options = options or BuildOptions()
         self._on_step, self._cancelled = on_step, cancelled
         limits, model = loop.mirror.limits, loop.mirror.model
-        self._middle = 0.5 * (limits.low + limits.high)
+        self._middle = limits.middle
         self._offset = Shape(model.zernike_offset, model.sag_offset)
         actuators = model.influence_zernike.shape[1]
         self.state = state if state is not None else loop.law.demagnetised(actuators, now(), self._middle)
@@ -173,7 +173,7 @@ class RecipeBuilder:
             maps += taken.maps
             if self._error(taken).max_zernike <= options.tolerance or maps + options.average > options.maps_max:
                 self._built.append((taken, maps))
-                return self.recipes[-1]
+                return self._recipe(taken, maps)
             aim = taken.aim
 
     @property
@@ -182,17 +182,19 @@ class RecipeBuilder:
 
         Figures are of each shape's last round, which judged signals found before it: so they flatter nothing.
         """
-        return tuple(
-            Recipe(
-                curvature=taken.target.curvature,
-                conic_constant=taken.target.conic_constant,
-                effective=self._solve(taken.target, taken.aim),
-                signals=taken.signals,
-                max_zernike=self._error(taken).max_zernike,
-                rms=rms_sag(self._error(taken), self._loop.mirror.model),
-                maps=maps,
-            )
-            for taken, maps in self._built
+        return tuple(self._recipe(taken, maps) for taken, maps in self._built)
+
+    def _recipe(self, taken: _Round, maps: int) -> Recipe:
+        """By all that was measured so far; `taken` is the last round of its shape, of `maps` in all."""
+        error = self._error(taken)
+        return Recipe(
+            curvature=taken.target.curvature,
+            conic_constant=taken.target.conic_constant,
+            effective=self._solve(taken.target, taken.aim),
+            signals=taken.signals,
+            max_zernike=error.max_zernike,
+            rms=rms_sag(error, self._loop.mirror.model),
+            maps=maps,
         )
 
     def _error(self, taken: _Round) -> Shape:
@@ -237,7 +239,7 @@ class RecipeBuilder:
             )
         if not plant.settle():
             raise Cancelled("cancelled while settling")
-        return applied, aim if abs(missed[worst]) <= MISSED_MAX else aim + missed
+        return applied, aim if abs(missed[worst]) <= MISS_IGNORED else aim + missed
 
     def _measure_round(self, target: FocusTarget, aim: Floats, before: int) -> _Round:
         model, law, options = self._loop.mirror.model, self._loop.law, self._options

@@ -19,7 +19,6 @@ from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.observer import Applied, HysteresisTracker
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import RecipeError
 from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
@@ -101,7 +100,7 @@ class RecipeRun:
             bench,
             now,
             options,
-            state=bench.host.hysteresis() or self._guess(planner.law, now()),
+            state=bench.host.hysteresis() or self._guess(planner.law, now(), active.middle),
             on_step=report,
             cancelled=bench.cancelled,
         )
@@ -173,14 +172,12 @@ class RecipeRun:
             finite = all(math.isfinite(curvature) for curvature in goal.curvatures)
             raise Refusal(ErrorCode.INVALID_ARGUMENT if finite else ErrorCode.NOT_FINITE, str(error)) from error
 
-    def _guess(self, law: HysteresisModel, now: float) -> HysteresisState | None:
+    def _guess(self, law: HysteresisModel, now: float, middle: float) -> HysteresisState | None:
         """The mirror long rested where the driver says it stands; None when it does not say."""
         state = self._bench.state
         if state is None or not len(state.applied) or not np.isfinite(state.applied).all():
             return None
-        tracker = HysteresisTracker(law)
-        tracker.observe(Applied(now, np.array(state.applied, dtype=float), 0, None, 0, False))
-        return tracker.state
+        return law.rested(np.array(state.applied, dtype=float), now, middle)
 
     def _stored(self, request: Any) -> tuple[int, str]:
         """What the calibration node answers: an ErrorCode and a sentence."""

@@ -194,4 +194,4 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
         value = getattr(hysteresis, name)
         if not (np.isfinite(value) and value >= 0.0):
             raise ValueError(f"hysteresis: {name} = {value:g}: must be finite and not negative")
-    return HysteresisFigures(law, sigma, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma)
+    return HysteresisFigures(law, hysteresis.held_out_max_zernike, hysteresis.unknown_sigma)

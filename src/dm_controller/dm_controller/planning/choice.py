@@ -131,7 +131,8 @@ def _best(target: FocusTarget, budget: float, context: PlanningContext, degauss:
             ways.append(recipe)
     except Refusal:
         pass  # none serves: the other ways remain
-    return min(ways, key=lambda way: way.plan.max_zernike_upper)
+    # One way needs no prediction before its command.
+    return ways[0] if len(ways) == 1 else min(ways, key=lambda way: way.plan.max_zernike_upper)
 
 
 def _after_degauss(target: FocusTarget, context: PlanningContext, degauss: Degauss, recipe: FoundRecipe | None) -> Move:

@@ -46,7 +46,6 @@ class HysteresisFigures:
     """What a calibration says of its hysteresis model; fields as in dm_msgs/ActuatorHysteresis."""
 
     law: HysteresisModel
-    zernike_sigma: Floats
     held_out_max_zernike: float
     unknown_sigma: float
 
@@ -152,31 +151,30 @@ class Planner:
 
             return Move(target, aim, aim, largest, known, travel + ahead, predict_linear)
         if state is None:
-            limits = mirror.limits
-            state, known = law.demagnetised(len(aim), time, 0.5 * (limits.low + limits.high)), False
+            state, known = law.demagnetised(len(aim), time, mirror.limits.middle), False
         # A move counts from its last write; older creep goes on during the way.
         begun, arrival = state, time + travel
         signals, missed = self._inverted(begun, arrival, aim, ahead, target if effective is None else None)
         reached = aim
         if missed is not None and np.abs(missed).max() > MISSED_MAX:
-            reached = aim - missed
             if effective is None:
+                reached = aim - missed
                 largest = mirror.predict(target, reached).max_zernike
             else:
                 denied = self._largest(missed)
                 largest, error = largest + denied, None if error is None else error + denied
 
         def predict() -> Plan:
-            plan = mirror.predict(target, reached if effective is None else aim)
+            plan = mirror.predict(target, reached)
             if error is not None:
-                plan = replace(plan, max_zernike=largest, max_zernike_upper=error)
+                plan = replace(plan, max_zernike=largest)
             creep = (0.0, 0.0)
             if law.creep_rate:
                 at = law.advance(begun, arrival)
                 creep = self._creep_error.bound(at, law.position_at(at, signals), ahead, error is not None)
             return self._bounded(plan, signals, known, creep, error)
 
-        return Move(target, signals, reached if effective is None else aim, largest, known, travel + ahead, predict)
+        return Move(target, signals, reached, largest, known, travel + ahead, predict)
 
     def _inverted(
         self, state: HysteresisState, arrival: float, aim: Floats, ahead: float, target: FocusTarget | None
