@@ -49,7 +49,8 @@ On the bench
   console    a web page of the bench, on the loopback
 
 On the simulation, with figures
-  compare    all solvers, open and closed loop, beside the fitting limit (--hysteresis: hysteresis and creep)
+  compare    all solvers, open and closed loop, beside the fitting limit (--hysteresis: hysteresis and creep;
+             --mirrors N: mirrors drawn at random)
   paper      the paper's tables and figures on one bench, as a page
   bench      how fast everything is, beside what one would use instead
   faults     faults injected into real processes: harm, loss, time to recover

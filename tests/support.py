@@ -15,7 +15,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from dm_tools.demo.demo_bench import bench_config
-from ros_fixtures import Observer, wait_until
+from ros_fixtures import Observer
+from waiting import wait_until
 
 __all__ = ["NodeProcess", "Observer", "bench_figures", "fast_bench", "wait_until"]
 

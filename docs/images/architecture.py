@@ -49,8 +49,8 @@ PACKAGES = (
     (4, 5, 2, 2, "dm_client"),
     (4, 5, 3, 3, "dm_autofocus"),
     (0, 5, 4, 4, "dm_bringup: launch files, configurations, registry of nodes"),
-    (0, 5, 5, 5, "dm_tools: command dm, console, recordings, generated documentation"),
-    (0, 5, 6, 6, "not installed: studies/ (comparison, benchmarks), tests/ (fault injection)"),
+    (0, 5, 5, 5, "dm_tools: command dm, console, recordings, security policies"),
+    (0, 5, 6, 6, "not installed: studies/ (comparison, benchmarks, generated pages), tests/ (fault injection)"),
 )
 #: Width of a column and height of a row of packages.
 COLUMN, ROW = 3.34, 0.68

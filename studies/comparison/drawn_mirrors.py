@@ -26,7 +26,7 @@ GAIN_STEP_SHARE = 0.002
 
 @dataclass(frozen=True)
 class DrawnMirror:
-    """A mirror and its fate.
+    """A mirror, and what happens to it after its calibration.
 
     Attributes:
         simulation: the mirror.

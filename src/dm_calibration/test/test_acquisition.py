@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +17,13 @@ from dm_calibration.acquisition.trigger import TriggerError, run_trigger
 from dm_calibration.map_files import MapFileError
 from dm_common.errors import ErrorCode, Refusal, error_code
 from map_fixtures import dat_bytes, disc_counts
+from waiting import wait_until
 
 MAP = dat_bytes(disc_counts(40))
 
 
 def python(code: str, *arguments: str) -> list[str]:
     return [sys.executable, "-S", "-c", code, *arguments]
-
-
-def wait_until(condition: Callable[[], Any], what: str) -> None:
-    deadline = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < deadline, f"not within a minute: {what}"
-        time.sleep(0.01)
 
 
 class WatchedFolder:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,20 +16,7 @@ from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import answers_arrive
-
-
-def wait_until(condition: Callable[[], Any], timeout_s: float = 60.0, what: str = "") -> Any:
-    """Return the first true value of `condition()`; fail the test when there is none in time.
-
-    What takes long is asked for ever more rarely, at least ten times a second, so that waiting costs little.
-    """
-    began = time.monotonic()
-    while (waited := time.monotonic() - began) < timeout_s:
-        value = condition()
-        if value:
-            return value
-        time.sleep(min(0.01 + 0.02 * waited, 0.1))
-    raise AssertionError(f"not within {timeout_s:g} s: {what or condition}")
+from waiting import wait_until
 
 
 class Observer:

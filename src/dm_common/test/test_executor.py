@@ -20,7 +20,8 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dm_common.ros.worker import WorkerActionServer, WorkerService
-from ros_fixtures import Observer, wait_until
+from ros_fixtures import Observer
+from waiting import wait_until
 
 NODE_SCRIPT = """
 import sys, time

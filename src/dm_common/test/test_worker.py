@@ -24,7 +24,8 @@ from dm_common.ros.worker import (
     never_silent,
     sleep,
 )
-from ros_fixtures import Observer, wait_until
+from ros_fixtures import Observer
+from waiting import wait_until
 
 
 def _longer(received: list[Any], count: int) -> bool:

@@ -11,7 +11,8 @@ from dm_msgs.srv import Degauss
 from dm_controller.conditioning import Run
 from dm_controller.degauss_client import DegaussClient
 from dm_controller.focus_types import StartDegauss
-from ros_fixtures import Observer, wait_until
+from ros_fixtures import Observer
+from waiting import wait_until
 
 
 @pytest.mark.parametrize("given_up", [True, False])
