@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode, MirrorInfo
-from dm_msgs.srv import Degauss, SetSignals
+from dm_msgs.srv import HoldMirror, SetSignals
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 
@@ -216,15 +217,54 @@ def test_set_signals_answers_when_the_shape_stands(driver: Driver) -> None:
 
 
 def test_degauss_makes_the_history_known(driver: Driver) -> None:
-    request = Degauss.Request(steps=6, end_signals=[0.1] * 37)
-    answer = driver.observer.call(Degauss, "degauss", request)
+    goal = Degauss.Goal(steps=6, end_signals=[0.1] * 37)
+    answer = driver.observer.run_goal(Degauss, "degauss", goal).result
     assert answer.error_code == ErrorCode.OK and answer.duration > 0
     state = driver.wait_for_state(lambda state: state.history_known and not state.moving, "history known")
     assert list(state.applied) == pytest.approx([0.1] * 37, abs=CODE)
     on_wire = signals_of(driver.unit.frames)
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
-    bad = driver.observer.call(Degauss, "degauss", Degauss.Request(amplitude=1.5))
+    bad = driver.observer.run_goal(Degauss, "degauss", Degauss.Goal(amplitude=1.5)).result
     assert bad.error_code == ErrorCode.OUT_OF_RANGE and "must be 0 to 1" in bad.message
+
+
+def test_a_degauss_has_feedback_and_a_bound_and_is_cancelled_to_the_shape_before(driver: Driver) -> None:
+    assert driver.set_signals(np.full(37, 0.25), wait=True).error_code == ErrorCode.OK
+    long = driver.observer.run_goal(Degauss, "degauss", Degauss.Goal(steps=9999)).result
+    assert long.error_code == ErrorCode.OUT_OF_RANGE and "degauss.duration_max" in long.message
+    feedback: list[Degauss.Feedback] = []
+    handle, result = driver.observer.send_goal(
+        Degauss, "degauss", Degauss.Goal(steps=2000), lambda message: feedback.append(message.feedback)
+    )
+    wait_until(lambda: len(feedback) > 2)
+    handle.cancel_goal_async()
+    wait_until(result.done)
+    cancelled = result.result().result
+    assert cancelled.error_code == ErrorCode.CANCELED and "back in the shape" in cancelled.message
+    assert feedback[-1].steps == 2000 and feedback[0].step < feedback[-1].step and feedback[-1].remaining > 30
+    state = driver.wait_for_state(lambda state: not state.moving, "rest")
+    assert list(state.applied) == pytest.approx([0.25] * 37, abs=CODE) and not state.history_known
+
+
+def test_one_owner_of_the_mirror_at_a_time(driver: Driver) -> None:
+    def hold(operation: int, holder: str = "calibration", **fields: Any) -> Any:
+        request = HoldMirror.Request(operation=operation, holder=holder, **fields)
+        return driver.observer.call(HoldMirror, "hold_mirror", request)
+
+    assert hold(HoldMirror.Request.HOLD, purpose="cancel calibrate to end it", lease=60.0).error_code == ErrorCode.OK
+    assert driver.set_signals(np.zeros(37), wait=True, holder="calibration").error_code == ErrorCode.OK
+    busy = driver.set_signals(np.full(37, 0.5))
+    assert busy.error_code == ErrorCode.BUSY and "cancel calibrate" in busy.message
+    degauss = driver.observer.run_goal(Degauss, "degauss", Degauss.Goal(steps=6)).result
+    assert degauss.error_code == ErrorCode.BUSY
+    driver.command(np.full(37, 0.5))
+    state = driver.wait_for_refusal(ErrorCode.BUSY, "actuator_command refused: calibration has held")
+    assert list(state.applied) == pytest.approx([0.0] * 37, abs=CODE) and state.holder == "calibration"
+    bad = driver.set_signals(np.full(37, 5.0), take_over=True)
+    assert bad.error_code == ErrorCode.OUT_OF_RANGE and driver.states[-1].holder == "calibration"
+    assert driver.set_signals(np.full(37, 0.5), wait=True, take_over=True).error_code == ErrorCode.OK
+    assert hold(HoldMirror.Request.RENEW).error_code == ErrorCode.PREEMPTED
+    driver.wait_for_state(lambda state: state.holder == "" and state.holding == "", "nobody holds it")
 
 
 def test_unit_unplugged_during_a_ramp_and_its_return(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:

@@ -5,6 +5,7 @@ The latest command wins. A move is cut into steps by the safety limiter and writ
 
 from __future__ import annotations
 
+import math
 import time
 
 from dm_common.errors import ErrorCode, Refusal
@@ -95,17 +96,28 @@ class ActuatorWriter(WriterThread):
                 return None
             return self.command(shape)
 
-    def degauss(self, amplitude: float, steps: int, end: Shape) -> Move:
+    def degauss(self, amplitude: float, steps: int, end: Shape, duration_max: float = math.inf) -> Move:
         """Run the decaying cycle about mid range, then go to `end` (checked, as for `command`).
 
         Args:
             amplitude: first half-swing; 0 = the largest inside the limits.
             steps: half-swings.
+            duration_max: s, longest time that it may take.
 
         Raises:
             Refusal: OUT_OF_RANGE, DRIVER_INACTIVE or ELECTRONICS_UNREACHABLE.
         """
-        return self._submit(degauss_move(self._limiter.limits, amplitude, steps, end))
+        return self._submit(degauss_move(self._limiter.limits, amplitude, steps, end, duration_max))
+
+    def turn_back(self, move: Move) -> Move | None:
+        """Leave `move` for the shape that was requested before it; None = something else was asked for since."""
+        with self._change:
+            if self._queue.newest is not move or move.before is None:
+                return None
+            back = Move(Kind.COMMAND, [move.before], move.before)
+            self._watchdog.feed(time.monotonic())
+            self._put(back)
+            return back
 
     def ramp_time(self, target: Shape) -> float:
         """Seconds that the slew limit needs from the present shape to `target`; 0 before the first write."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +13,8 @@ from dm_driver.safety_limiter import DriverLimits, Shape
 
 #: A degauss of at least this share of the full range leaves nothing of what was before.
 FULL_CYCLE = 0.999
+#: Most half-swings: smaller ones than these leave would be below a step of the electronics.
+STEPS_MAX = 10000
 
 
 def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: int, end: Shape) -> Iterator[Shape]:
@@ -33,7 +36,9 @@ def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: in
     yield end
 
 
-def degauss_move(limits: DriverLimits, amplitude: float, steps: int, end: Shape) -> Move:
+def degauss_move(
+    limits: DriverLimits, amplitude: float, steps: int, end: Shape, duration_max: float = math.inf
+) -> Move:
     """The decaying cycle about mid range, then the way to `end` (a legal shape).
 
     Args:
@@ -41,6 +46,7 @@ def degauss_move(limits: DriverLimits, amplitude: float, steps: int, end: Shape)
         amplitude: first half-swing; 0 = the largest inside the limits.
         steps: half-swings.
         end: (N,) signals to end in.
+        duration_max: s, longest time that it may take.
 
     Raises:
         Refusal: OUT_OF_RANGE.
@@ -49,9 +55,16 @@ def degauss_move(limits: DriverLimits, amplitude: float, steps: int, end: Shape)
     largest = limits.half_range
     if not 0.0 <= amplitude <= largest:
         raise Refusal(ErrorCode.OUT_OF_RANGE, f"amplitude = {amplitude:g}: must be 0 to {largest:g}")
-    if steps < 1:
-        raise Refusal(ErrorCode.OUT_OF_RANGE, f"steps = {steps}: must be at least 1")
+    if not 1 <= steps <= STEPS_MAX:
+        raise Refusal(ErrorCode.OUT_OF_RANGE, f"steps = {steps}: must be 1 to {STEPS_MAX}")
     swing = amplitude or largest
+    # The swings add up to steps * swing; the ways there and to the end are no longer than the whole range each.
+    duration = (steps * swing + 4.0 * largest) / limits.slew_rate
+    if not duration <= duration_max:
+        raise Refusal(
+            ErrorCode.OUT_OF_RANGE,
+            f"steps = {steps}: would take {duration:.0f} s, must be at most {duration_max:g} s (degauss.duration_max)",
+        )
     waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)
     # A smaller cycle leaves what wider swings have written.
-    return Move(Kind.DEGAUSS, waypoints, end, wipes=swing >= FULL_CYCLE * largest)
+    return Move(Kind.DEGAUSS, waypoints, end, wipes=swing >= FULL_CYCLE * largest, steps=steps, duration=duration)

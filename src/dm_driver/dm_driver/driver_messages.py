@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles, time_message
+from dm_driver.commands.mirror_hold import MirrorHold
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Kind, WriterState
 
@@ -29,10 +30,11 @@ def driver_state(state: WriterState) -> int:
     return int(ActuatorState.STATE_ACTIVE if state.enabled else ActuatorState.STATE_INACTIVE)
 
 
-def unconfigured_message(frame_id: str, refusal: Refusal | None) -> ActuatorState:
+def unconfigured_message(frame_id: str, refusal: Refusal | None, hold: MirrorHold) -> ActuatorState:
     """The state of a driver that has no valid configuration."""
     message = ActuatorState(driver_state=ActuatorState.STATE_UNCONFIGURED)
     message.header.frame_id = frame_id
+    message.holder, message.holding = hold.holder, hold.sentence
     _set_error(message, refusal)
     return message
 
@@ -43,12 +45,17 @@ def _set_error(message: ActuatorState, refusal: Refusal | None) -> None:
 
 
 def state_message(
-    state: WriterState, refusal: Refusal | None, configuration: DriverConfiguration, frame_id: str
+    state: WriterState,
+    refusal: Refusal | None,
+    configuration: DriverConfiguration,
+    frame_id: str,
+    hold: MirrorHold,
 ) -> ActuatorState:
     """The state of a configured driver; `refusal` of the last command, None when it was carried out."""
     message = ActuatorState(driver_state=driver_state(state))
     message.header.frame_id = frame_id
     message.header.stamp = time_message(state.stamp_ns)
+    message.holder, message.holding = hold.holder, hold.sentence
     message.sequence = state.sequence
     message.moving = state.moving is not None
     message.history_known = state.history_known

@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from dm_common.ros.parameters import REQUIRED, Parameter, real, reals, switch, text, whole, wholes
+from dm_driver.degauss import STEPS_MAX
 from dm_driver.electronics import BACK_ENDS
 from dm_driver.electronics.check_sums import CHECK_SUMS
 from dm_driver.electronics.frame_format import BYTE_ORDERS, MOST_BITS, MOST_WORD_BITS, PARITIES, FrameFormat
@@ -134,5 +135,11 @@ PARAMETERS: Final = (
         "Empty = keep nothing.",
     ),
     Parameter("safe_signals", reals([], -1.0, 1.0), "The safe shape; empty = all -1 (volts.min)."),
-    Parameter("degauss.steps", whole(100, 1, 10000), "Half-swings of a degauss."),
+    Parameter("degauss.steps", whole(100, 1, STEPS_MAX), "Half-swings of a degauss."),
+    Parameter(
+        "degauss.duration_max",
+        real(180.0, 1.0, 3600.0, "s"),
+        "Longest degauss: goals that would take longer are refused.",
+        live=True,
+    ),
 )

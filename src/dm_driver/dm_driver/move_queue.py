@@ -49,7 +49,7 @@ class MoveQueue:
         if self.pending is not None:
             self.pending.finish(Outcome.SUPERSEDED)
         self.pending = move
-        self.requested = move.target
+        move.before, self.requested = self.requested, move.target
 
     def begin(self, move: Move, shape: Shape, applied: Shape | None) -> None:
         """Leave the current move for `move`.
@@ -65,7 +65,7 @@ class MoveQueue:
                 self._turn(applied)
         self.current = move
         self.requested = move.target
-        self._steps = self._limiter.path(shape, move.waypoints)
+        self._steps = self._limiter.path(shape, move.way())
         self.next_shape = next(self._steps)
         self.under_way = False
         if move.kind is Kind.DEGAUSS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 
@@ -38,15 +38,35 @@ class Move:
         waypoints: shapes to pass; straight lines between them.
         target: the last of them.
         wipes: a degauss over the full range, which wipes the hysteresis.
+        steps, duration: of a degauss: its half-swings, and how long they take, s.
+        begun: waypoints that the mirror is past, or on its way to.
+        before: (N,) where the last accepted move led when this one was put in its place; None before the first.
     """
 
-    def __init__(self, kind: Kind, waypoints: Iterable[Shape], target: Shape, wipes: bool = False) -> None:
+    def __init__(
+        self,
+        kind: Kind,
+        waypoints: Iterable[Shape],
+        target: Shape,
+        wipes: bool = False,
+        steps: int = 0,
+        duration: float = 0.0,
+    ) -> None:
         self.kind = kind
         self.wipes = wipes
         self.waypoints = waypoints
         self.target = target
+        self.steps, self.duration = steps, duration
+        self.begun = 0
+        self.before: Shape | None = None
         self._ended = threading.Event()
         self._outcome: Outcome | None = None
+
+    def way(self) -> Iterator[Shape]:
+        """The waypoints, counted as they are begun."""
+        for waypoint in self.waypoints:
+            self.begun += 1
+            yield waypoint
 
     def wait(self, timeout_s: float | None = None) -> Outcome | None:
         """Wait for the end; None when it has not come in time."""

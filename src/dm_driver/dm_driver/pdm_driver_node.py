@@ -10,13 +10,14 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
-from dm_msgs.srv import Degauss, SetSignals
+from dm_msgs.srv import Degauss as DegaussService
+from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -25,8 +26,11 @@ from rclpy.time import Time
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import diagnostics, parameters, qos
 from dm_common.ros.executor import run_node
-from dm_common.ros.worker import WorkerService
+from dm_common.ros.worker import WorkerService, never_silent
 from dm_driver.actuator_writer import ActuatorWriter
+from dm_driver.commands.command_gate import CommandGate
+from dm_driver.commands.degauss_action import CODE_OF_OUTCOME, DegaussAction
+from dm_driver.commands.mirror_hold import MirrorHold
 from dm_driver.driver_configuration import DriverConfiguration, build_configuration
 from dm_driver.driver_health import driver_health
 from dm_driver.driver_messages import mirror_info_message, state_message, unconfigured_message
@@ -38,12 +42,6 @@ from dm_driver.moves import Move, Outcome, WriterState
 STATE_INTERVAL_S = 0.02
 #: Time for the electronics beyond what a ramp takes.
 MARGIN_S = 2.0
-
-_CODE_OF_OUTCOME = {
-    Outcome.SUPERSEDED: ErrorCode.PREEMPTED,
-    Outcome.LINK_LOST: ErrorCode.ELECTRONICS_UNREACHABLE,
-    Outcome.STOPPED: ErrorCode.DRIVER_INACTIVE,
-}
 
 
 class PdmDriverNode(LifecycleNode):
@@ -58,19 +56,20 @@ class PdmDriverNode(LifecycleNode):
         except (parameters.ParameterError, ParameterException) as error:
             self._problem = str(error)
         self._frame_id: str = self._values.get("frame_id", "mirror")
-        self._configuration: DriverConfiguration | None = None
-        self._writer: ActuatorWriter | None = None
-        self._refused: Counter[str] = Counter()
-        # Guards refusal and publishing: state leaves the executor's, the writer's and the services' threads.
+        self._hold = MirrorHold(time.monotonic)
+        self._gate = CommandGate(self._hold, self._on_gate)
+        # Guards publishing: state leaves the executor's, the writer's and the services' threads.
         self._state_lock = threading.Lock()
-        self._refusal: Refusal | None = None  # of the last command, or of the configuration
         self._published_at = 0.0
         # Plain publishers: the state must be seen in every lifecycle state.
         self._state_publisher = self.create_publisher(ActuatorState, "actuator_state", qos.STATE)
         self._info_publisher = self.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
         self.create_subscription(ActuatorCommand, "actuator_command", self._on_command, qos.COMMAND)
         WorkerService(self, SetSignals, "set_signals", self._on_set_signals)
-        WorkerService(self, Degauss, "degauss", self._on_degauss)
+        WorkerService(self, DegaussService, "degauss", self._on_degauss)
+        DegaussAction(self, self._begin_degauss)
+        answer = never_silent(self, "hold_mirror", self._on_hold_mirror)
+        self.create_service(HoldMirror, "hold_mirror", answer, qos_profile=qos.SERVICE)
         self._diagnostics = diagnostics.Diagnostics(
             self, f"{self._values.get('mirror.name', '?')} {self._values.get('mirror.serial', '?')}", self._health
         )
@@ -95,11 +94,12 @@ class PdmDriverNode(LifecycleNode):
             configuration = build_configuration(self._values)
         except ValueError as error:
             self.get_logger().error(f"configuration refused: {error}")
-            self._report(Refusal(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {error}"))
+            self._gate.refusal = Refusal(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {error}")
+            self._publish_state()
             return TransitionCallbackReturn.FAILURE
-        self._configuration = configuration
-        self._refusal = None
-        self._writer = ActuatorWriter(
+        self._gate.configuration = configuration
+        self._gate.refusal = None
+        self._gate.writer = ActuatorWriter(
             configuration.make_electronics(),
             configuration.output,
             configuration.limiter,
@@ -109,8 +109,8 @@ class PdmDriverNode(LifecycleNode):
             stamp_ns=lambda: int(self.get_clock().now().nanoseconds),
             last=self._last_shape(configuration),
         )
-        self._writer.start()
-        self._writer.wait_for_link(self._values["electronics.timeout"])
+        self._gate.writer.start()
+        self._gate.writer.wait_for_link(self._values["electronics.timeout"])
         self._info_publisher.publish(
             mirror_info_message(self._values, configuration, self._frame_id, self.get_clock().now().to_msg())
         )
@@ -129,9 +129,9 @@ class PdmDriverNode(LifecycleNode):
             return LastShape(None, actuators)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        writer = self._writer
+        writer = self._gate.writer
         assert writer is not None
-        self._refusal = None
+        self._gate.refusal = None
         if writer.enable(MARGIN_S if writer.state().link_up else 0.0):
             self.get_logger().info("active; the mirror stands in the safe shape")
         else:
@@ -164,7 +164,7 @@ class PdmDriverNode(LifecycleNode):
         self._release("end of the process")
 
     def _to_safe_shape(self, occasion: str) -> None:
-        writer, configuration = self._writer, self._configuration
+        writer, configuration = self._gate.writer, self._gate.configuration
         if writer is None or configuration is None or not writer.state().enabled:
             return
         ramp_time = writer.ramp_time(configuration.safe_shape)
@@ -179,7 +179,7 @@ class PdmDriverNode(LifecycleNode):
 
     def _release(self, occasion: str) -> None:
         self._to_safe_shape(occasion)
-        writer, self._writer, self._configuration = self._writer, None, None
+        writer, self._gate.writer, self._gate.configuration = self._gate.writer, None, None
         if writer is not None and not writer.stop():
             self.get_logger().error(f"{occasion}: the electronics' thread hangs; it ends with the process")
         self._publish_state()
@@ -194,7 +194,7 @@ class PdmDriverNode(LifecycleNode):
             shape = configuration.limiter.check_shape(message.signals)
             return writer.correct(shape, message.expected_turns) if message.expected_turns else writer.command(shape)
 
-        self._attempt("actuator_command", carry_out)
+        self._gate.attempt("actuator_command", message, carry_out)
 
     def _on_set_signals(self, request: Any, response: Any) -> Any:
         def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move | None:
@@ -202,47 +202,53 @@ class PdmDriverNode(LifecycleNode):
             response.ramp_time = writer.ramp_time(target)
             return None if request.dry_run else writer.command(target)
 
-        self._answer(response, self._attempt("set_signals", carry_out, dry_run=request.dry_run), wait=request.wait)
-        writer = self._writer
+        result = self._gate.attempt("set_signals", request, carry_out, dry_run=request.dry_run)
+        self._answer(response, result, wait=request.wait)
+        writer = self._gate.writer
         if writer is not None and (applied := writer.state().applied) is not None:
             response.applied.frombytes(applied.tobytes())
         return response
 
-    def _on_degauss(self, request: Any, response: Any) -> Any:
+    def _begin_degauss(self, goal: Any) -> tuple[ActuatorWriter, Move] | Refusal:
+        """The move of a goal, which has begun; or its refusal."""
+        used: list[ActuatorWriter] = []
+
         def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
             limits = configuration.limiter.limits
             middle = np.full(limits.actuators, limits.middle)
-            end = configuration.limiter.check_shape(request.end_signals or middle, "end_signals")
-            return writer.degauss(request.amplitude, request.steps or self._values["degauss.steps"], end)
+            end = configuration.limiter.check_shape(goal.end_signals or middle, "end_signals")
+            used.append(writer)
+            steps, longest = goal.steps or self._values["degauss.steps"], self._values["degauss.duration_max"]
+            return writer.degauss(goal.amplitude, steps, end, longest)
 
+        move = self._gate.attempt("degauss", goal, carry_out)
+        assert move is not None
+        return move if isinstance(move, Refusal) else (used[0], move)
+
+    def _on_degauss(self, request: Any, response: Any) -> Any:
         begun = time.monotonic()
-        self._answer(response, self._attempt("degauss", carry_out), wait=True)
+        goal = Degauss.Goal(amplitude=request.amplitude, steps=request.steps, end_signals=request.end_signals)
+        move = self._begin_degauss(goal)
+        self._answer(response, move if isinstance(move, Refusal) else move[1], wait=True)
         response.duration = time.monotonic() - begun
         return response
 
-    def _attempt(
-        self,
-        source: str,
-        carry_out: Callable[[ActuatorWriter, DriverConfiguration], Move | None],
-        dry_run: bool = False,
-    ) -> Move | Refusal | None:
-        """Carry out a request, or return and report its refusal. A refused dry run is the caller's business only."""
-        writer, configuration = self._writer, self._configuration
-        if not dry_run:
-            self._refusal = None  # before the writer's thread publishes the first write
+    def _on_hold_mirror(self, request: Any, response: Any) -> Any:
+        before = self._hold.holder
         try:
-            if writer is None or configuration is None:
-                raise Refusal(
-                    ErrorCode.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first"
-                )
-            move = carry_out(writer, configuration)
-        except Refusal as refusal:
-            if not dry_run:
-                self._refused[ErrorCode(refusal.error_code).name] += 1
-                self.get_logger().warning(f"{source} refused: {refusal}", throttle_duration_sec=1.0)
-                self._report(Refusal(refusal.error_code, f"{source} refused: {refusal}", refusal.actuators))
-            return refusal
-        return move
+            self._hold.ask(request.operation, request.holder, request.purpose, request.duration, request.lease)
+            response.message = self._hold.sentence or "nobody holds the mirror"
+        finally:
+            response.holder = self._hold.holder
+            if response.holder != before:
+                self.get_logger().info(self._hold.sentence or f"{before} has given the mirror back")
+                self._publish_state()
+        return response
+
+    def _on_gate(self, text: str) -> None:
+        """A command was refused, or took the mirror over."""
+        self.get_logger().warning(text, throttle_duration_sec=1.0)
+        self._publish_state()
 
     @staticmethod
     def _answer(response: Any, result: Move | Refusal | None, wait: bool) -> None:
@@ -251,7 +257,7 @@ class PdmDriverNode(LifecycleNode):
         elif result is not None and wait:
             outcome = result.wait()
             if outcome is not None and outcome is not Outcome.REACHED:
-                response.error_code, response.message = _CODE_OF_OUTCOME[outcome], outcome.value
+                response.error_code, response.message = CODE_OF_OUTCOME[outcome], outcome.value
 
     # State
 
@@ -262,24 +268,20 @@ class PdmDriverNode(LifecycleNode):
         if edge or time.monotonic() - self._published_at >= STATE_INTERVAL_S:
             self._publish_state()
 
-    def _report(self, refusal: Refusal) -> None:
-        self._refusal = refusal
-        self._publish_state()
-
     def _publish_state(self) -> None:
         with self._state_lock:
             if not self.context.ok():  # on the way out nobody is left to publish to
                 return
-            writer, configuration = self._writer, self._configuration
+            gate, writer, configuration = self._gate, self._gate.writer, self._gate.configuration
             if writer is None or configuration is None:
-                message = unconfigured_message(self._frame_id, self._refusal)
+                message = unconfigured_message(self._frame_id, gate.refusal, self._hold)
             else:
-                message = state_message(writer.state(), self._refusal, configuration, self._frame_id)
+                message = state_message(writer.state(), gate.refusal, configuration, self._frame_id, self._hold)
             self._state_publisher.publish(message)
             self._published_at = time.monotonic()
 
     def _health(self) -> diagnostics.Health:
-        return driver_health(self._writer, self._refusal, self._refused)
+        return driver_health(self._gate.writer, self._gate.refusal, self._gate.refused)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -69,7 +69,8 @@ _DECLARED = (
         "pdm_driver",
         publish=(*_HEALTH, "actuator_state", "mirror_info"),
         subscribe=("actuator_command",),
-        reply=("degauss", "set_signals"),
+        reply=("degauss", "hold_mirror", "set_signals"),
+        execute=("degauss",),
     ),
     NodeInterface(
         "interferometer",

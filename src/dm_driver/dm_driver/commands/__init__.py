@@ -1,0 +1,1 @@
+"""Who may command the mirror, and the requests that take a while."""

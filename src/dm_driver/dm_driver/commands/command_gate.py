@@ -1,0 +1,70 @@
+"""What every command passes on its way to the writer: is the driver configured, who holds the mirror. Knows no ROS."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_driver.actuator_writer import ActuatorWriter
+from dm_driver.commands.mirror_hold import MirrorHold
+from dm_driver.driver_configuration import DriverConfiguration
+from dm_driver.moves import Move
+
+
+class CommandGate:
+    """Carries out what may be carried out, and keeps what was refused last.
+
+    Args:
+        hold: who holds the mirror.
+        report: called after each refusal, and when the mirror was taken over, with a line for the log.
+
+    Attributes:
+        writer, configuration: of the configured driver; None = it is not.
+        refusal: of the last command, or of the configuration; None = it was carried out.
+        refused: number of refused commands by the name of their code.
+    """
+
+    def __init__(self, hold: MirrorHold, report: Callable[[str], None]) -> None:
+        self.hold, self._report = hold, report
+        self.writer: ActuatorWriter | None = None
+        self.configuration: DriverConfiguration | None = None
+        self.refusal: Refusal | None = None
+        self.refused: Counter[str] = Counter()
+
+    def attempt(
+        self,
+        source: str,
+        request: Any,
+        carry_out: Callable[[ActuatorWriter, DriverConfiguration], Move | None],
+        dry_run: bool = False,
+    ) -> Move | Refusal | None:
+        """Carry out a request, or return and report its refusal. A refused dry run is the caller's business only.
+
+        Args:
+            source: what the request came by, for the log.
+            request: its fields `holder` and, where it has one, `take_over` are judged here.
+        """
+        writer, configuration = self.writer, self.configuration
+        if not dry_run:
+            self.refusal = None  # before the writer's thread publishes the first write
+        try:
+            if writer is None or configuration is None:
+                raise Refusal(
+                    ErrorCode.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first"
+                )
+            takes_over = not dry_run and self.hold.check(request.holder, getattr(request, "take_over", False))
+            move = carry_out(writer, configuration)
+            if takes_over:
+                holder = self.hold.holder
+                self.hold.evict(request.holder)
+                self._report(f"{source} of {request.holder or 'nobody in particular'} took the mirror from {holder}")
+            return move
+        except Refusal as refusal:
+            if not dry_run:
+                self.refused[ErrorCode(refusal.error_code).name] += 1
+                text = f"{source} refused: {refusal}"
+                self.refusal = Refusal(refusal.error_code, text, refusal.actuators)
+                self._report(text)
+            return refusal

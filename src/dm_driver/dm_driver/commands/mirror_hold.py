@@ -1,0 +1,123 @@
+"""One owner of the mirror at a time: who holds it, and what everybody else hears meanwhile. Knows no ROS.
+
+A calibration that a stray focus request moves the mirror under is lost. So whoever needs the mirror for a while holds
+it: commands of others are refused, with a sentence that says who holds it, for how long, and how to end that. A hold is
+renewed all the time and ends soon after its holder has died. Taking it over is explicit.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from enum import IntEnum
+
+from dm_common.errors import ErrorCode, Refusal
+
+#: A hold that is not renewed ends after this time, s, where its holder names no other.
+LEASE_S = 3.0
+#: Longest lease that may be asked for, s.
+LEASE_MAX_S = 3600.0
+
+
+class Operation(IntEnum):
+    """The constants of dm_msgs/HoldMirror."""
+
+    HOLD = 0
+    RENEW = 1
+    TAKE_OVER = 2
+    RELEASE = 3
+
+
+class MirrorHold:
+    """Any thread may ask.
+
+    Args:
+        clock: steady time, s.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._holder = self._purpose = ""
+        self._since = self._until = self._duration = 0.0
+        self._evicted = self._evicted_by = ""  # whose hold was taken over last, and by whom
+
+    @property
+    def holder(self) -> str:
+        """Who holds the mirror; "" = nobody."""
+        with self._lock:
+            return self._current()
+
+    @property
+    def sentence(self) -> str:
+        """Who holds the mirror, since when and what for; "" = nobody does."""
+        with self._lock:
+            return self._sentence()
+
+    def ask(self, operation: int, holder: str, purpose: str = "", duration: float = 0.0, lease: float = 0.0) -> None:
+        """Hold the mirror, or give it back, as in dm_msgs/HoldMirror.
+
+        Raises:
+            Refusal: BUSY, PREEMPTED when the hold to be renewed was taken over, or a field that cannot be.
+        """
+        if not 0 <= operation <= max(Operation):
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"operation = {operation}: must be 0 to {max(Operation)}")
+        if not holder.strip():
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, "holder is empty: must say who holds the mirror")
+        for name, value, high in (("duration", duration, math.inf), ("lease", lease, LEASE_MAX_S)):
+            if not math.isfinite(value):
+                raise Refusal(ErrorCode.NOT_FINITE, f"{name} = {value}: must be a finite number")
+            if not 0.0 <= value <= high:
+                raise Refusal(ErrorCode.OUT_OF_RANGE, f"{name} = {value:g} s: must be 0 to {high:g} s")
+        with self._lock:
+            current = self._current()
+            if operation == Operation.RENEW and current != holder and holder == self._evicted:
+                raise Refusal(ErrorCode.PREEMPTED, f"{self._evicted_by} has taken the mirror over")
+            if current not in ("", holder):
+                if operation != Operation.TAKE_OVER:
+                    raise Refusal(ErrorCode.BUSY, self._sentence())
+                self._evict(holder)
+            if operation == Operation.RELEASE:
+                self._holder = ""
+                return
+            if holder == self._evicted:
+                self._evicted = ""
+            now = self._clock()
+            if current != holder:
+                self._since = now
+            self._holder, self._purpose, self._duration = holder, purpose, duration
+            self._until = now + (lease or LEASE_S)
+
+    def check(self, holder: str, take_over: bool) -> bool:
+        """Whether a command of `holder` ("" = nobody in particular) takes the mirror from somebody.
+
+        Raises:
+            Refusal: BUSY, somebody else holds the mirror.
+        """
+        with self._lock:
+            other = self._current() not in ("", holder)
+            if other and not take_over:
+                raise Refusal(ErrorCode.BUSY, self._sentence())
+            return other
+
+    def evict(self, by: str) -> None:
+        """Whoever holds the mirror does so no longer: a command of `by` ("" = nobody in particular) is carried out."""
+        with self._lock:
+            self._evict(by or "a command with take_over")
+
+    def _current(self) -> str:
+        if self._holder and self._clock() > self._until:
+            self._holder = ""
+        return self._holder
+
+    def _evict(self, by: str) -> None:
+        self._evicted, self._evicted_by, self._holder = self._holder, by, ""
+
+    def _sentence(self) -> str:
+        if not self._current():
+            return ""
+        held = self._clock() - self._since
+        left = f", about {max(self._duration - held, 0.0):.0f} s to go" if self._duration else ""
+        purpose = f": {self._purpose}" if self._purpose else ""
+        return f"{self._holder} has held the mirror for {held:.0f} s{left}{purpose}; take_over takes it from there"
