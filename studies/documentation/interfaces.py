@@ -28,7 +28,28 @@ HEAD = """# Interfaces
 Written from the code by `./dm exec python -m studies.documentation.interfaces`; a test keeps it true. Parameters are
 on [a page of their own](parameters.md). Names are relative: with a namespace they lie in it. Units are SI where a
 comment names none; signals are normalised, −1 to +1; sag is that of the surface, positive curvature is concave.
+
+A program asks by the topic `focus_request` or the service `set_focus` (`dry_run` predicts only), moves with the action
+`move_focus`, and finds what the mirror can do on the latched topic `capabilities`. `actuator_command`, `set_signals`
+and `degauss` go below the controller; `calibrate`, `converge` and `build_recipes` are actions with an interferometer,
+`autofocus` and `set_focus_distance` with a camera. Every refusal carries an `error_code` and a sentence with the value
+and the allowed range.
+
+## Nodes
+
+| node | package | what it does |
+|---|---|---|
 """
+#: What each node does.
+DUTIES = {
+    "virtual_bench": "the simulation: mirror with hysteresis and creep, electronics, interferometer, camera",
+    "pdm_driver": "signals in, frames of the drive unit out; a safety limiter in front of every write",
+    "interferometer": "reads `.dat`, `.datx`, `.asc`, `.xyz`; fits 21 Zernike terms over all pixels",
+    "calibration": "measures influence function, hysteresis and creep, checks the wiring, follows later maps",
+    "focus_controller": "curvature, conic constant and Zernike terms in, commands out: bounded least squares, then the "
+    "inverse of hysteresis and creep",
+    "autofocus": "camera images in, focus requests out: search, tracking, focus by distance",
+}
 
 
 @dataclass(frozen=True)
@@ -129,6 +150,16 @@ def nodes_and_offers() -> dict[str, list[Offer]]:
     return result
 
 
+def duties() -> Iterator[str]:
+    """A row for each node: its package and what it does."""
+    from dm_bringup.nodes import NODES
+
+    for node in NODES:
+        kinds = [kind for kind, said in (("lifecycle node", node.lifecycle), ("optional", node.optional)) if said]
+        yield f"| [{node.name}](#node-{node.name}) | {node.package} | {'; '.join([DUTIES[node.name], *kinds])} |"
+    yield ""
+
+
 def node_tables(nodes: dict[str, list[Offer]]) -> Iterator[str]:
     """The interfaces of every node."""
     for name, offers in nodes.items():
@@ -191,7 +222,7 @@ def interfaces_page() -> str:
     from ament_index_python.packages import get_package_share_directory
 
     share = Path(get_package_share_directory("dm_msgs"))
-    parts = [HEAD, *node_tables(nodes_and_offers())]
+    parts = [HEAD.rstrip(), *duties(), *node_tables(nodes_and_offers())]
     for folder, title in (("msg", "Messages"), ("srv", "Services"), ("action", "Actions")):
         parts.append(f"## {title}\n")
         for path in sorted((share / folder).glob(f"*.{folder}")):
