@@ -152,9 +152,22 @@ def _checked(
 
 
 def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lambda step: None) -> Outcome:
-    """Draw, calibrate and judge one mirror."""
-    began = time.process_time()
+    """Draw, calibrate and judge one mirror; one that cannot be judged to the end has a failure and no figures."""
     mirror = draw_mirror(seed, options.pixels)
+    try:
+        return _judged(mirror, options, progress)
+    except (Refusal, ValueError) as error:
+        return Outcome(mirror, failure=str(error))
+
+
+def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress) -> Outcome:
+    """Calibrate and judge one mirror.
+
+    Raises:
+        Refusal, ValueError: it cannot be calibrated, or no request can be drawn, planned or carried out.
+    """
+    began = time.process_time()
+    seed = mirror.simulation.seed
     rng = np.random.default_rng([seed, 15])
     bench = SimulatedBench(mirror.simulation)
     if mirror.held_before:
@@ -162,11 +175,8 @@ def judge_mirror(seed: int, options: PopulationOptions, progress: Progress = lam
         bench.time += HELD_S
         bench.power_cycle(OFF_S)
     progress(f"seed {seed}: calibration")
-    try:
-        calibration = bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps))
-        active = active_of(bench, calibration_message(calibration, None, "mirror", 1.0))
-    except (Refusal, ValueError) as error:
-        return Outcome(mirror, failure=str(error))
+    calibration = bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps))
+    active = active_of(bench, calibration_message(calibration, None, "mirror", 1.0))
     calibrated = time.process_time() - began
     hysteresis = calibration.hysteresis
     assert hysteresis is not None
