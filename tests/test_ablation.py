@@ -8,10 +8,11 @@ import typer
 from typer.testing import CliRunner
 
 from dm_controller.planning.target import FocusTarget
-from studies.comparison.ablation import CONDITIONED, DWELLS, HISTORIES, AblationOptions, ablate, total_steps
+from studies.comparison.ablation import CONDITIONED, HISTORIES, AblationOptions, ablate, total_steps
 from studies.comparison.ablation_figures import Ablation, Requests, RowFigures, figures_of
 from studies.comparison.ablation_models import CREEP, HYSTERESIS, LINEAR, MODELS, PLAYS, RECIPES
 from studies.comparison.compare import fitting_limits, true_error
+from studies.comparison.random_requests import DWELLS
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.comparison.true_surface import TrueSurface
 from studies.verbs.compare import compare as command

@@ -107,6 +107,12 @@ def test_what_is_refused() -> None:
         identify_response(commands, measured, times[:4])
     with pytest.raises(ValueError, match="time stamps: map 2"):
         identify_response(commands, measured, -times)
+    with pytest.raises(ValueError, match="times: all are the same"):
+        identify_response(commands, measured, np.ones_like(times))
+    for array, text in ((commands, "commands: row 7 holds NaN"), (times, "times: number 7 is NaN")):
+        bad = np.where((np.arange(160) == 6).reshape(-1, *[1] * (array.ndim - 1)), np.nan, array)
+        with pytest.raises(ValueError, match=text):
+            identify_response(bad, measured, times) if array is commands else identify_response(commands, measured, bad)
     with pytest.raises(ValueError, match="nothing in it changes"):
         identify_response(commands, np.ones_like(measured), times)
     with pytest.raises(ExcitationError, match="actuator 3 turned"):

@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from dm_simulation.mirror.hysteresis import LAWS
-from studies.comparison import drawn_mirrors
+from studies.comparison import drawn_mirrors, population
 from studies.comparison.drawn_mirrors import draw_mirror
 from studies.comparison.population import (
     ANY_ORDER,
@@ -18,11 +18,13 @@ from studies.comparison.population import (
     POWER_CUT,
     RECIPES,
     RESTARTED,
+    Outcome,
     PopulationOptions,
     judge_population,
 )
+from studies.comparison.random_requests import Requests
 from studies.verbs.compare import compare as command
-from studies.verbs.compare_mirrors import figures_of, row_of
+from studies.verbs.compare_mirrors import figures_of, row_of, show
 
 
 def test_a_seed_is_always_the_same_mirror_and_seeds_differ() -> None:
@@ -54,6 +56,25 @@ def test_a_mirror_is_judged_and_its_figures_are_told() -> None:
     assert figures["mirrors"] == 1
     assert figures["worst_seed"] == 3
     assert figures["median_mirror"]["p90_nm"] == pytest.approx(1e9 * asked.quantile(0.9))
+
+
+def test_a_mirror_that_cannot_be_driven_fails_by_itself(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(*_: object) -> None:
+        raise ValueError("no curvature is reachable")
+
+    monkeypatch.setattr(population, "_judged", refused)
+    (outcome,) = judge_population([3], PopulationOptions(pixels=100))
+    assert outcome.failure == "no curvature is reachable"
+    show([row_of(outcome)])
+    assert "seed 3: no curvature is reachable" in capsys.readouterr().out
+
+
+def test_figures_without_any_request_are_shown_as_none(capsys: pytest.CaptureFixture[str]) -> None:
+    outcome = Outcome(draw_mirror(3), groups={name: Requests.none(["refused"]) for name in (ANY_ORDER, RECIPES)})
+    show([row_of(outcome)])
+    assert "median mirror: p50 -, p90 -, recipes p90 -" in capsys.readouterr().out
 
 
 def test_mirrors_need_one_first_seed() -> None:

@@ -28,7 +28,7 @@ CREEPS = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIM
 
 def run_of(law: HysteresisModel, maps: int, noise: float = 2e-10, seed: int = 1, response: Floats = RESPONSE) -> Run:
     commands = excitation(MIRROR, maps)
-    time = np.cumsum(0.5 + 0.5 * commands.settled + commands.dwell)
+    time = np.cumsum(0.5 + 0.5 * commands.settle_share + commands.dwell)
     effective, _ = follow(law, law.demagnetised(COUNT, 0.0), commands.signals, time)
     values = effective @ response.T + noise * np.random.default_rng(seed).standard_normal((maps, len(response)))
     return Run(commands.signals, time, Responses(values, len(RESPONSE), np.ones(maps, dtype=bool)), 0.0)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis import hysteresis_fit
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
+from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -66,6 +70,23 @@ def test_commands_without_a_map_stay_in_the_history() -> None:
     assert any("excitation 30" in remark for remark in gappy.remarks)
 
 
+def test_the_law_is_fitted_to_the_very_maps_that_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many rounds contradict the law: here one map more in each."""
+    fitted_to = []
+
+    def one_more(run: Run, *_: object, **__: object) -> Any:
+        fitted_to.append(run)
+        residual = np.where(np.arange(60) == len(fitted_to), 100.0, 1.0)[:, None]
+        return SimpleNamespace(fit=SimpleNamespace(residual=residual))
+
+    monkeypatch.setattr(hysteresis_fit, "identify", one_more)
+    every = Responses(np.zeros((60, 1)), 1, np.ones(60, dtype=bool))
+    run = Run(np.zeros((60, 1)), np.arange(60.0), every)
+    _, kept = hysteresis_fit._without_outliers(run, np.zeros(60, dtype=bool), (), print)
+    assert kept is fitted_to[-1]
+    assert kept.responses.usable.sum() == 60 - hysteresis_fit.OUTLIER_ROUNDS + 1
+
+
 def test_a_map_of_something_else_does_not_enter_the_law() -> None:
     maps, spoilt = run(), np.array(run().coefficients)
     row = maps.label.index("excitation 50")
@@ -73,4 +94,5 @@ def test_a_map_of_something_else_does_not_enter_the_law() -> None:
     found = plays(replace(maps, coefficients=spoilt))
     assert found.held_out_max_zernike < 1.5 * fitted().held_out_max_zernike
     assert found.law.creep_rate == pytest.approx(fitted().law.creep_rate, rel=0.05)
+    np.testing.assert_allclose(found.law.crept, fitted().law.crept, atol=0.05)
     assert any("excitation 50" in remark for remark in found.remarks)

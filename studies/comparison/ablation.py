@@ -18,6 +18,7 @@ from dm_controller.planning.target import FocusTarget
 from studies.comparison.ablation_figures import Ablation, Identified, Requests, Series
 from studies.comparison.ablation_models import MODELS, Variant, make_variants
 from studies.comparison.driven_mirror import DrivenMirror
+from studies.comparison.random_requests import CURVATURE_MAX, DWELLS
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, plan_steps
 from studies.comparison.true_surface import TrueSurface
 
@@ -28,10 +29,6 @@ TRACKED, DEGAUSSED, POWER_CYCLE, CONDITIONED = "tracked", "degaussed", "power cy
 HISTORIES = (TRACKED, DEGAUSSED, POWER_CYCLE)
 #: Hysteresis laws of the simulations; `mixed` is one that no candidate of the identification holds.
 PLANTS = ("prandtl_ishlinskii", "preisach", "bouc_wen", "mixed")
-#: Times that shapes are held, s.
-DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
-#: Largest curvature asked for, 1/m.
-CURVATURE_MAX = 0.05
 #: The longest hold, from when its drift counts, and the curvature, s, s, 1/m.
 HOLD_S, HOLD_FROM_S, HOLD_CURVATURE = 3600.0, 1.0, 0.03
 

@@ -9,13 +9,11 @@ from dm_calibration.calibrator import fit_effective
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, fit_hysteresis
 from dm_calibration.influence.fit import FitOptions
-from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
-from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from dm_controller.planning.target import FocusTarget
 from studies.comparison.compare import CURVATURES
+from studies.comparison.driven_mirror import build_recipes
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 
 #: `plays only` is the whole law, chosen among candidates without the Duhem operator.
@@ -34,31 +32,26 @@ class Variant:
 
 
 def make_variants(bench: SimulatedBench, calibration: Calibration) -> tuple[Variant, ...]:
-    """The models, each made of the maps of `calibration` alone."""
+    """The models, each made of the maps of `calibration` alone.
+
+    Raises:
+        ValueError: a recipe is beyond what the mirror reaches.
+    """
     hysteresis = calibration.hysteresis
     assert hysteresis is not None
     plays = fit_hysteresis(calibration.maps, candidates=[c for c in CANDIDATES if not c.slopes])
     still = replace(hysteresis, law=replace(hysteresis.law, creep_rate=0.0))
     whole = _variant(CREEP, bench, calibration, hysteresis, True)
+    book, unreachable = build_recipes(bench.fork(), whole.loop, CURVATURES)
+    if unreachable:
+        raise ValueError(unreachable[0])
     return (
         _variant(LINEAR, bench, calibration, None, False),
         _variant(PLAYS, bench, calibration, plays, True),
         _variant(HYSTERESIS, bench, calibration, still, False),
         whole,
-        replace(whole, name=RECIPES, book=_recipes(bench.fork(), whole.loop)),
+        replace(whole, name=RECIPES, book=book),
     )
-
-
-def _recipes(bench: SimulatedBench, loop: Planner) -> RecipeBook:
-    """Recipes over the range of the requests, built on the bench as it stands."""
-    tracker = HysteresisTracker(loop.law)
-    for report in bench.reports:
-        tracker.observe(report)
-    options = BuildOptions(settle_time=bench.config.settle_time)
-    builder = RecipeBuilder(loop, bench, lambda: bench.time, options, state=tracker.state)
-    for curvature in CURVATURES:
-        builder.build(FocusTarget(curvature))
-    return recipe_book(builder.recipes, loop, bench.config.degauss_steps, round(1e9 * bench.time))
 
 
 def _variant(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 
 from dm_calibration.procedure.applied_history import SettledState
 from dm_common.hysteresis.creep_record import CreepRecord, record_of
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.recipes import NO_RECIPES, RecipeBook
+from dm_controller.converge.goals import UnreachableError
+from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move, Planner
 from dm_controller.planning.recipes import find
@@ -17,6 +20,24 @@ from studies.comparison.simulated_bench import SimulatedBench
 #: Share of the time since the move that the next correction of a held shape waits: creep slows down like that, and an
 #: experiment need not correct more often than it matters. The first ones come as the controller's do.
 CORRECTION_GROWTH = 0.07
+
+
+def build_recipes(bench: SimulatedBench, planner: Planner, curvatures: Iterable[float]) -> tuple[RecipeBook, list[str]]:
+    """Recipes of these curvatures, built on the bench as it stands, and why others of them could not be built."""
+    tracker = HysteresisTracker(planner.law)
+    for report in bench.reports:
+        tracker.observe(report)
+    options = BuildOptions(settle_time=bench.config.settle_time)
+    builder = RecipeBuilder(planner, bench, lambda: bench.time, options, state=tracker.state)
+    refusals = []
+    for curvature in curvatures:
+        try:
+            builder.build(FocusTarget(float(curvature)))
+        except UnreachableError as error:
+            refusals.append(str(error))
+    if not builder.recipes:
+        return NO_RECIPES, refusals
+    return recipe_book(builder.recipes, planner, bench.config.degauss_steps, round(1e9 * bench.time)), refusals
 
 
 class DrivenMirror:

@@ -22,27 +22,23 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_common.errors import Refusal
 from dm_common.hysteresis.creep_record import CreepRecord
-from dm_common.hysteresis.observer import HysteresisTracker
-from dm_common.recipes import NO_RECIPES, RecipeBook
-from dm_controller.converge.goals import UnreachableError
-from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
+from dm_common.recipes import NO_RECIPES
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.drawn_mirrors import DIES, GAIN_STEP, GAIN_STEP_SHARE, DrawnMirror, draw_mirror
-from studies.comparison.driven_mirror import DrivenMirror
+from studies.comparison.driven_mirror import DrivenMirror, build_recipes
 from studies.comparison.random_requests import (
     CURVATURE_MAX,
+    DWELLS,
     REACHABLE_TOLERANCE,
     Requests,
     active_of,
     draw_targets,
     judge_requests,
 )
-from studies.comparison.simulated_bench import Floats, SimulatedBench
+from studies.comparison.simulated_bench import SimulatedBench
 from studies.comparison.true_surface import TrueSurface
 
-#: Times that shapes are held, s.
-DWELLS = (0.1, 1.0, 10.0, 60.0, 600.0)
 #: A shape is held for so long before the electronics are switched off, for so long, s.
 HELD_S, OFF_S = 86400.0, 600.0
 #: Requests after a restart, maps that then check the calibration, and requests by recipes for each recipe.
@@ -93,26 +89,6 @@ class Outcome:
 #: Kinds of requests: from the calibration on, by recipes after a degauss, after a day's hold and a restart, then after
 #: maps that checked the calibration, after a power cut during a move.
 ANY_ORDER, RECIPES, RESTARTED, CHECKED, POWER_CUT = "any order", "recipes", "restarted", "checked", "power cut"
-
-
-def _recipes(bench: SimulatedBench, active: ActiveCalibration, curvatures: Floats) -> tuple[RecipeBook, list[str]]:
-    """Recipes of these curvatures, and why others of them could not be built."""
-    tracker = HysteresisTracker(active.planner.law)
-    for report in bench.reports:
-        tracker.observe(report)
-    options = BuildOptions(settle_time=bench.config.settle_time)
-    builder = RecipeBuilder(active.planner, bench, lambda: bench.time, options, state=tracker.state)
-    refusals = []
-    for curvature in curvatures:
-        try:
-            builder.build(FocusTarget(float(curvature)))
-        except UnreachableError as error:  # the published range said otherwise
-            refusals.append(str(error))
-    recipes = builder.recipes
-    if not recipes:
-        return NO_RECIPES, refusals
-    book = recipe_book(recipes, active.planner, bench.config.degauss_steps, round(1e9 * bench.time))
-    return book, refusals
 
 
 def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -> None:
@@ -187,20 +163,19 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
     if options.recipes:
         progress(f"seed {seed}: recipes")
         curvatures = np.linspace(max(low, -CURVATURE_MAX), min(high, CURVATURE_MAX), options.recipes)
-        book, unreachable = _recipes(bench, active, curvatures)
+        book, unreachable = build_recipes(bench, active.planner, curvatures)
     _age(bench, mirror, rng)
 
     progress(f"seed {seed}: any order")
     dwells = rng.permutation(np.resize(DWELLS, options.requests))
     other = bench.fork()
-    groups[ANY_ORDER] = judge_requests(
-        DrivenMirror(other, active.planner), active, surface, draw_targets(active, options.requests, rng), dwells
-    )
+    driven = DrivenMirror(other, active.planner)
+    groups[ANY_ORDER] = judge_requests(driven, active, surface, draw_targets(active, options.requests, rng), dwells)
     # From there a move that a power cut ends.
     progress(f"seed {seed}: power cut")
     first = draw_targets(active, FIRST_REQUESTS + 1, rng)
     short = np.resize(DWELLS[:4], FIRST_REQUESTS)
-    other.power_cut(DrivenMirror(other, active.planner).plan(first[0]).signals, float(rng.uniform(0.1, 0.9)))
+    other.power_cut(driven.plan(first[0]).signals, float(rng.uniform(0.1, 0.9)))
     driven = _restarted(other, active, float(10.0 ** rng.uniform(0, 3.5)))
     groups[POWER_CUT] = judge_requests(driven, active, surface, first[1:], short)
 

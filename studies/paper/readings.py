@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import usable_sag
+from dm_calibration.influence.regression import complete_sag
 from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.stepwise import SelectionOptions, StepwiseFit
 from dm_calibration.regression.surface_error import (
@@ -39,7 +39,6 @@ from dm_calibration.regression.surface_error import (
     surface_errors,
 )
 from dm_common.names import unknown_name
-from dm_common.optics.piston_tilt import fill_gaps
 from dm_common.optics.zernike import TERM_RMS, basis
 from studies.paper.reported import TEST_SURFACES
 
@@ -121,9 +120,7 @@ class LinearHistory:
 
     def __init__(self, maps: MapSet, model: Floats) -> None:
         """`model`: (M, P) m, sag to fill points without data from."""
-        self._usable: NDArray[np.bool_] = np.asarray(np.isfinite(maps.sag).any(axis=1))
-        self._sag = usable_sag(maps, ["" if usable else "no data" for usable in self._usable])
-        self._sag[self._usable] = fill_gaps(maps.sag[self._usable], model[self._usable], maps.points)
+        self._usable, self._sag = complete_sag(maps, model)
         self._design = np.column_stack((np.ones(len(maps)), maps.applied))
 
     def predict(self, keep: NDArray[np.bool_]) -> Floats:

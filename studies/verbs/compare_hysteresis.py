@@ -25,8 +25,8 @@ def run(plants: Sequence[str], seeds: Sequence[int], simulation: Any, quick: boo
 
 def rows_of(ablation: Any) -> list[dict[str, Any]]:
     """A row for each series and dwell time, and one over all dwell times (`dwell_s` null, with the hold of an hour)."""
-    from studies.comparison.ablation import DWELLS
     from studies.comparison.ablation_figures import figures_of
+    from studies.comparison.random_requests import DWELLS
 
     rows = []
     for series in ablation.series:

@@ -154,10 +154,10 @@ def _show_population(figures: dict[str, Any]) -> None:
     if not figures:
         return
     for name, text in (("median_mirror", "median mirror"), ("worst_in_ten", "worst mirror in ten")):
-        p50, p90 = figures[name]["p50_nm"], figures[name]["p90_nm"]
+        recipes = figures["recipes_p90_nm"][name]
         console.print(
-            f"{text}: p50 {_text(p50, '.2f')} nm ({as_wavelengths(1e-9 * p50)}), p90 {_text(p90, '.2f')} nm "
-            f"({as_wavelengths(1e-9 * p90)}), recipes p90 {_text(figures['recipes_p90_nm'][name], '.2f')} nm"
+            f"{text}: p50 {_both(figures[name]['p50_nm'])}, p90 {_both(figures[name]['p90_nm'])}, "
+            f"recipes p90 {'-' if recipes is None else f'{recipes:.2f} nm'}"
         )
     lowest = ", ".join(
         f"{group.replace('_', ' ')} {_text(value, '.0%')}" for group, value in figures["lowest_coverage"].items()
@@ -172,6 +172,12 @@ def _show_population(figures: dict[str, Any]) -> None:
 
 def _length(value: float | None) -> tuple[str, str]:
     return (_text(value, ".2f"), as_wavelengths(1e-9 * value)) if value is not None else ("", "")
+
+
+def _both(value: float | None) -> str:
+    """A length in nm, and in wavelengths; "-" where there were no requests."""
+    nm, wavelengths = _length(value)
+    return f"{nm} nm ({wavelengths})" if nm else "-"
 
 
 def _text(value: float | None, form: str) -> str:

@@ -66,8 +66,8 @@ PARAMETERS = (
     Parameter(
         "bump.figure_max",
         real(50e-9, 0.0, 1e-3, "m"),
-        "Largest change of the rms figure between two reference frames, beyond what `hysteresis_allowance` explains; "
-        "0 = not checked.",
+        "Largest change of the rms figure between two reference frames, beyond what twice `hysteresis_allowance` "
+        "explains; 0 = not checked.",
         live=True,
     ),
     Parameter(

@@ -49,7 +49,7 @@ def test_held_shapes_lean_to_one_side_for_minutes_and_some_maps_are_early() -> N
     first = np.arange(300) < np.median(np.flatnonzero(held))
     assert (lean[held & first] > 0.0).all()
     assert (lean[held & ~first] < 0.0).mean() > 0.9  # but for the one in the middle
-    early = commands.settled < 1.0
+    early = commands.settle_share < 1.0
     assert 0.15 < early[~commands.check].mean() < 0.4
     assert not (early & (held | commands.check)).any()
 

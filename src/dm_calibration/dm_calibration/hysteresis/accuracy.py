@@ -13,14 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.hysteresis.candidate_fit import PREISACH_AND_DUHEM
 from dm_calibration.hysteresis.features import crept, fading_feature, play_features, relaxation
+from dm_calibration.hysteresis.segments import without
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.optics.zernike import PISTON_TILT
 
 Floats = NDArray[np.float64]
 
-#: Plays and powers of the richest candidate, the slope of a typical fading operator, a typical creep rate.
-PLAYS, POWERS, SLOPE, CREEP_RATE = 20, 3, 1.5, 0.01
+#: The richest candidate, the slope of a typical fading operator, a typical creep rate.
+RICHEST, SLOPE, CREEP_RATE = PREISACH_AND_DUHEM, 1.5, 0.01
 #: Standard deviation of a coefficient of one map where no calibration tells it, m.
 TYPICAL_NOISE = 2e-10
 #: Standard deviation of a coefficient that stays however long the run is, m: steps of the electronics, creep older than
@@ -82,17 +84,14 @@ def expected_accuracy(
     covariance = np.eye(response.shape[1]) * (share * scale**2 + floor**2)
     features = _features(signals, time, start)
     free = np.linalg.qr(gains[~check, :3])[0]
-    seen = features[~check]
-    seen = seen - np.einsum("mg,kg,kfn->mfn", free, free, seen, optimize=True)
-    covariance += scale**2 * _shared_error(seen, features[check], response)
+    covariance += scale**2 * _shared_error(without(features[~check], free), features[check], response)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
     return ExpectedAccuracy(np.sqrt(np.diag(covariance)), float(np.quantile(np.abs(draws).max(axis=1), 0.95)))
 
 
 def _features(signals: Floats, time: Floats, start: float) -> Floats:
     """(M, F, N), the creep of the signal among them; without the signal itself, whose weight is in the gains."""
-    radius = np.concatenate(([0.0], (np.arange(PLAYS) + 0.5) / PLAYS))
-    plays = play_features(signals, radius, POWERS)
+    plays = play_features(signals, RICHEST.radius, RICHEST.powers)
     own_creep = crept(signals[:, None, :], time, start)
     fading = fading_feature(signals, DuhemOperator(np.array([SLOPE])))
     static = np.concatenate((plays[:, 1:], fading), axis=1)

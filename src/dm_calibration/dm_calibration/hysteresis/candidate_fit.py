@@ -8,6 +8,8 @@ found by Gauss-Newton around that (variable projection [14]).
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +18,7 @@ from scipy.optimize import least_squares
 
 from dm_calibration.hysteresis.features import crept, fading_feature, play_features
 from dm_calibration.hysteresis.responses import Responses
-from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of
+from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of, without
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
@@ -27,6 +29,8 @@ Rows = NDArray[np.bool_]
 RIDGE = 1e-6
 #: Rounds of alternating solutions. With 6 a run of 100 maps predicts held-out ones three times worse; 60 gain nothing.
 ROUNDS = 20
+#: Evaluations of the Gauss-Newton iteration at most, from a guess and from a fit to other rows.
+EVALUATIONS, EVALUATIONS_AGAIN = 20, 8
 #: Least uncertainty of a response, m, that of data without noise.
 SCATTER_MIN = 1e-11
 #: Creep that explains less than so many squared standard deviations of the maps is none, and, of actuators without
@@ -58,14 +62,20 @@ class Candidate:
         """Whether it has more than a static response to the signal."""
         return bool(self.plays or self.slopes)
 
+    @property
+    def radius(self) -> Floats:
+        """(1 + plays,) half-widths of the play operators, that of the signal itself first."""
+        return np.concatenate(([0.0], (np.arange(self.plays) + 0.5) / max(self.plays, 1)))
 
+
+PREISACH, PREISACH_AND_DUHEM = Candidate("Preisach", 20, 3, 0), Candidate("Preisach and Duhem", 20, 3, 4)
 CANDIDATES = (
     Candidate("linear", 0, 1, 0),
     Candidate("static", 0, 3, 0),
     Candidate("Prandtl-Ishlinskii", 20, 1, 0),
-    Candidate("Preisach", 20, 3, 0),
+    PREISACH,
     Candidate("Duhem", 0, 3, 4),
-    Candidate("Preisach and Duhem", 20, 3, 4),
+    PREISACH_AND_DUHEM,
     Candidate("static, each actuator its own", 0, 5, 0, own=True),
     Candidate("Preisach, each actuator its own", 30, 5, 0, own=True),
 )
@@ -106,6 +116,15 @@ class Run:
         """Rows of each part of the run, from one degauss to the next."""
         return parts_of(np.zeros(len(self.time), dtype=np.int64) if self.segment is None else self.segment)
 
+    @property
+    def starts(self) -> list[float]:
+        """When the degauss before each part had ended, s."""
+        return starts_of(self.parts, self.began, self.time, self.moved)
+
+    def moved_in(self, part: slice) -> Floats | None:
+        """`moved` of the maps of a part."""
+        return None if self.moved is None else self.moved[part]
+
 
 @dataclass(frozen=True, eq=False)
 class LawFit:
@@ -126,27 +145,40 @@ class CandidateProblem:
     """One candidate on one run: features once, then fits to any rows."""
 
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
-        self.run, self.candidate, self._scatter = run, candidate, scatter
-        self.radius = np.concatenate(([0.0], (np.arange(candidate.plays) + 0.5) / max(candidate.plays, 1)))
-        self._parts = run.parts
-        self._starts = [run.began, *starts_of(self._parts, run.time, run.moved)]
-        powers = candidate.powers
-        self._plays = in_parts(self._parts, lambda part: play_features(run.signals[part], self.radius, powers))
+        self.run, self.candidate = run, candidate
+        self.radius = candidate.radius
+        self._parts, self._starts = run.parts, run.starts
+        self._plays = self._in_parts(
+            lambda part, start: play_features(run.signals[part], self.radius, candidate.powers)
+        )
         self._plays_crept = self._crept(self._plays)
-        self._measured = run.responses.values / scatter
         self._figure = figure_columns(run.time, self._parts, self._starts)
+        self._scale(scatter)
+
+    def _scale(self, scatter: Floats) -> None:
+        self._scatter = scatter
+        self._measured = self.run.responses.values / scatter
+
+    def scaled(self, scatter: Floats) -> CandidateProblem:
+        """The same problem with another uncertainty (D,) of each response."""
+        other = copy.copy(self)
+        other._scale(scatter)
+        return other
+
+    def _in_parts(self, work: Callable[[slice, float], Floats]) -> Floats:
+        return in_parts(self._parts, self._starts, work)
 
     def _crept(self, features: Floats) -> Floats:
         """What creep adds to `features` (M, F, N) per unit of creep rate; each part begins rested."""
-        time, moved = self.run.time, self.run.moved
-        start = {part.start: start for part, start in zip(self._parts, self._starts, strict=True)}
-        return in_parts(
-            self._parts,
-            lambda part: crept(features[part], time[part], start[part.start], None if moved is None else moved[part]),
-        )
+        run = self.run
+        return self._in_parts(lambda part, start: crept(features[part], run.time[part], start, run.moved_in(part)))
 
-    def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int = 20) -> LawFit:
-        """Fit to the rows in `keep` (M,)."""
+    def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
+        """Fit to the rows in `keep` (M,), from `start` or from a guess.
+
+        Args:
+            evaluations: at most; None = as it usually takes.
+        """
         slopes = self.candidate.slopes
         if start is None:
             guess = np.concatenate((np.full(min(slopes, 1), 1.5), np.zeros(max(slopes - 1, 0)), [0.01]))
@@ -171,13 +203,13 @@ class CandidateProblem:
             bounds=(low, high),
             x_scale=scale,
             diff_step=1e-3,
-            max_nfev=evaluations,
+            max_nfev=evaluations or (EVALUATIONS if start is None else EVALUATIONS_AGAIN),
             xtol=1e-5,
             ftol=1e-6,
         )
         nonlinear, still = found.x, np.append(found.x[:-1], 0.0)
         without, least = float(np.square(residual(still)).sum()), CREEP_SHOWN
-        if not (self.candidate.plays or slopes):
+        if not self.candidate.hysteretic:
             least = max(least, CREEP_SHARE * without)
         if without - 2.0 * found.cost < least:
             nonlinear = still
@@ -190,7 +222,7 @@ class CandidateProblem:
         if not self.candidate.slopes:
             return features
         operator = DuhemOperator(slope)
-        fading = in_parts(self._parts, lambda part: fading_feature(self.run.signals[part], operator))
+        fading = self._in_parts(lambda part, start: fading_feature(self.run.signals[part], operator))
         fading = fading + rate * self._crept(fading)
         return np.concatenate((features, fading), axis=1)
 
@@ -199,13 +231,12 @@ class CandidateProblem:
         measured, figure = self._measured[keep], self._figure[keep]
         free = basis_of(figure)
         kept = features[keep]
-        without_figure = measured - free @ (free.T @ measured)
+        without_figure = without(measured, free)
         count = features.shape[1]
         if weights is None:
             weights = np.eye(count)[0]
-        rows, actuators = len(kept), kept.shape[2]
-        flat = kept.reshape(rows, -1)
-        projected = (flat - free @ (free.T @ flat)).reshape(kept.shape)
+        actuators = kept.shape[2]
+        projected = without(kept, free)
         for _ in range(ROUNDS if count > 1 else 1):
             design = np.hstack((figure, np.einsum("f,mfn->mn", weights, kept)))
             solution = np.linalg.lstsq(design, measured, rcond=1e-10)[0]

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Run
-from dm_calibration.hysteresis.features import PER_ELEMENT, creep_states, follow
-from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, starts_of
+from dm_calibration.hysteresis.features import creep_states, follow, spectrum_prior
+from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.optics.zernike import PISTON_TILT
 
@@ -25,8 +25,6 @@ Floats = NDArray[np.float64]
 SPECTRUM, CORRELATION, POSITION, SPREAD = 0.6, 6.0, 0.03, 0.3
 #: An actuator whose gains are less than this share of the largest is dead.
 DEAD = 0.01
-#: The rate where a law has found less.
-RATE_MIN = 1e-3
 
 
 def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
@@ -35,19 +33,17 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     The first is of errors that all actuators share, the second of those of each by itself.
     """
     values, keep = run.responses.values, run.responses.usable
-    parts = run.parts
-    starts = [run.began, *starts_of(parts, run.time, run.moved)]
+    parts, starts = run.parts, run.starts
     still = replace(law, creep_rate=0.0)
-    begin = {part.start: start for part, start in zip(parts, starts, strict=True)}
 
-    def features_of(part: slice) -> Floats:
-        start, moved = begin[part.start], None if run.moved is None else run.moved[part]
+    def features_of(part: slice, start: float) -> Floats:
+        moved = run.moved_in(part)
         rested = still.demagnetised(run.signals.shape[1], start)
         position = follow(still, rested, run.signals[part], run.time[part], moved)[0]
         states = creep_states(position, run.time[part], start, moved)
         return np.concatenate((position[:, None], np.array(list(states))), axis=1)
 
-    features = in_parts(parts, features_of)
+    features = in_parts(parts, starts, features_of)
     creep = np.einsum(
         "mjn,nj->mn", features[:, 1:], np.broadcast_to(law.creep_share, (features.shape[2], len(CREEP_TIMES)))
     )
@@ -58,13 +54,10 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     scatter = np.maximum(np.sqrt(np.square(left).sum(axis=0) / max(len(left) - design.shape[1], 1)), SCATTER_MIN)
     scatter[: run.responses.coefficients] = np.median(scatter[: run.responses.coefficients])
     gains = solution[figure.shape[1] :] / scatter
-    free = basis_of(figure)
-    seen = features[keep] - np.tensordot(free, np.tensordot(free.T, features[keep], 1), 1)
+    seen = without(features[keep], basis_of(figure))
 
-    rate = max(law.creep_rate, RATE_MIN) * PER_ELEMENT
-    apart = np.abs(np.subtract.outer(np.arange(len(CREEP_TIMES)), np.arange(len(CREEP_TIMES))))
     prior = np.zeros((1 + len(CREEP_TIMES),) * 2)
-    prior[0, 0], prior[1:, 1:] = POSITION**2, (SPECTRUM * rate) ** 2 * np.exp(-apart / CORRELATION)
+    prior[0, 0], prior[1:, 1:] = POSITION**2, spectrum_prior(law.creep_rate, SPECTRUM, CORRELATION)
     together = seen @ gains
     shared = np.linalg.inv(np.einsum("mjd,mkd->jk", together, together) + np.linalg.inv(prior))
     # What one actuator shows beside all others, but for piston and tilt, which no response holds; a dead one nothing.

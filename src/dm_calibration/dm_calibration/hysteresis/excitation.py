@@ -42,13 +42,13 @@ class Excitation:
     Attributes:
         signals: (M, N) legal shapes, repeats not included.
         dwell: (M,) s to hold each beyond the settle time before its map.
-        settled: (M,) share of the settle time to wait.
+        settle_share: (M,) of the settle time to wait.
         check: (M,) which test the law.
     """
 
     signals: Floats
     dwell: Floats
-    settled: Floats
+    settle_share: Floats
     check: NDArray[np.bool_]
 
 
@@ -81,16 +81,22 @@ def _random(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
     return np.asarray(middle + level + own * rng.uniform(-1.0, 1.0, (count, mirror.actuators)))
 
 
+def _gentle(mirror: Mirror, shapes: Floats) -> Floats:
+    """(...,) what share of `shapes` (..., N), in half ranges, keeps neighbours near each other; at most 1."""
+    if not len(mirror.limits.pairs):
+        return np.ones(shapes.shape[:-1])
+    a, b = mirror.limits.pairs.T
+    steepest = mirror.limits.half_range * np.abs(shapes[..., a] - shapes[..., b]).max(axis=-1)
+    return np.asarray(np.minimum(1.0, 0.999 * mirror.limits.neighbour_difference / np.maximum(steepest, 1e-12)))
+
+
 def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
     """`shapes` (M, N) drawn to a bowl in the first half of the rows, to its inverse in the second."""
     middle, half_range = mirror.limits.middle, mirror.limits.half_range
     squares = mirror.x**2 + mirror.y**2
     bowl = 2.0 * squares / squares.max() - 1.0
-    if len(mirror.limits.pairs):
-        a, b = mirror.limits.pairs.T
-        steepest = half_range * np.abs(bowl[a] - bowl[b]).max()
-        share = min(1.0, 0.999 * mirror.limits.neighbour_difference / max(steepest, 1e-12))
-        bowl = share * bowl - (1.0 - share)  # its middle at the end of the range
+    share = float(_gentle(mirror, bowl))
+    bowl = share * bowl - (1.0 - share)  # its middle at the end of the range
     sign = np.where(np.arange(len(shapes)) < len(shapes) // 2, 1.0, -1.0)
     return np.asarray((1.0 - BOWL) * shapes + BOWL * (middle + half_range * sign[:, None] * bowl))
 
@@ -103,11 +109,7 @@ def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
     patterns = np.stack((2.0 * (x**2 + y**2) - 1.0, x**2 - y**2, 2.0 * x * y, x * (3.0 * (x**2 + y**2) - 2.0)))
     size = rng.uniform(-1.0, 1.0, (count, len(patterns))) * np.array([0.7, 0.1, 0.1, 0.05])
     shapes = size @ patterns + 0.03 * rng.uniform(-1.0, 1.0, (count, mirror.actuators))
-    if len(mirror.limits.pairs):
-        a, b = mirror.limits.pairs.T
-        steepest = np.abs(shapes[:, a] - shapes[:, b]).max(axis=1)
-        allowed = mirror.limits.neighbour_difference / half_range
-        shapes *= np.minimum(1.0, 0.999 * allowed / np.maximum(steepest, 1e-12))[:, None]
+    shapes *= _gentle(mirror, shapes)[:, None]
     shapes = np.clip(shapes, -1.0, 1.0)
     # Of a plate the level is only piston; a membrane that all actuators pull is a sphere.
     room = 1.0 - np.abs(shapes).max(axis=1, keepdims=True)

@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 
 #: Weight of each element of an even creep spectrum per unit of creep rate.
 PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIMES) - 1)
+#: Creep rate that a prior takes where a law has found less.
+RATE_MIN = 1e-3
 
 
 def play_values(signals: Floats, radius: Floats) -> Floats:
@@ -79,6 +81,24 @@ def crept(features: Floats, time: Floats, start: float, moved: Floats | None = N
     for row, state in enumerate(creep_states(features, time, start, moved)):
         result[row] = state.sum(axis=0)
     return result * PER_ELEMENT
+
+
+def weight_of(rate: float) -> float:
+    """Weight of each creep element that a prior expects of a law of the creep rate `rate`."""
+    return max(rate, RATE_MIN) * PER_ELEMENT
+
+
+def spectrum_prior(rate: float, spread: float, correlation: float) -> Floats:
+    """(J, J) prior covariance of the weights of the creep elements.
+
+    Args:
+        rate: creep rate of the law.
+        spread: standard deviation relative to the weight that goes with it.
+        correlation: elements over which the spectrum stays alike to 1/e.
+    """
+    number = np.arange(len(CREEP_TIMES))
+    apart = np.abs(np.subtract.outer(number, number))
+    return np.asarray((spread * weight_of(rate)) ** 2 * np.exp(-apart / correlation))
 
 
 def relaxation(time: Floats, start: float) -> Floats:

@@ -12,7 +12,7 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import Identification, identify
-from dm_calibration.hysteresis.responses import responses_of
+from dm_calibration.hysteresis.responses import Responses, responses_of
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of
 from dm_calibration.influence.maps import CHECK, MapSet
 from dm_common.hysteresis.inverse import random_histories
@@ -74,7 +74,7 @@ def fit_hysteresis(
     covariance = _error_covariance(found, run, maps.terms)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
-    law = _followed(maps, found.fit.law)[1]
+    law = _followed(maps, found.fit.law, run.responses)[1]
     if law.creep_rate:
         law = replace(law, creep_covariance=creep_covariance(run, law))
     return HysteresisFit(
@@ -92,15 +92,15 @@ def _without_outliers(
     run: Run, test: NDArray[np.bool_], candidates: Sequence[Candidate], progress: Callable[[str], None]
 ) -> tuple[Identification, Run]:
     """The law of the maps that one law explains, and the run with those alone counting; the commands all stay."""
-    for _ in range(OUTLIER_ROUNDS):
+    for _ in range(OUTLIER_ROUNDS - 1):
         found = identify(run, test, candidates, progress=progress)
         size = np.linalg.norm(found.fit.residual, axis=1)
         usable = run.responses.usable
         outlier = usable & (size > OUTLIER * np.median(size[usable]))
         if not outlier.any() or outlier.sum() > OUTLIERS_MAX * usable.sum():
-            break
+            return found, run
         run = replace(run, responses=replace(run.responses, usable=usable & ~outlier))
-    return found, run
+    return identify(run, test, candidates, progress=progress), run
 
 
 def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
@@ -122,28 +122,31 @@ def effective_maps(maps: MapSet, law: HysteresisModel) -> MapSet:
     return _followed(maps, law)[0]
 
 
-def _followed(maps: MapSet, law: HysteresisModel) -> tuple[MapSet, HysteresisModel]:
+def _followed(maps: MapSet, law: HysteresisModel, responses: Responses | None = None) -> tuple[MapSet, HysteresisModel]:
     """Maps with effective signals, and the law with what the actuators had crept to before the last part of the run.
+
+    Args:
+        responses: of the maps; None = not known yet.
 
     Raises:
         ValueError: time stamps that run backwards.
     """
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
     moved, parts = maps.moved_s(), parts_of(maps.segment)
-    start = dict(zip(range(len(parts)), [-BEFORE_FIRST_MAP_S, *starts_of(parts, time, moved)], strict=True))
+    starts = starts_of(parts, -BEFORE_FIRST_MAP_S, time, moved)
 
-    def followed(part: slice) -> Floats:
-        state = law.demagnetised(maps.actuators, start[parts.index(part)])
+    def followed(part: slice, start: float) -> Floats:
+        state = law.demagnetised(maps.actuators, start)
         return follow(law, state, maps.applied[part], time[part], moved[part])[0]
 
-    effective = in_parts(parts, followed)
+    effective = in_parts(parts, starts, followed)
     if not law.creep_rate:
         return replace(maps, applied=effective), law
     fading = np.zeros((len(maps), len(parts)))
     for number, part in enumerate(parts):
-        fading[part, number] = _fading(law, time[part] - start[number])
-    crept = _crept_before(maps, effective, fading)
-    began = 1e-9 * int(maps.stamp_ns[0]) + start[len(parts) - 1]
+        fading[part, number] = _fading(law, time[part] - starts[number])
+    crept = _crept_before(responses_of(maps) if responses is None else responses, effective, fading)
+    began = 1e-9 * int(maps.stamp_ns[0]) + starts[-1]
     return replace(maps, applied=effective + fading @ crept), replace(law, crept_at=began, crept=crept[-1])
 
 
@@ -152,29 +155,38 @@ def _fading(law: HysteresisModel, elapsed: Floats) -> Floats:
     return np.asarray(np.exp(-elapsed[:, None] / law.creep_time) @ np.atleast_2d(law.creep_share).mean(axis=0))
 
 
-def _crept_before(maps: MapSet, effective: Floats, fading: Floats) -> Floats:
+def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Floats:
     """(S, N) effective signals that the mirror had crept to before each degauss, from what fades in the figure.
 
     Without this the fading goes into the figure, which then belongs to the time of the run only. Expected to be of
-    order 1, like all effective signals; that keeps patterns quiet which the maps hardly show.
+    order 1, like all effective signals; that keeps patterns quiet which the maps hardly show. Maps that contradict the
+    effective signals have no say.
 
     Args:
+        effective: (M, N).
         fading: (M, S) how much of it each map still shows.
     """
-    responses = responses_of(maps)
     keep, count = responses.usable, responses.coefficients
     parts = fading.shape[1]
-    design = np.column_stack((np.ones(len(maps)), fading, effective))[keep]
-    values = responses.values[keep]
-    solution = np.linalg.lstsq(design, values, rcond=1e-10)[0]
+    whole = np.column_stack((np.ones(len(effective)), fading, effective))
+    for _ in range(OUTLIER_ROUNDS):
+        design, values = whole[keep], responses.values[keep]
+        solution = np.linalg.lstsq(design, values, rcond=1e-10)[0]
+        residual = values - design @ solution
+        size = np.linalg.norm(residual, axis=1)
+        outlier = size > OUTLIER * np.median(size)
+        if not outlier.any() or outlier.sum() > OUTLIERS_MAX * len(size):
+            break
+        keep = keep.copy()
+        keep[np.flatnonzero(keep)[outlier]] = False
     freedom = max(len(design) - design.shape[1], 1)
-    scatter = np.sqrt(np.square(values - design @ solution).sum(axis=0) / freedom)
+    scatter = np.sqrt(np.square(residual).sum(axis=0) / freedom)
     scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
     uncertainty = np.sqrt(np.diag(np.linalg.pinv(design.T @ design))[1 : 1 + parts])
     crept = []
     for faded, sigma in zip(solution[1 : 1 + parts], uncertainty, strict=True):
         if not sigma > 0.0:  # no map of that part can be used
-            crept.append(np.zeros(maps.actuators))
+            crept.append(np.zeros(effective.shape[1]))
             continue
         influence = solution[1 + parts :] / (scatter * sigma)
         crept.append(

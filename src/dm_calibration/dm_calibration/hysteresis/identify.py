@@ -14,7 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, SCATTER_MIN, Candidate, CandidateProblem, LawFit, Run
+from dm_calibration.hysteresis.candidate_fit import (
+    CANDIDATES,
+    PREISACH,
+    SCATTER_MIN,
+    Candidate,
+    CandidateProblem,
+    LawFit,
+    Run,
+)
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.influence.regression import TooFewMapsError
 
@@ -76,7 +84,9 @@ def identify(
     usable = run.responses.usable
     test = np.zeros_like(usable) if test is None else test & usable
     train = usable & ~test
-    scatter = _scatter(run, train)
+    preisach = CandidateProblem(run, PREISACH, np.ones(run.responses.values.shape[1]))
+    scatter = _scatter(preisach, train)
+    preisach = preisach.scaled(scatter)
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
@@ -96,21 +106,21 @@ def identify(
         held_out = np.full_like(whole.residual, np.nan)
         for fold in range(folds):
             left_out = train & (part == fold)
-            held_out[left_out] = problem.fit(train & ~left_out, whole, evaluations=4).residual[left_out]
+            held_out[left_out] = problem.fit(train & ~left_out, whole).residual[left_out]
         scores[name] = float(np.sqrt(np.mean(np.square(held_out[train] / scatter))))
         if best is None or PARSIMONY * scores[name] < best[0]:
             best = (scores[name], problem, whole, held_out)
 
     for candidate in candidates:
         if not candidate.own:
-            consider(CandidateProblem(run, candidate, scatter))
+            consider(preisach if candidate == PREISACH else CandidateProblem(run, candidate, scatter))
         elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
             consider(OwnLaws(run, candidate, best[2].law, scatter))
     assert best is not None  # the linear candidate can always be inverted
     score, problem, fitted, held_out = best
     if test.any():
         held_out = np.where(test[:, None], fitted.residual, np.nan)
-        fitted = problem.fit(usable, fitted, evaluations=8)
+        fitted = problem.fit(usable, fitted)
     return Identification(fitted, held_out, {name: s / score for name, s in scores.items()}, refused)
 
 
@@ -139,15 +149,14 @@ def check_excitation(run: Run) -> None:
         )
 
 
-def _scatter(run: Run, keep: Rows) -> Floats:
+def _scatter(rich: CandidateProblem, keep: Rows) -> Floats:
     """(D,) uncertainty of each response, from what a rich law leaves: one value for coefficients, one per pattern."""
-    responses = run.responses
+    responses = rich.run.responses
     scatter = np.ones(responses.values.shape[1])
     scatter[: responses.coefficients] = 1e-9
     scatter[responses.coefficients :] = 1e-8
-    richest = next(candidate for candidate in CANDIDATES if candidate.name == "Preisach")
     for _ in range(2):
-        left = CandidateProblem(run, richest, scatter).fit(keep, evaluations=4).residual[keep]
+        left = rich.scaled(scatter).fit(keep, evaluations=4).residual[keep]
         # Robust: maps that no law explains must not set the scale.
         size = 1.4826 * np.median(np.abs(left), axis=0)
         scatter = np.maximum(size, SCATTER_MIN)

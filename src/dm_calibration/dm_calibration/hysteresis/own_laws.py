@@ -14,7 +14,7 @@ responses of neighbours overlap; its matrix is the elementwise product of the Gr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +23,15 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Candidate, LawFit, Run
-from dm_calibration.hysteresis.features import PER_ELEMENT, creep_states, fading_feature, play_values
-from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, starts_of
+from dm_calibration.hysteresis.features import (
+    PER_ELEMENT,
+    creep_states,
+    fading_feature,
+    play_values,
+    spectrum_prior,
+    weight_of,
+)
+from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
@@ -41,8 +48,8 @@ LOADING = 0.3
 #: Prior standard deviation of a Duhem operator's weight.
 DUHEM_WEIGHT = 0.3
 #: Prior of the creep spectrum: standard deviation relative to the common rate, correlation over elements, and the
-#: spread between actuators relative to that; the rate where the common law found less.
-SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD, CREEP_RATE_MIN = 0.5, 12.0, 0.3, 1e-3
+#: spread between actuators relative to that.
+SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD = 0.5, 12.0, 0.3
 #: Rounds of the three solutions in turn. With 6 the slow creep is a third less true and held-out errors up to four
 #: times as large, with 60 hardly better.
 ROUNDS = 20
@@ -81,12 +88,11 @@ class OwnLaws:
     def __init__(self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats) -> None:
         self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
         self.candidate = candidate
-        self._parts = run.parts
-        self._starts = [run.began, *starts_of(self._parts, run.time, run.moved)]
-        self.radius = np.concatenate(([0.0], (np.arange(candidate.plays) + 0.5) / candidate.plays))
+        self._parts, self._starts = run.parts, run.starts
+        self.radius = candidate.radius
         self._basis = pattern_basis(self.radius, candidate.powers)
         signals = run.signals
-        values = in_parts(self._parts, lambda part: play_values(signals[part], self.radius))
+        values = self._in_parts(lambda part, start: play_values(signals[part], self.radius))
         orders = candidate.powers
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
@@ -94,25 +100,24 @@ class OwnLaws:
         prior = np.ones(self._basis.shape[1])
         if self._slope.size:
             operator = DuhemOperator(self._slope)
-            columns.append(in_parts(self._parts, lambda part: fading_feature(signals[part], operator)))
+            columns.append(self._in_parts(lambda part, start: fading_feature(signals[part], operator)))
             prior = np.append(prior, DUHEM_WEIGHT**2)
         self._features = np.concatenate(columns, axis=1)
         count = signals.shape[1]
-        self._between = np.asarray(np.linalg.inv(np.ones((count, count)) + SPREAD**2 * np.eye(count)), dtype=np.float64)
+        self._between = _alike(count, SPREAD)
         self._prior = np.asarray(np.diag(1.0 / prior), dtype=np.float64)
         self._creeps = common.creep_rate > 0.0
-        self._creep = max(common.creep_rate, CREEP_RATE_MIN) * PER_ELEMENT
-        apart = np.abs(np.subtract.outer(np.arange(len(CREEP_TIMES)), np.arange(len(CREEP_TIMES))))
-        self._creep_prior = np.asarray(
-            np.linalg.inv((SPECTRUM * self._creep) ** 2 * np.exp(-apart / SPECTRUM_CORRELATION)), dtype=np.float64
-        )
-        self._creep_between = np.asarray(
-            np.linalg.inv(np.ones((count, count)) + SPECTRUM_SPREAD**2 * np.eye(count)), dtype=np.float64
-        )
+        self._creep = weight_of(common.creep_rate)
+        prior_of_creep = spectrum_prior(common.creep_rate, SPECTRUM, SPECTRUM_CORRELATION)
+        self._creep_prior = np.asarray(np.linalg.inv(prior_of_creep), dtype=np.float64)
+        self._creep_between = _alike(count, SPECTRUM_SPREAD)
         self._figure = figure_columns(run.time, self._parts, self._starts)
 
-    def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int = ROUNDS) -> OwnFit:
-        """Fit to the rows in `keep` (M,), from `start` or from no hysteresis at all, in so many rounds or more."""
+    def _in_parts(self, work: Callable[[slice, float], Floats]) -> Floats:
+        return in_parts(self._parts, self._starts, work)
+
+    def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
+        """Fit to the rows in `keep` (M,), from `start` or from no hysteresis at all."""
         if isinstance(start, OwnFit):
             patterns, creep, scatter = start.patterns, start.creep, start.scatter
         else:
@@ -125,7 +130,7 @@ class OwnLaws:
         free = basis_of(self._figure[keep])
         crept = self._with_creep(creep)
         gains, residual = self._gains(crept, patterns, keep)
-        for number in range(max(evaluations, ROUNDS)):
+        for number in range(ROUNDS):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
             patterns = self._patterns(crept[keep], gains / scatter, measured, free)
@@ -160,12 +165,14 @@ class OwnLaws:
 
     def _creep_states(self, values: Floats) -> Iterator[Floats]:
         """(J, ...) what the creep elements have followed of `values` (M, ...) at each map; each part begins rested."""
-        time, moved = self.run.time, self.run.moved
+        run = self.run
         for part, start in zip(self._parts, self._starts, strict=True):
-            yield from creep_states(values[part], time[part], start, None if moved is None else moved[part])
+            yield from creep_states(values[part], run.time[part], start, run.moved_in(part))
 
     def _with_creep(self, creep: Floats) -> Floats:
         """(M, F, N) features with the creep that the spectra `creep` (J, N) add."""
+        if not creep.any():
+            return self._features
         added = [np.einsum("jfn,jn->fn", state, creep) for state in self._creep_states(self._features)]
         return self._features + np.array(added)
 
@@ -188,7 +195,7 @@ class OwnLaws:
     def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior."""
         left = measured - crept[:, 0] @ gains
-        solved = _solve(_without(crept[:, 1:], free), _without(left, free), gains, self._prior, self._between)
+        solved = _solve(without(crept[:, 1:], free), without(left, free), gains, self._prior, self._between)
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(self, position: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats) -> Floats:
@@ -196,7 +203,7 @@ class OwnLaws:
         elements = np.array(list(self._creep_states(position)))[keep]
         left = measured - (position[keep] + self._creep * elements.sum(axis=1)) @ gains
         return self._creep + _solve(
-            _without(elements, free), _without(left, free), gains, self._creep_prior, self._creep_between
+            without(elements, free), without(left, free), gains, self._creep_prior, self._creep_between
         )
 
 
@@ -212,9 +219,9 @@ def pattern_basis(radius: Floats, orders: int) -> Floats:
     return np.asarray(axes[:, strongest] * np.sqrt(size[strongest]))
 
 
-def _without(rows: Floats, free: Floats) -> Floats:
-    """`rows` (M, ...) less what the orthonormal columns `free` (M, C) explain."""
-    return rows - np.tensordot(free, np.tensordot(free.T, rows, 1), 1)
+def _alike(actuators: int, spread: float) -> Floats:
+    """(N, N) inverse prior covariance over actuators that share a common part and differ by `spread` of it."""
+    return np.asarray(np.linalg.inv(np.ones((actuators, actuators)) + spread**2 * np.eye(actuators)))
 
 
 def _solve(features: Floats, left: Floats, gains: Floats, prior: Floats, between: Floats) -> Floats:

@@ -97,13 +97,18 @@ def identify_response(
         Arrays that do not belong together, measurements that never change, or times that run backwards.
     """
     signals, values = (np.asarray(array, dtype=np.float64) for array in (commands, measured))
-    if signals.ndim != 2 or not np.isfinite(signals).all():
-        raise ValueError(f"commands has the shape {signals.shape}: must be (measurements, actuators) finite numbers")
+    if signals.ndim != 2 or not signals.size:
+        raise ValueError(f"commands has the shape {signals.shape}: must be (measurements, actuators)")
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(signals).all(axis=1))
+    if not finite.all():
+        raise ValueError(f"commands: row {_first(~finite)} holds NaN or an infinity")
     if values.ndim != 2 or len(values) != len(signals):
         raise ValueError(f"measured has the shape {values.shape}: must be ({len(signals)}, numbers of a measurement)")
     if np.abs(signals).max() > 1.0 + 1e-9:
         raise ValueError(f"commands reach {np.abs(signals).max():g}: must be normalised to -1 to 1")
     seconds = _seconds(times, len(signals))
+    if not np.ptp(seconds) > 0.0:
+        raise ValueError("times: all are the same; leave them out where they are not known")
     usable: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     size = float(values[usable].std(axis=0).max()) if usable.any() else 0.0
     if not size > 0.0:
@@ -133,9 +138,16 @@ def identify_response(
 
 def _seconds(times: ArrayLike | None, count: int) -> Floats:
     seconds = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, dtype=np.float64)
-    if seconds.shape != (count,) or not np.isfinite(seconds).all():
-        raise ValueError(f"times has the shape {seconds.shape}: must be ({count},) finite numbers, s")
+    if seconds.shape != (count,):
+        raise ValueError(f"times has the shape {seconds.shape}: must be ({count},), s")
+    if not np.isfinite(seconds).all():
+        raise ValueError(f"times: number {_first(~np.isfinite(seconds))} is NaN or infinite")
     return seconds - seconds[0]
+
+
+def _first(rows: NDArray[np.bool_]) -> int:
+    """Number of the first of `rows` that is true, from 1."""
+    return int(rows.argmax()) + 1
 
 
 def _effective(law: HysteresisModel, signals: Floats, seconds: Floats) -> Floats:

@@ -28,15 +28,21 @@ def parts_of(segment: NDArray[np.int64]) -> list[slice]:
     return [slice(begin, end) for begin, end in pairwise(bounds)]
 
 
-def starts_of(parts: list[slice], time: Floats, moved: Floats | None) -> list[float]:
-    """When the degauss before each part but the first had ended, s; `time`, `moved` (M,) s as in a run."""
+def starts_of(parts: list[slice], first: float, time: Floats, moved: Floats | None) -> list[float]:
+    """When the degauss before each part had ended, s.
+
+    Args:
+        first: s, that before the first.
+        time, moved: (M,) s, as in a run.
+    """
     stood = time if moved is None else moved
-    return [float(stood[part.start]) - BEFORE_FIRST_MAP_S for part in parts[1:]]
+    return [first, *(float(stood[part.start]) - BEFORE_FIRST_MAP_S for part in parts[1:])]
 
 
-def in_parts(parts: list[slice], work: Callable[[slice], Floats]) -> Floats:
-    """What `work` makes of each part, one after the other."""
-    return work(parts[0]) if len(parts) == 1 else np.concatenate([work(part) for part in parts])
+def in_parts(parts: list[slice], starts: list[float], work: Callable[[slice, float], Floats]) -> Floats:
+    """What `work` makes of each part and its start, s, one after the other."""
+    made = [work(part, start) for part, start in zip(parts, starts, strict=True)]
+    return made[0] if len(made) == 1 else np.concatenate(made)
 
 
 def figure_columns(time: Floats, parts: list[slice], starts: list[float]) -> Floats:
@@ -62,6 +68,11 @@ def basis_of(columns: Floats) -> Floats:
     """Orthonormal columns that span `columns`, which may be 0 or alike in the rows at hand."""
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(left[:, size > 1e-9 * size[0]])
+
+
+def without(rows: Floats, free: Floats) -> Floats:
+    """`rows` (M, ...) less what the orthonormal columns `free` (M, C) explain."""
+    return rows - np.tensordot(free, np.tensordot(free.T, rows, 1), 1)
 
 
 def _begins(parts: list[slice], count: int) -> NDArray[np.bool_]:

@@ -171,6 +171,21 @@ def usable_sag(maps: MapSet, reasons: list[str]) -> Floats:
     return sag
 
 
+def complete_sag(maps: MapSet, model: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Which maps hold data (M,), and their sag (M, P) m with piston and tilt removed; that of the others is zero.
+
+    Args:
+        model: (M, P) m, sag to fill points without data from.
+
+    Raises:
+        TooFewMapsError: no map holds data.
+    """
+    usable: NDArray[np.bool_] = np.asarray(np.isfinite(maps.sag).any(axis=1))
+    sag = usable_sag(maps, ["" if good else "no data" for good in usable])
+    sag[usable] = fill_gaps(maps.sag[usable], model[usable], maps.points)
+    return usable, sag
+
+
 def regress(design: Design, maps: MapSet, sag: Floats) -> tuple[Regression, Floats]:
     """Regress coefficients and sag together; points without data are filled from the fit, round by round.
 

@@ -33,7 +33,8 @@ class BumpOptions:
         tilt_max: of the sag at the edge by tilt, m.
         shift_max: of the aperture on the map, m at the mirror.
         figure_max: of the rms figure, beyond what hysteresis may have left, m.
-        hysteresis_allowance: share of their moves by which actuators may miss their mark.
+        hysteresis_allowance: share of their moves by which actuators may miss their mark; twice that is allowed for,
+            since actuators that moved together err together.
     """
 
     tilt_max: float = 3e-6

@@ -41,7 +41,7 @@ def forecast(plan: Plan, settle_time: float, earlier: Calibration | None) -> For
     if earlier is not None and len(earlier.maps) > 1:
         gap = np.diff(np.sort(earlier.maps.stamp_ns)) * 1e-9
         per_map = max(float(np.median(gap)), settle_time)
-    time = np.cumsum([per_map - (1.0 - step.settled) * settle_time + step.dwell for step in steps])
+    time = np.cumsum([per_map - (1.0 - step.settle_share) * settle_time + step.dwell for step in steps])
     duration = float(time[-1]) if len(time) else 0.0
     signals = [step.signals for step in steps if step.signals is not None]
     check = np.array([step.kind is StepKind.CHECK for step in steps], dtype=bool)

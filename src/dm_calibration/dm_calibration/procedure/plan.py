@@ -50,7 +50,7 @@ class Step:
         signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes.
         nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
         dwell: to hold the shape beyond the settle time, s.
-        settled: share of the settle time to wait.
+        settle_share: of the settle time to wait.
     """
 
     label: str
@@ -58,7 +58,7 @@ class Step:
     signals: Floats | None = None
     nominal: Floats | None = None
     dwell: float = 0.0
-    settled: float = 1.0
+    settle_share: float = 1.0
 
     @property
     def needs_model(self) -> bool:
@@ -138,10 +138,10 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     commands = excitation(mirror, options.hysteresis_maps)
     steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
     steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]
-    rows = zip(commands.signals, commands.dwell, commands.settled, commands.check, strict=True)
-    for k, (signals, dwell, settled, check) in enumerate(rows):
+    rows = zip(commands.signals, commands.dwell, commands.settle_share, commands.check, strict=True)
+    for k, (signals, dwell, share, check) in enumerate(rows):
         kind = StepKind.CHECK if check else StepKind.EXCITATION
-        steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell), settled=float(settled)))
+        steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell), settle_share=float(share)))
         if (k + 1) % HYSTERESIS_REFERENCE_EVERY == 0:
             steps.append(Step(f"reference {2 + k // HYSTERESIS_REFERENCE_EVERY}", StepKind.REFERENCE, mirror.rest))
     return Plan(PlanKind.HYSTERESIS, tuple(steps))

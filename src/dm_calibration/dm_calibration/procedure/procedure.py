@@ -172,7 +172,7 @@ class Procedure:
     def _measure_state(self, step: Step, number: int, repeats: int) -> None:
         assert step.signals is not None
         applied = self._bench.apply(step.signals)
-        if not self._bench.settle(step.dwell, step.settled):
+        if not self._bench.settle(step.dwell, step.settle_share):
             raise Cancelled("cancelled while settling")
         taken = 0
         failure = MeasurementError(ErrorCode.MAP_REJECTED, "")

@@ -42,7 +42,7 @@ class MapListener:
     """Gives maps that arrive to :class:`RecalibrationManager` and publishes what they change.
 
     Args:
-        bench: measures for the service.
+        services: measure for the service.
         busy: whether a calibration is running; its maps are not taken.
     """
 
@@ -54,7 +54,11 @@ class MapListener:
         services: BenchServices,
         busy: Callable[[], bool],
     ) -> None:
-        self._node, self._values, self._manager, self._services, self._busy = node, values, manager, services, busy
+        self._node = node
+        self._values = values
+        self._manager = manager
+        self._services = services
+        self._busy = busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
         self._history = AppliedHistory()
         self._law: HysteresisModel | None = None
@@ -63,7 +67,8 @@ class MapListener:
         self._judged: deque[int] = deque(maxlen=STAMPS_KEPT)
         self._taken = self._refused = 0
         self._last_refusal = ""
-        self._dirty = self._was_stale = False
+        self._dirty = False
+        self._was_stale = False
         self._published_at = float("-inf")
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="updates")
         node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
@@ -224,10 +229,8 @@ class MapListener:
             updates = self._updates.updates
             if updates is not None:
                 response.revision = updates.revision
-                response.gain_drift, response.offset_drift = (
-                    abs(updates.largest_gain[0]),
-                    updates.offset_rms,
-                )
+                response.gain_drift = abs(updates.largest_gain[0])
+                response.offset_drift = updates.offset_rms
         return response
 
     def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from dm_calibration.hysteresis.features import crept, play_features
-from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of
+from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of, without
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.regression import drift_columns, usable_sag
+from dm_calibration.influence.regression import complete_sag, drift_columns
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_common.optics.piston_tilt import fill_gaps
 
 Floats = NDArray[np.float64]
 
@@ -59,30 +58,25 @@ class RunHistory:
             model: (M, P) m, sag to fill points without data from.
         """
         self._maps = maps
-        reasons = ["" if np.isfinite(row).any() else "no data" for row in maps.sag]
-        self.usable = np.array([not reason for reason in reasons])
-        self._sag = usable_sag(maps, reasons)
-        self._sag[self.usable] = fill_gaps(maps.sag[self.usable], model[self.usable], maps.points)
+        self._usable, self._sag = complete_sag(maps, model)
         self._figure = drift_columns(maps.stamp_ns, maps.reference)
         self._radius = np.array((0.0, *PLAY_RADII))
-        parts = parts_of(maps.segment)
-        self._plays = in_parts(parts, lambda part: play_features(maps.applied[part], self._radius, 1))
         time = np.maximum.accumulate(1e-9 * (maps.stamp_ns - maps.stamp_ns[0]))  # whatever the clock did
         moved = np.clip(maps.moved_s(), np.concatenate((time[:1], time[:-1])), time)
-
-        def creep_of(part: slice) -> Floats:
-            start = float(moved[part][0]) - BEFORE_FIRST_MAP_S
-            return crept(self._plays[part], time[part], start, moved[part])
-
-        self._crept = in_parts(parts, creep_of)
+        parts = parts_of(maps.segment)
+        starts = starts_of(parts, float(moved[0]) - BEFORE_FIRST_MAP_S, time, moved)
+        self._plays = in_parts(parts, starts, lambda part, start: play_features(maps.applied[part], self._radius, 1))
+        self._crept = in_parts(
+            parts, starts, lambda part, start: crept(self._plays[part], time[part], start, moved[part])
+        )
 
     def fit(self, keep: NDArray[np.bool_]) -> SagModel:
         """The model that explains the maps in `keep` (M,) best."""
-        keep = keep & self.usable
+        keep = keep & self._usable
         area = np.sqrt(self._maps.points.weight)
         figure, sag = self._figure[keep], self._sag[keep] * area
         free = np.linalg.qr(figure)[0]  # what the figure takes up is no evidence about the weights
-        without_figure = sag - free @ (free.T @ sag)
+        without_figure = without(sag, free)
         weights, rate = np.eye(len(self._radius))[0], 0.0
         for _ in range(ROUNDS):
             design = np.hstack((figure, self._effective(weights, rate)[keep]))
@@ -97,10 +91,8 @@ class RunHistory:
     @staticmethod
     def _weights(columns: Floats, free: Floats, sag: Floats) -> Floats:
         """Weights (F,) >= 0 with columns (M, F, P) summing up to the sag (M, P); the first scaled to 1."""
-        count, features, points = columns.shape
-        columns = columns.reshape(count, -1)
-        columns = (columns - free @ (free.T @ columns)).reshape(count, features, points)
-        columns = np.moveaxis(columns, 1, 2).reshape(-1, features)
+        features = columns.shape[1]
+        columns = np.moveaxis(without(columns, free), 1, 2).reshape(-1, features)
         q, r = np.linalg.qr(columns)
         weights = nnls(r, q.T @ sag.ravel())[0]
         return np.asarray(weights / weights[0]) if weights[0] > 0.0 else np.eye(features)[0]
