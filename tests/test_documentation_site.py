@@ -96,6 +96,13 @@ def test_the_reach_is_that_of_the_optics() -> None:
     assert far == pytest.approx(0.0, abs=1e-9)
 
 
+def test_every_picture_can_be_made_again() -> None:
+    rows = set(re.findall(r"(?m)^\| `([\w-]+\.\w+)` \| \S", (ROOT / "CONTRIBUTING.md").read_text()))
+    assert rows == {path.name for path in (DOCS / "images").iterdir() if path.suffix != ".py"}
+    shown = {name for page in PAGES for name in re.findall(r"\((?:docs/)?images/([^)]+)\)", page.read_text())}
+    assert shown == rows, "a picture that no page shows"
+
+
 def test_the_image_is_made_as_the_hosted_checks_do() -> None:
     image, checks = ((ROOT / name).read_text() for name in ("Dockerfile", ".github/workflows/ci.yml"))
     for step in re.findall(r"(rosdep install .*?-y|grep -E \S+ \S+)", image):
