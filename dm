@@ -34,21 +34,22 @@ SUPPORTED_PYTHON = ((3, 11), (3, 13))
 USAGE = """\
 usage: ./dm COMMAND [OPTION ...]
 
-The two commands to begin with
-  demo       calibrate a virtual PDM30-37 over the real nodes, wire protocol and file formats, then focus it
-  test       set everything up and run all checks: ruff, mypy, pytest
+The first hour
+  up         start the nodes (--config FILE: against hardware; without: with the virtual bench)
+  calibrate  measure and store a calibration with hysteresis and creep, about 100 maps
+  focus      ask for a curvature (or --dioptre): the promise first, then the move
+  status     what runs, where the mirror stands, what it promises, what to do next
 
 On the bench
-  up         start the nodes (--config FILE: against hardware; without: with the virtual bench)
-  calibrate  measure and store a calibration (--plan hysteresis: hysteresis and creep too)
-  focus      ask for a curvature (or --dioptre): prediction first, then the move
-  recipes    build conditioned recipes for a list of curvatures on the interferometer
-  check      compare the calibration in use with a map, and let the map improve it
+  check      compare promise and map, and let the map improve the calibration
+  flatten    as flat as the mirror can;  degauss  remove the hysteresis;  measure  take one map
   report     a page and a PDF of one calibration, to keep
+  recipes    build conditioned recipes for a list of curvatures on the interferometer
   record     write what the nodes say to an MCAP file;  replay  plays it back
   console    a web page of the bench, on the loopback
 
 On the simulation, with figures
+  demo       calibrate a virtual PDM30-37 over the real nodes, wire protocol and file formats, then focus it
   compare    all solvers, open and closed loop, beside the fitting limit (--hysteresis: hysteresis and creep;
              --mirrors N: mirrors drawn at random)
   paper      the paper's tables and figures on one bench, as a page
@@ -58,8 +59,11 @@ On the simulation, with figures
   doctor     say what is missing or wrong, and how to cure it
   security   least-privilege policies of every node for SROS 2, written or checked
   exec       run any command inside the environment: ./dm exec python my_script.py
+  test       set everything up and run all checks: ruff, mypy, pytest
 
-Every command has --help, and --json FILE where it yields figures. Set-up runs by itself when it is needed.
+Every command has --help, and --json FILE (- = standard output) where it yields figures. Set-up runs by itself.
+Exit codes: 0 done; 1 refused or failed, the reason on standard error; 2 wrong usage; 3 the nodes are not running;
+130 interrupted by Ctrl-C. --version says which version this is.
 --install-completion makes the Tab key complete commands and options in your shell; --show-completion prints the script.
 """
 
@@ -338,7 +342,7 @@ def main(arguments: list[str]) -> int:
         return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_tools"], run_environment())
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE, end="")
-        return 0 if arguments else 2
+        return 0
     command, rest = arguments[0], arguments[1:]
     try:
         if command == "doctor" and missing_tools():

@@ -129,6 +129,15 @@ def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert finding is not None and str(tmp_path) in finding.problem
 
 
+def test_disk_use_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    maps = tmp_path / ".ros" / "dm_bench" / "maps"
+    maps.mkdir(parents=True)
+    (maps / "a.dat").write_bytes(bytes(3_000_000))
+    finding = doctor_machine.disk_use()
+    assert not finding.cure and finding.problem.endswith("3 MB in ~/.ros/dm_bench")
+
+
 def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
     none = doctor_bench.stored_calibration(tmp_path, "T-1")
     assert none is not None and none.note and "no calibration of the mirror T-1" in none.problem
@@ -188,12 +197,13 @@ def test_nodes_of_the_same_name(domain: int, monkeypatch: pytest.MonkeyPatch) ->
     rclpy.init(context=context, domain_id=domain)
     nodes = [Node("pdm_driver", context=context)]
     try:
-        assert doctor_machine.running_nodes("elsewhere") is None
+        none = doctor_machine.running_nodes("elsewhere")
+        assert none.note and "./dm up" in none.cure
         once = doctor_machine.running_nodes()
-        assert once is not None and once.note and f"pdm_driver: running in the domain {domain}" in once.problem
+        assert not once.cure and f"pdm_driver, in the ROS domain {domain}" in once.problem
         nodes.append(Node("pdm_driver", context=context))
         twice = doctor_machine.running_nodes()
-        assert twice is not None and not twice.note and "pdm_driver: running more than once" in twice.problem
+        assert not twice.note and "pdm_driver: running more than once" in twice.problem
     finally:
         for node in nodes:
             node.destroy_node()

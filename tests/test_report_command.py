@@ -32,7 +32,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> CalibrationStore:
 
 def test_the_newest_is_reported(store: CalibrationStore, tmp_path: Path) -> None:
     figures = tmp_path / "figures.json"
-    report("", tmp_path / "out", store.folder, figures)
+    report("", tmp_path / "out", store.folder, json=figures)
     told = json.loads(figures.read_text())
     assert told["id"] == "newer"
     assert told["remeasured_max_zernike_nm"] is None

@@ -32,7 +32,7 @@ from dm_calibration.recalibration.map_listener import PUBLISH_PERIOD_S, MapListe
 from dm_calibration.regression.error_prediction import ErrorPrediction
 from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.errors import EXPECTED, ErrorCode, Refusal
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.messages import mirror_from, recipe_book_from, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.bench_services import BenchServices
@@ -123,7 +123,10 @@ class CalibrationNode(Node):
             calibration = self._manager.load("" if name == "newest" else name)
             self.get_logger().info(f"calibration {calibration.id} loaded at start")
         except EXPECTED as error:
-            self.get_logger().warning(f"load_on_start = {name!r}: {error}")
+            if name == "newest" and error_code(error) == ErrorCode.NOT_CALIBRATED:  # a bench that is new
+                self.get_logger().info(f"{error}: calibrate first")
+            else:
+                self.get_logger().warning(f"load_on_start = {name!r}: {error}")
 
     def _on_list(self, _request: Any, response: Any) -> Any:
         in_use = self._manager.in_use

@@ -205,7 +205,7 @@ class FocusController:
         assert self.active is not None
         order.began = now.steady
         sent = Sent(SendCommand(move.signals, now.ns), order, now.time, now.steady)
-        shape = CommandedShape(move, self.active.planner, sent, self._holds(), now.time)
+        shape = CommandedShape(move, self.active.planner, sent, self._holds(), now.time, began=now.time)
         self.monitor.shape = self.hold.shape = shape
         return sent.command
 

@@ -12,6 +12,7 @@ from dm_msgs.msg import ActuatorState, Capabilities, FocusState, MirrorInfo
 from dm_common.errors import Refusal
 from dm_common.messages import applied_from, doubles, stamp_ns, time_message
 from dm_common.ros import diagnostics
+from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_types import DriverReport, Moment, Outcome
 from dm_controller.forecast import HysteresisShare
@@ -100,14 +101,24 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
 
 
 def health(controller: FocusController, values: Mapping[str, Any], now: Moment) -> diagnostics.Health:
-    """The health of the node whose parameters are `values`."""
-    figures = {
+    """The health of the node whose parameters are `values`.
+
+    While the shape stands that was asked for: its curvature (1/m), since when (s), the 95 % bound on its error (m).
+    """
+    figures: dict[str, object] = {
         "requests": controller.requests,
         "refused": controller.refused,
         "history": controller.observer.unknown or "known",
         "held": controller.hold.active,
         "corrections": controller.hold.corrections,
     }
+    shape, report = controller.monitor.shape, controller.monitor.latest
+    if shape is not None and shape.kept and report and same_signals(report.requested, shape.sent.command.signals):
+        figures |= {
+            "curvature": shape.move.target.curvature,
+            "stands for": f"{now.time - shape.began:.1f}",
+            "bound": shape.move.plan.max_zernike_upper,
+        }
     text = trouble(controller, values, now)
     return diagnostics.Health(diagnostics.WARN if text else diagnostics.OK, text or "ready", figures)
 

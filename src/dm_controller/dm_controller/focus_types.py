@@ -193,6 +193,7 @@ class CommandedShape:
         held: it is corrected for creep.
         checked: s, ROS time, when creep was looked at last.
         kept: its move was not stopped.
+        began: s, ROS time, when it was commanded first.
     """
 
     move: Move
@@ -201,6 +202,7 @@ class CommandedShape:
     held: bool
     checked: float
     kept: bool = True
+    began: float = 0.0
 
 
 Effect = SendCommand | StartDegauss | PublishState | PublishCapabilities | Log

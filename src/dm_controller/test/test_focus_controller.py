@@ -19,6 +19,7 @@ from dm_common.hysteresis.observer import Applied
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
 from dm_controller.focus_controller import FocusController
+from dm_controller.focus_messages import health
 from dm_controller.focus_types import (
     DriverReport,
     Effect,
@@ -552,3 +553,15 @@ def test_a_calibration_that_cannot_be_used_ends_the_hold(bench: Bench, message: 
     assert not bench.controller.hold.active
     bench.ask(0.01)
     assert bench.refusal().error_code == code
+
+
+def test_health_says_what_stands_as_long_as_it_does() -> None:
+    bench = Bench()
+    assert "curvature" not in health(bench.controller, VALUES, bench.now).values
+    bench.ask(0.02)
+    bench.wait(40.0)
+    told = health(bench.controller, VALUES, bench.now).values
+    assert (told["curvature"], told["held"]) == (0.02, True) and bench.controller.hold.corrections
+    assert float(str(told["stands for"])) == pytest.approx(40.0, abs=0.1) and 0.0 < float(str(told["bound"])) < 1e-6
+    bench.degauss()
+    assert "curvature" not in health(bench.controller, VALUES, bench.now).values

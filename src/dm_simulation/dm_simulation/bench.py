@@ -17,7 +17,7 @@ from dm_simulation.electronics.monitor import Monitor, MonitorConfig
 from dm_simulation.electronics.server import OFF, ElectronicsServer, PortsConfig
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.trigger_server import TriggerServer
-from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx
+from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx, prune
 from dm_simulation.mirror.membrane import Membrane, MembraneConfig
 from dm_simulation.mirror.piezo import DRAWN, PiezoActuators, PiezoConfig
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
@@ -27,13 +27,14 @@ from dm_simulation.mirror.zernike import Array
 @dataclass(frozen=True)
 class FilesConfig:
     """Map files: where they go, "dat" or "datx", unit of .datx heights, intensity frame in .dat, seconds over which a
-    file grows (0: it appears whole), and the name of the part."""
+    file grows (0: it appears whole), bytes of maps that are kept there (0: all), and the name of the part."""
 
     folder: Path = Path("maps")
     format: str = "datx"
     datx_unit: str = "NanoMeters"
     intensity: bool = False
     slow_write: float = 0.0
+    limit: float = 5e8
     part_name: str = "PDM30-37"
 
 
@@ -172,6 +173,8 @@ class VirtualBench:
             else:
                 content = encode_datx(*facts, unit=files.datx_unit, part_name=files.part_name)
             deliver(content, path, files.slow_write)
+            if files.limit and path.parent == files.folder.absolute():
+                prune(path.parent, files.limit)
             self.maps_written += 1
         return path
 

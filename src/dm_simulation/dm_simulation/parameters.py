@@ -207,6 +207,11 @@ PARAMETERS = (
         "Wall time over which a file grows; 0 = it appears whole.",
     ),
     Parameter(
+        "output_limit",
+        real(_FILES.limit, 0.0, 1e15, "B"),
+        "Maps in output_folder are removed, the oldest first, beyond this; 0 = all are kept.",
+    ),
+    Parameter(
         "clock.speed",
         real(0.0, 0.0, 1e4),
         "Publish /clock at this multiple of the wall clock, and live by it; 0 = no /clock, the node's own time.",
@@ -252,6 +257,7 @@ def bench_config(values: Mapping[str, Any]) -> BenchConfig:
             datx_unit=values["output_datx_unit"],
             intensity=values["output_intensity"],
             slow_write=values["output_slow_write"],
+            limit=values["output_limit"],
             part_name=values["mirror.name"],
         ),
         trigger_port=values["trigger.port"],

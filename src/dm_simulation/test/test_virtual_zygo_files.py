@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 import threading
 import time
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dm_simulation.interferometer.zygo_files import deliver, encode_dat, encode_datx
+from dm_simulation.interferometer.zygo_files import deliver, encode_dat, encode_datx, prune
 
 WAVELENGTH = 632.8e-9
 
@@ -124,3 +125,15 @@ def test_a_slow_file_grows_in_pieces(tmp_path: Path) -> None:
 def test_a_missing_folder_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         deliver(b"x", tmp_path / "none" / "map.dat")
+
+
+def test_the_oldest_maps_go_and_nothing_else(tmp_path: Path) -> None:
+    maps = [tmp_path / f"measure_{number}_1.dat" for number in range(3)] + [tmp_path / "map_000001.datx"]
+    others = [tmp_path / "my_map.dat", tmp_path / "measure_notes.dat", tmp_path / "map_1.txt"]
+    for number, path in enumerate([*others, *maps]):
+        path.write_bytes(bytes(100))
+        os.utime(path, (number, number))
+    prune(tmp_path, 250)
+    assert [path for path in (*others, *maps) if path.exists()] == [*others, *maps[2:]]
+    prune(tmp_path, 1)
+    assert [path for path in maps if path.exists()] == maps[3:], "the newest stays"

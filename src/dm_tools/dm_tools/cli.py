@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
-from dm_tools.output import fail
+from dm_tools.output import NotRunningError, fail
 
 #: Module of each verb, in the order of the help text; its function has the verb's name.
 VERBS = {
     "demo": "dm_tools.demo.demo",
     "up": "dm_tools.verbs.up",
+    "status": "dm_tools.verbs.status",
     "calibrate": "dm_tools.verbs.calibrate",
-    "recipes": "dm_tools.verbs.recipes",
-    "report": "dm_tools.verbs.report",
     "focus": "dm_tools.verbs.focus",
+    "flatten": "dm_tools.verbs.focus",
+    "degauss": "dm_tools.verbs.focus",
+    "measure": "dm_tools.verbs.measure",
+    "check": "dm_tools.verbs.measure",
+    "report": "dm_tools.verbs.report",
+    "recipes": "dm_tools.verbs.recipes",
     "console": "dm_tools.verbs.console",
     "compare": "studies.verbs.compare",
     "paper": "studies.verbs.paper",
@@ -26,13 +34,49 @@ VERBS = {
     "faults": "fault_injection.verb",
     "security": "dm_tools.verbs.security",
     "doctor": "dm_tools.verbs.doctor",
-    "check": "dm_tools.verbs.verify_calibration",
     "test": "studies.verbs.run_checks",
 }
 #: Packages that are not installed: their verbs are there where the checkout is.
 CHECKOUT = ("studies", "fault_injection")
 #: Settings of verbs that take more than their own options: `test` hands the rest to pytest.
 SETTINGS = {"test": {"allow_extra_args": True, "ignore_unknown_options": True}}
+#: An argument that is a number below zero, and no option.
+NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+#: Exit codes, as the help says them.
+REFUSED, NOT_RUNNING, INTERRUPTED = 1, 3, 130
+EXIT_CODES = f"""Exit codes: 0 done; {REFUSED} refused or failed, with the reason on standard error; 2 wrong usage;
+{NOT_RUNNING} the nodes are not running; {INTERRUPTED} interrupted by Ctrl-C."""
+
+
+class Command(TyperCommand):
+    """A verb that takes `-0.02` for the number it is."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the first negative number that is no option's value behind `--`, where nothing is an option."""
+        valued = {name for option in self.params if not getattr(option, "is_flag", True) for name in option.opts}
+        for place, word in enumerate(args):
+            if word == "--":
+                break
+            if NEGATIVE.fullmatch(word) and (place == 0 or args[place - 1] not in valued):
+                args = [*args[:place], *args[place + 1 :], "--", word]
+                break
+        return super().parse_args(ctx, args)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"dm {version('dm_tools')}, Python {sys.version.split()[0]}, {sys.prefix}")
+        raise typer.Exit
+
+
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Say which version this is.", callback=_show_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Options of the command itself."""
 
 
 def make_app() -> typer.Typer:
@@ -40,11 +84,13 @@ def make_app() -> typer.Typer:
     app = typer.Typer(
         name="dm",
         help="Open-loop focus with a deformable mirror: calibrate once, then ask for a curvature.",
+        epilog=EXIT_CODES,
         no_args_is_help=True,
         add_completion=True,
-        rich_markup_mode="markdown",
+        rich_markup_mode="markdown" if sys.stderr.isatty() else None,  # frames are for screens
         pretty_exceptions_enable=False,
     )
+    app.callback()(_options)
     for name, module in VERBS.items():
         try:
             function = getattr(importlib.import_module(module), name)
@@ -52,7 +98,7 @@ def make_app() -> typer.Typer:
             if error.name not in CHECKOUT:
                 raise
         else:
-            app.command(name=name, context_settings=SETTINGS.get(name))(function)
+            app.command(name=name, cls=Command, context_settings=SETTINGS.get(name))(function)
     return app
 
 
@@ -65,6 +111,6 @@ def main() -> None:
         app(prog_name="dm")
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
         fail(str(error))
-        sys.exit(1)
+        sys.exit(NOT_RUNNING if isinstance(error, NotRunningError) else REFUSED)
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(INTERRUPTED)

@@ -1,4 +1,4 @@
-"""What the subcommands share: the console, figures as JSON, progress bars."""
+"""What the subcommands share: the console, figures as JSON, progress bars, how they end."""
 
 from __future__ import annotations
 
@@ -15,20 +15,50 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 errors = Console(stderr=True, highlight=False)
 
+#: `--json -`.
+STANDARD_OUTPUT = Path("-")
 #: The wavelength that coefficients are compared with on screens [m].
 WAVELENGTH = 632.8e-9
 
-JsonOption = Annotated[Path | None, typer.Option("--json", help="Write the figures to this file.", metavar="FILE")]
+
+def _free_standard_output(path: Path | None) -> Path | None:
+    """Where figures go to standard output, everything else is written on standard error."""
+    console.file = sys.stderr if path == STANDARD_OUTPUT else None  # type: ignore[assignment]
+    return path
+
+
+JsonOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        help="Write the figures to this file, - = standard output.",
+        metavar="FILE",
+        callback=_free_standard_output,
+    ),
+]
 NamespaceOption = Annotated[str, typer.Option("--namespace", help="Namespace of the mirror, one per mirror.")]
+
+
+class NotRunningError(RuntimeError):
+    """No node of the suite is running where the command looks for it."""
 
 
 def fail(message: str) -> None:
     """Say what went wrong on standard error."""
-    errors.print(f"[bold red]error:[/] {message}", soft_wrap=True, markup=True)
+    errors.print("[bold red]error:[/]", end=" ")
+    errors.print(message, soft_wrap=True, markup=False)
+
+
+def next_step(text: str) -> None:
+    """The last line of a command: what one does after it."""
+    console.print(f"[dim]next: {text}[/]", soft_wrap=True)
 
 
 def progress_bar(steady: bool = True) -> Progress:
-    """A progress bar with step i of n and the time left; not `steady` = drawn only when `refresh()` is called."""
+    """A progress bar with step i of n and the time left; not `steady` = drawn only when `refresh()` is called.
+
+    Nothing is drawn where nobody watches: into a pipe or a file.
+    """
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -38,6 +68,7 @@ def progress_bar(steady: bool = True) -> Progress:
         console=console,
         refresh_per_second=4,
         auto_refresh=steady,
+        disable=not console.is_terminal,
     )
 
 
@@ -53,12 +84,16 @@ def _plain(value: Any) -> Any:
 
 
 def write_json(path: Path | None, figures: dict[str, Any]) -> None:
-    """Write figures whole or not at all; None writes nothing."""
+    """Write figures whole or not at all, `-` to standard output; None writes nothing."""
     from dm_calibration.store.atomic_write import write_whole
 
     if path is None:
         return
-    write_whole(path, (json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n").encode())
+    text = json.dumps(_plain(figures), indent=2, allow_nan=False) + "\n"
+    if path == STANDARD_OUTPUT:
+        sys.stdout.write(text)
+        return
+    write_whole(path, text.encode())
     console.print(f"figures: {path}")
 
 

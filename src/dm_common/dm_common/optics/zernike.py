@@ -19,6 +19,23 @@ MAX_ORDER = 5
 PISTON_TILT = 3
 
 
+#: What opticians call the terms of radial order n and azimuthal order m.
+_SPOKEN = {
+    (0, 0): "piston",
+    (1, 1): "tilt",
+    (2, 0): "defocus",
+    (2, 2): "astigmatism",
+    (3, 1): "coma",
+    (3, 3): "trefoil",
+    (4, 0): "spherical aberration",
+    (4, 2): "secondary astigmatism",
+    (4, 4): "tetrafoil",
+    (5, 1): "secondary coma",
+    (5, 3): "secondary trefoil",
+    (5, 5): "pentafoil",
+}
+
+
 class Term(NamedTuple):
     """R_n^m(r) cos(m theta) or R_n^m(r) sin(m theta)."""
 
@@ -30,6 +47,11 @@ class Term(NamedTuple):
     def name(self) -> str:
         """For example `Z_2^0` or `Z_2^2 cos`."""
         return f"Z_{self.n}^{self.m} {self.kind}".strip()
+
+    @property
+    def spoken(self) -> str:
+        """What opticians call it, for example `defocus` or `astigmatism cos`."""
+        return f"{_SPOKEN[self.n, self.m]} {self.kind}".strip()
 
     @property
     def rms(self) -> float:
@@ -60,6 +82,10 @@ TERMS: tuple[Term, ...] = tuple(
 
 NAMES: tuple[str, ...] = tuple(term.name for term in TERMS)
 
+#: What opticians call each term.
+SPOKEN: tuple[str, ...] = tuple(term.spoken for term in TERMS)
+_DEFOCUS = TERMS.index(Term(2, 0, ""))
+
 #: Root mean square of each term over the unit disc.
 TERM_RMS: NDArray[np.float64] = np.array([term.rms for term in TERMS])
 TERM_RMS.flags.writeable = False
@@ -88,6 +114,15 @@ def basis(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
         radial = np.polynomial.polynomial.polyval(r2, _radial_factor(n, m))
         result[..., k] = radial * (angular[m].imag if kind == "sin" else angular[m].real)
     return result
+
+
+def curvature_of(coefficients: ArrayLike, radius: float) -> float:
+    """Curvature (1/m, positive = concave) of the paraboloid with the defocus of `coefficients` (21,), m.
+
+    Args:
+        radius: of the aperture, m.
+    """
+    return 4.0 * float(_checked(coefficients)[_DEFOCUS]) / radius**2
 
 
 def _checked(coefficients: ArrayLike) -> NDArray[np.float64]:

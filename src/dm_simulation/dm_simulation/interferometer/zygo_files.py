@@ -6,6 +6,7 @@ big-endian). `.datx`: HDF5 as Mx writes it.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import struct
@@ -26,6 +27,7 @@ RESOLUTION = (4096, 32768, 131072)
 #: What Mx stores where there is no data.
 NO_DATA = 1.7976931348623157e308
 FORMATS = ("dat", "datx")
+MAP_NAMES = tuple(f"{name}_[0-9]*.{suffix}" for name in ("map", "measure") for suffix in FORMATS)
 UNITS = ("Fringes", "NanoMeters")
 
 
@@ -164,3 +166,20 @@ def deliver(content: bytes, path: Path, seconds: float = 0.0, pieces: int = 8) -
     except OSError:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def prune(folder: Path, limit: float) -> None:
+    """Remove the oldest maps until those in `folder` take no more than `limit` bytes; the newest stays in any case.
+
+    Only names that the bench and the node `interferometer` give to maps count: whatever else is there is not ours.
+    """
+    maps = []
+    for path in (path for pattern in MAP_NAMES for path in folder.glob(pattern)):
+        with contextlib.suppress(OSError):  # somebody else removed it
+            maps.append((path.stat().st_mtime_ns, path.stat().st_size, path))
+    total = 0
+    for number, (_time, size, path) in enumerate(sorted(maps, reverse=True)):
+        total += size
+        if number and total > limit:
+            with contextlib.suppress(OSError):
+                path.unlink()

@@ -65,7 +65,7 @@ def _known(name: str) -> dict[str, Parameter]:
     return {item.name: item for node in NODES if node.name == name for item in node.load_parameters()}
 
 
-def _effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+def effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """The values of a node that is started with those `given`."""
     return {item.name: item.default for item in _known(name).values()} | dict(given)
 
@@ -126,7 +126,7 @@ def driver_configuration(config: Config) -> Finding | None:
     if any(value == UNSET for value in given.values()) or required_parameters(config) or parameters(config):
         return None  # reported already
     try:
-        build_configuration(_effective("pdm_driver", given))
+        build_configuration(effective("pdm_driver", given))
     except ValueError as error:
         return Finding(str(error), "correct the value; the driver refuses to configure with it")
     return None
@@ -211,7 +211,7 @@ def _holders(device: Path) -> list[str]:
 
 def free_ports(bench: Mapping[str, Any]) -> Finding | None:
     """Whether the ports that the bench wants are free."""
-    values, taken = _effective("virtual_bench", bench), []
+    values, taken = effective("virtual_bench", bench), []
     for name, kind in (
         ("electronics.tcp_port", socket.SOCK_STREAM),
         ("electronics.udp_port", socket.SOCK_DGRAM),

@@ -11,7 +11,7 @@ class Finding(NamedTuple):
 
     Attributes:
         problem: what is wrong, in words.
-        cure: what to do about it.
+        cure: what to do about it; "" = nothing, all is well.
         note: True = worth knowing, but nothing is broken.
     """
 

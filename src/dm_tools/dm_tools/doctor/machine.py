@@ -8,17 +8,18 @@ import shutil
 import subprocess
 import time
 import xml.etree.ElementTree as ElementTree
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from dm_bringup.nodes import NAMES, NODES
+from dm_bringup.nodes import NODES
 from dm_tools.doctor.finding import Check, Finding
 
 MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
 #: Each node takes a segment of 16 MB in /dev/shm, see config/fastdds.xml.
 SHARED_MEMORY_MIN = 128e6
 DISK_MIN = 1e9
+#: What the suite keeps in ~/.ros unless configured otherwise.
+FOLDERS = ("dm_bench", "dm_calibrations")
 #: DDS takes its ports from the domain; above this they run into those that the system hands out.
 DOMAIN_MAX = 101
 #: A node announces itself once, then every few seconds.
@@ -37,7 +38,7 @@ def machine_checks(namespace: str = "") -> list[Check]:
         ("ROS domain", domain),
         ("messages between nodes", messages),
         ("nodes that are running", lambda: running_nodes(namespace)),
-        ("disk", lambda: disk(Path.home())),
+        ("disk", disk_use),
         ("clock", clock),
     ]
 
@@ -121,35 +122,25 @@ def messages() -> Finding | None:
     return None
 
 
-def running_nodes(namespace: str = "") -> Finding | None:
-    """Nodes of the suite in this domain: twice is wrong, once is worth knowing; and how their clock differs."""
+def running_nodes(namespace: str = "") -> Finding:
+    """Nodes of the suite in this domain: twice is wrong, none is worth knowing; and how their clock differs."""
     from dm_client import DeformableMirrorClient
+    from dm_tools.running_suite import nodes_of_suite, where
 
     with DeformableMirrorClient(namespace) as client:
-        place = client.node.get_namespace()
-
-        def seen() -> Counter[str]:
-            found = client.node.get_node_names_and_namespaces()
-            return Counter(name for name, where in found if where == place and name in NAMES)
-
-        client.wait(lambda: max(seen().values(), default=0) > 1, DISCOVERY_S)
-        count = seen()
-        where = f"in the domain {os.environ.get('ROS_DOMAIN_ID', '0')}, namespace {place}"
+        client.wait(lambda: max(nodes_of_suite(client).values(), default=0) > 1, DISCOVERY_S)
+        count, place = nodes_of_suite(client), where(client)
         twice = [name for name in count if count[name] > 1]
         if twice:
             return Finding(
-                f"{', '.join(twice)}: running more than once {where}; they answer and command over each other",
+                f"{', '.join(twice)}: running more than once {place}; they answer and command over each other",
                 "end one of them, or give each mirror a --namespace or each bench a ROS_DOMAIN_ID of its own",
             )
         if count and (skew := _skew(client)) is not None:
             return skew
     if count:
-        return Finding(
-            f"{', '.join(count)}: running {where}",
-            "fine if they are yours; a second ./dm up needs another --namespace or ROS_DOMAIN_ID",
-            note=True,
-        )
-    return None
+        return Finding(f"{', '.join(count)}, {place}", "")
+    return Finding(f"none {place}", "./dm up starts them", note=True)
 
 
 def _skew(client: Any) -> Finding | None:
@@ -181,6 +172,19 @@ def disk(path: Path) -> Finding | None:
     if free < DISK_MIN:
         return Finding(f"{free / 1e9:.1f} GB free in {path}", "make room: maps take 4 MB each, recordings more")
     return None
+
+
+def disk_use() -> Finding:
+    """What is free, and what the suite's own folders take."""
+    home = Path.home()
+    if scarce := disk(home):
+        return scarce
+    taken = []
+    for folder in (home / ".ros" / name for name in FOLDERS):
+        size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        if size:
+            taken.append(f"{size / 1e6:.0f} MB in ~/.ros/{folder.name}")
+    return Finding(", ".join([f"{shutil.disk_usage(home).free / 1e9:.0f} GB free", *taken]), "")
 
 
 def clock() -> Finding | None:

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.errors import ErrorCode
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, progress_bar, write_json
+from dm_tools.running_suite import promise, running_suite
 
 
 class CalibrationPlan(StrEnum):
@@ -28,12 +29,19 @@ def run_calibration(client: Any, goal: Any) -> Any:
     with progress_bar() as progress:
         task = progress.add_task("calibration", total=None)
 
+        said = ""
+
         def show(feedback: Any) -> None:
+            nonlocal said
+            text = calibration_step(feedback)
+            if not console.is_terminal and text.split()[0] != said:  # no bar is drawn: one line a phase
+                said = text.split()[0]
+                console.print(f"calibration: {said}, step {feedback.step} of {feedback.steps}")
             progress.update(
                 task,
                 total=feedback.steps or None,
                 completed=feedback.step,
-                description=f"calibration: {calibration_step(feedback)}",
+                description=f"calibration: {text}",
             )
 
         result = client.calibrate(goal, show)
@@ -68,14 +76,12 @@ def show_result(result: Any) -> None:
     if result.id:
         console.print(
             f"calibration [bold]{result.id}[/]: {result.maps} maps in {result.duration:.0f} s, residual "
-            f"{nanometres(result.in_sample_rms):.2f} nm rms in-sample, {nanometres(result.held_out_rms):.2f} nm held "
-            f"out, condition number {result.condition_number:.1f}"
+            f"{nanometres(result.held_out_rms):.2f} nm rms on maps held out"
         )
     if result.hysteresis_model:
         console.print(
-            f"hysteresis: {result.hysteresis_model}, moves right to "
-            f"{nanometres(result.hysteresis_held_out_max_zernike):.2f} nm "
-            f"(largest coefficient, 95 %, on moves held out){_foretold(result)}"
+            f"promise: {promise(result.hysteresis_held_out_max_zernike)} for the largest coefficient, from moves held "
+            f"out{_foretold(result)}; hysteresis {result.hysteresis_model}"
         )
     for entry in result.dropped:
         console.print(f"[yellow]dropped[/] {entry}")
@@ -87,7 +93,7 @@ def show_result(result: Any) -> None:
 
 def _foretold(result: Any) -> str:
     expected = result.expected_max_zernike
-    return f"; expected were {nanometres(expected):.2f} nm" if expected > 0.0 else ""
+    return f", expected {nanometres(expected):.2g} nm" if expected > 0.0 else ""
 
 
 def figures_of(result: Any) -> dict[str, Any]:
@@ -138,7 +144,7 @@ def calibrate(
     """
     from dm_msgs.action import Calibrate
 
-    from dm_client import DeformableMirrorClient, DeformableMirrorError
+    from dm_client import DeformableMirrorError
 
     if hysteresis is not None:
         plan = CalibrationPlan.hysteresis
@@ -153,11 +159,11 @@ def calibrate(
         activate=activate,
         note=note,
     )
-    with DeformableMirrorClient(namespace) as client:
+    with running_suite(namespace) as client:
         if fresh and not dry_run:
             start_fresh(client)
         try:
-            result = run_calibration(client, goal)
+            result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
         except DeformableMirrorError as error:
             if error.response is not None:
                 show_result(error.response)
@@ -169,3 +175,7 @@ def calibrate(
             console.print(result.message.partition(";")[0])
         show_result(result)
     write_json(json, {"calibration": figures_of(result)})
+    if dry_run:
+        next_step("the same without --dry-run measures")
+    elif result.id:
+        next_step("./dm focus 0.02")

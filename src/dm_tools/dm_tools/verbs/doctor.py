@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 
 
 def doctor(
@@ -29,12 +29,16 @@ def doctor(
     for name, run in checks:
         finding = run()
         findings[name] = None if finding is None else finding._asdict()
-        if finding is None:
-            console.print("[green]ok[/]   ", name, markup=True)
+        if finding is None or not finding.cure:
+            console.print("[green]ok[/]   ", end=" ")
+            console.print(f"{name}: {finding.problem}" if finding else name, soft_wrap=True, markup=False)
         else:
             mark = "[yellow]note[/] " if finding.note else "[red]WRONG[/]"
             console.print(mark, end=" ")
             console.print(f"{name}: {finding.problem}\n      cure: {finding.cure}", soft_wrap=True, markup=False)
     write_json(json, {"doctor": findings})
-    if any(finding and not finding["note"] for finding in findings.values()):
+    if wrong := sum(bool(finding and finding["cure"] and not finding["note"]) for finding in findings.values()):
+        next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again")
         raise typer.Exit(1)
+    running = findings["nodes that are running"]
+    next_step("./dm status" if running and not running["cure"] else "./dm up")

@@ -1,12 +1,13 @@
-"""`dm focus`: ask the running suite for a curvature."""
+"""`dm focus`, `dm flatten`, `dm degauss`: what moves the mirror of the running suite."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, as_wavelengths, console, nanometres, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
+from dm_tools.running_suite import naming_holder, promise, running_suite
 
 
 def focus(
@@ -15,19 +16,16 @@ def focus(
         bool, typer.Option("--dioptre", help="The number is the optical power = 2 x curvature.")
     ] = False,
     conic: Annotated[float, typer.Option(help="Conic constant: 0 = sphere, -1 = paraboloid.")] = 0.0,
-    dry_run: Annotated[bool, typer.Option(help="Predict only; nothing moves.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict only; nothing moves.")] = False,
     wait: Annotated[bool, typer.Option(help="Return when the shape stands.")] = True,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
-    """Ask for a curvature: the prediction first, then the move.
-
-    Negative numbers need two dashes before them: dm focus -- -0.02
-    """
-    from dm_client import DeformableMirrorClient, DeformableMirrorError
+    """Ask for a curvature: what is promised first, then the move."""
+    from dm_client import DeformableMirrorError
 
     wanted = curvature / 2.0 if dioptre else curvature
-    with DeformableMirrorClient(namespace) as client:
+    with running_suite(namespace) as client, naming_holder(client):
         try:
             state = client.focus(wanted, conic, dry_run=True)
         except DeformableMirrorError as error:
@@ -36,28 +34,80 @@ def focus(
                     json, {"focus": [{"curvature": wanted, "error_code": error.error_code, "message": str(error)}]}
                 )
             raise
-        console.print(
-            f"{wanted:+.4f} 1/m ({2 * wanted:+.3f} dioptre): predicted residual "
-            f"{nanometres(state.predicted_rms):.1f} nm rms, largest coefficient "
-            f"{nanometres(state.predicted_max_zernike):.2f} nm "
-            f"({as_wavelengths(state.predicted_max_zernike_upper)} with the calibration's own error), "
-            f"reachable {state.curvature_min:+.4f} to {state.curvature_max:+.4f} 1/m"
-        )
-        if state.saturated:
-            console.print(
-                f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit"
-            )
-        if not state.history_known:
-            console.print("[yellow]the hysteresis history is unknown[/]: a degauss would make this more accurate")
+        _show(state)
         if not dry_run:
             if wait:
                 result = client.move_focus(wanted, conic)
                 state = result.state
-                console.print(f"the shape stands after {result.duration * 1e3:.0f} ms")
+                console.print(f"the shape stands after {result.duration * 1e3:.0f} ms{_held(state)}")
             else:
                 state = client.focus(wanted, conic)
-    figures = {
-        "curvature": wanted,
+    write_json(json, {"focus": [figures_of(state)]})
+    _show_next(state)
+
+
+def flatten(
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict only; nothing moves.")] = False,
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Make the surface as flat as the mirror can: curvature 0, its own figure corrected."""
+    with running_suite(namespace) as client, naming_holder(client):
+        state = client.flatten(dry_run=dry_run)
+    _show(state)
+    if state.applied:
+        console.print(f"commanded{_held(state)}")
+    write_json(json, {"focus": [figures_of(state)]})
+    _show_next(state)
+
+
+def degauss(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
+    """Swing all actuators with falling amplitude: the mirror ends at mid range, with a known history.
+
+    It takes seconds. After it every promise is as narrow as the calibration allows.
+    """
+    with running_suite(namespace) as client, naming_holder(client):
+        console.print("degaussing: the mirror swings over its whole range and ends at mid range")
+        response = client.degauss()
+        known = client.wait(lambda: client.actuator_state.history_known, 2.0)
+    console.print(f"done in {response.duration:.1f} s; the actuators' history is {'known' if known else 'not known'}")
+    write_json(json, {"degauss": {"seconds": response.duration, "history_known": known}})
+    if not known:
+        raise typer.Exit(1)
+    next_step("./dm focus 0.02")
+
+
+def _show(state: Any) -> None:
+    """What a dm_msgs/FocusState promises."""
+    console.print(
+        f"{state.curvature:+.4f} 1/m ({state.power:+.3f} dioptre): promised "
+        f"{promise(state.predicted_max_zernike_upper)} for the largest coefficient; "
+        f"reachable {state.curvature_min:+.4f} to {state.curvature_max:+.4f} 1/m",
+        soft_wrap=True,
+    )
+    if state.saturated:
+        console.print(f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit")
+    if not state.history_known:
+        console.print("[yellow]the actuators' history is not known[/]: after ./dm degauss the promise is narrower")
+
+
+def _held(state: Any) -> str:
+    return " and is held against creep" if state.creep_held else ""
+
+
+def _show_next(state: Any) -> None:
+    if not state.applied:
+        next_step("the same without --dry-run moves the mirror")
+    elif not state.history_known:
+        next_step("./dm degauss, then ask again: the promise is narrower")
+    else:
+        next_step("./dm check compares the promise with a map, ./dm status says where the mirror stands")
+
+
+def figures_of(state: Any) -> dict[str, Any]:
+    """A dm_msgs/FocusState's figures for JSON."""
+    return {
+        "curvature": state.curvature,
         "predicted_rms_nm": nanometres(state.predicted_rms),
         "predicted_rms_upper_nm": nanometres(state.predicted_rms_upper),
         "predicted_max_zernike_nm": nanometres(state.predicted_max_zernike),
@@ -66,4 +116,3 @@ def focus(
         "applied": state.applied,
         "calibration": state.calibration_id,
     }
-    write_json(json, {"focus": [figures]})

@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, progress_bar, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, progress_bar, write_json
+from dm_tools.running_suite import naming_holder, running_suite
 
 #: Range of [1], section 3.2.
 DEFAULT = "-0.05:0.05:11"
@@ -83,10 +84,8 @@ def recipes(
     Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps the recipes that are whole and leaves the mirror
     at mid range.
     """
-    from dm_client import DeformableMirrorClient
-
     wanted = curvatures_of(curvatures or DEFAULT)
-    with DeformableMirrorClient(namespace) as client:
+    with running_suite(namespace) as client, naming_holder(client):
         if not show:
             result = _build(client, wanted, conic, tolerance * 1e-9, max_maps)
             console.print(result.message)
@@ -100,3 +99,4 @@ def recipes(
     if not calibration.recipes.recipes:
         console.print(f"calibration {calibration.id or '(none)'} holds no recipes")
     write_json(json, {"calibration": calibration.id, **_figures(calibration.recipes)})
+    next_step("./dm focus CURVATURE: with a time budget the controller uses a recipe where it does better")

@@ -4,15 +4,37 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, console, nanometres, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
 
-#: Where the node `calibration` keeps its files unless told otherwise.
-DEFAULT_STORE = "~/.ros/dm_calibrations"
+#: Where the node `calibration` keeps its files: of the shipped virtual bench, and unless told otherwise.
+STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
+
+
+def running_store(namespace: str) -> Path | None:
+    """Folder of the calibration that the running suite uses; None = nothing runs, or it has none."""
+    from dm_tools.running_suite import running_suite
+
+    try:
+        with running_suite(namespace) as client:
+            file = Path(client.latest("calibration", 2.0).file)
+    except RuntimeError:  # not running, or not calibrated
+        return None
+    return file.parent if file.name and file.is_file() else None
+
+
+def newest_store(folders: Sequence[Path]) -> Path:
+    """The folder with the youngest file in it; the first when there is none in any."""
+
+    def youngest(folder: Path) -> float:
+        return max((file.stat().st_mtime for file in folder.expanduser().glob("*.h5")), default=0.0)
+
+    return max(folders, key=youngest)
 
 
 def find_calibration(name: str, store: Any) -> tuple[Any, Path]:
@@ -44,12 +66,15 @@ def report(
         str, typer.Argument(help="Id in the store, or a calibration file; empty = the newest.", metavar="[ID|FILE]")
     ] = "",
     out: Annotated[Path, typer.Option(help="Folder for the two files.")] = Path("runs/report"),
-    store: Annotated[Path, typer.Option(help="Folder of the calibration files.")] = Path(DEFAULT_STORE),
+    store: Annotated[
+        Path | None, typer.Option(help="Folder of the calibration files; none = the running suite's, else the usual.")
+    ] = None,
+    namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
     """Write the report of a calibration: what was measured with what, how good it is, and what limits it.
 
-    Reads the stored file; needs no running nodes.
+    Reads the stored file; needs no running nodes, but takes the calibration of those that run.
     """
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
@@ -58,12 +83,15 @@ def report(
     folder = out.resolve()
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {out}: is a file; name a folder, which need not exist yet")
+    if store is None:
+        store = running_store(namespace) or newest_store(STORES)
     found, file = find_calibration(calibration, CalibrationStore(store))
     written = write_report(found, folder, file)
     console.print(
-        f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.in_sample_rms):.2f} nm in-sample, "
-        f"{nanometres(found.fit.held_out_rms):.2f} nm held out, {len(found.limitations)} sentences of caution"
+        f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "
+        f"{len(found.limitations)} sentences of caution"
     )
     console.print(f"page: {os.path.relpath(written.html)}\nPDF: {os.path.relpath(written.pdf)}")
     files = {"html": str(written.html), "pdf": str(written.pdf)}
     write_json(json, figures_of(found) | {"files": files, "seconds": time.monotonic() - started})
+    next_step(f"open {os.path.relpath(written.pdf)}")

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import os
 import signal
 import tempfile
 import threading
+import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from dm_bringup.suite import Config, load_config
-from dm_tools.output import console
+from dm_tools.output import console, next_step
 
+#: A suite that is not ready after this is said to be late, s.
+LATE_S = 30.0
+#: How a line of a node's log looks, unless the user has chosen: with the time of the wall clock.
+LOG_FORMAT = "{date_time_with_ms} {severity} {name}: {message}"
 #: Between the ports of two virtual benches.
 PORTS_APART = 10
 
@@ -41,7 +47,9 @@ def up(
 ) -> None:
     """Start the nodes and keep them running until Ctrl-C or SIGTERM; the mirror is then ramped to its safe shape."""
     from dm_bringup.suite import Suite
+    from dm_tools.doctor.bench import effective
 
+    os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""])
     stop = threading.Event()
     # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
@@ -57,11 +65,52 @@ def up(
         for name, configuration in mirrors.items():
             kind = "virtual bench" if "virtual_bench" in configuration else "hardware"
             console.print(f"the nodes {f'of {name} ' if name else ''}are starting ({kind})")
+            if kind == "virtual bench":
+                bench = effective("virtual_bench", configuration["virtual_bench"])
+                console.print(
+                    f"it keeps its last {bench['output_limit'] / 1e6:.0f} MB of maps in {bench['output_folder']}"
+                )
         console.print("Ctrl-C stops them and makes every mirror safe")
+        watchers = [threading.Thread(target=say_when_ready, args=(name, stop), daemon=True) for name in mirrors]
+        for watcher in watchers:
+            watcher.start()
         while not stop.wait(0.2):
             for suite in suites:
                 suite.check()
         console.print("\nstopping")
+        for watcher in watchers:
+            watcher.join(1.0)
+
+
+def say_when_ready(namespace: str, stop: threading.Event) -> None:
+    """Wait until the suite of this namespace takes requests, and say so and what to do next."""
+    from dm_client import DeformableMirrorClient
+
+    started, late = time.monotonic(), False
+    option = f" --namespace {namespace}" if namespace else ""
+    with DeformableMirrorClient(namespace) as client:
+
+        def lacks() -> str:
+            state = client.messages.get("actuator_state")
+            if state is None or state.driver_state != state.STATE_ACTIVE:
+                return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
+            if {"mirror_info", "calibration", "capabilities"} - client.messages.keys():
+                return "calibration and focus_controller have not said yet what the mirror can do"
+            return ""
+
+        while (lacking := lacks()) and not stop.wait(0.2):
+            if not late and time.monotonic() - started > LATE_S:
+                late = True
+                console.print(f"not ready after {LATE_S:.0f} s: {lacking}; ./dm doctor says more")
+        if stop.is_set():
+            return
+        capabilities, mirror = client.capabilities, client.mirror_info
+    console.print(
+        f"[bold green]ready[/] after {time.monotonic() - started:.0f} s: {mirror.name} {mirror.serial}, "
+        + (f"calibration {capabilities.calibration_id}" if capabilities.calibration_id else "not calibrated yet")
+    )
+    verb = "focus 0.02" if capabilities.calibration_id else "calibrate"
+    next_step(f"in another terminal: ./dm {verb}{option}; ./dm status{option} says how things are")
 
 
 def configurations(files: list[Path], namespaces: list[str]) -> dict[str, Config]:

@@ -1,0 +1,154 @@
+"""The running suite, as the verbs meet it: whether it is there, who holds the mirror, where the mirror stands."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from dm_bringup.nodes import NAMES
+from dm_tools.output import NotRunningError, as_wavelengths, errors, nanometres
+
+if TYPE_CHECKING:
+    from dm_client import DeformableMirrorClient
+
+#: Time in which nodes on this machine are found, s; on a busy one it takes longer.
+FIND_S = 1.2
+BUSY_S = 5.0
+#: Time in which every node reports its health, and an action what it is doing, s.
+REPORT_S = 1.5
+#: What has the mirror for itself while it runs, by the name of the action.
+HOLDERS = {"calibrate": "a calibration", "converge": "the closed loop", "build_recipes": "the building of recipes"}
+
+
+def nodes_of_suite(client: DeformableMirrorClient) -> Counter[str]:
+    """How often each node of the suite runs in the client's namespace."""
+    place = client.node.get_namespace()
+    found = client.node.get_node_names_and_namespaces()
+    return Counter(name for name, where in found if where == place and name in NAMES)
+
+
+def where(client: DeformableMirrorClient) -> str:
+    """The ROS domain and namespace that the client looks at."""
+    return f"in the ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}, namespace {client.node.get_namespace()}"
+
+
+@contextmanager
+def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
+    """A client of the suite that runs in this namespace.
+
+    Raises:
+        NotRunningError: none of its nodes is found.
+    """
+    from dm_client import DeformableMirrorClient
+
+    with DeformableMirrorClient(namespace) as client:
+        if not client.wait(lambda: nodes_of_suite(client), FIND_S):
+            errors.print(f"no node of the suite found yet {where(client)}: ./dm up starts it", soft_wrap=True)
+            if not client.wait(lambda: nodes_of_suite(client), BUSY_S - FIND_S):
+                others = {place for name, place in client.node.get_node_names_and_namespaces() if name in NAMES}
+                seen = f"; some are running in {', '.join(sorted(others))} (--namespace)" if others else ""
+                raise NotRunningError(f"no node of the suite is running {where(client)}{seen}: start it with ./dm up")
+        yield client
+
+
+def promise(bound: float) -> str:
+    """A 95 % bound on the largest coefficient error (m) in the one way all verbs put it."""
+    return f"{nanometres(bound):.2g} nm (95 % bound, {as_wavelengths(bound)})" if bound > 0.0 else "not known"
+
+
+def verdict(promised: float, measured: float) -> str:
+    """Promised and measured largest coefficient error (m), and whether the promise was kept, as a sentence."""
+    kept = "[green]inside[/]" if measured <= promised else "[red]outside[/]"
+    return f"promised {promise(promised)}, measured {nanometres(measured):.2g} nm: {kept}"
+
+
+class Holder(NamedTuple):
+    """An operation that has the mirror for itself.
+
+    Attributes:
+        name: such as "a calibration".
+        step, steps: how far it is; 0 = not known.
+    """
+
+    name: str
+    step: int = 0
+    steps: int = 0
+
+    def __str__(self) -> str:
+        far = f" (step {self.step} of {self.steps})" if self.steps else f" (step {self.step})" if self.step else ""
+        return f"{self.name}{far}"
+
+
+def holder(client: DeformableMirrorClient) -> Holder | None:
+    """Who has the mirror for itself; None = nobody."""
+    from dm_client.client import INTERFACES
+    from dm_tools.console.external_goals import ExternalGoals
+
+    goals = {name: ExternalGoals(client.node, INTERFACES[name], name) for name in HOLDERS}
+    if not client.wait(lambda: any(each.running for each in goals.values()), 0.5):
+        return None
+    name, goal = next((name, each) for name, each in goals.items() if each.running)
+    client.wait(lambda: goal.feedback, REPORT_S)
+    feedback = goal.feedback
+    return Holder(HOLDERS[name], *(getattr(feedback, field, 0) for field in ("step", "steps")))
+
+
+@contextmanager
+def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
+    """Say of a request that is refused within who has the mirror for itself, if somebody has."""
+    from dm_client import DeformableMirrorError
+
+    try:
+        yield
+    except DeformableMirrorError as error:
+        if by := holder(client):
+            text = f"{by} has the mirror: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
+            raise DeformableMirrorError(error.error_code, text, error.response) from error
+        raise
+
+
+def hear_health(client: DeformableMirrorClient) -> dict[str, Any]:
+    """{node: its latest status on /diagnostics}, filled from now on."""
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    heard: dict[str, Any] = {}
+
+    def take(message: Any) -> None:
+        for status in message.status:
+            place, _, name = status.name.rpartition("/")
+            if place == client.node.get_namespace().lstrip("/"):
+                heard[name] = status
+
+    client.node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
+    return heard
+
+
+class Standing(NamedTuple):
+    """The shape that stands, as the controller reports it.
+
+    Attributes:
+        curvature: 1/m.
+        seconds: since its command.
+        bound: m, 95 % bound on its largest coefficient error.
+        held: creep is fed forward.
+    """
+
+    curvature: float
+    seconds: float
+    bound: float
+    held: bool
+
+
+def standing(health: dict[str, Any]) -> Standing | None:
+    """The shape that stands; None = not one that was asked for as a curvature."""
+    values = (
+        {pair.key: pair.value for pair in health["focus_controller"].values} if "focus_controller" in health else {}
+    )
+    if "curvature" not in values:
+        return None
+    return Standing(
+        float(values["curvature"]), float(values["stands for"]), float(values["bound"]), values["held"] == "True"
+    )

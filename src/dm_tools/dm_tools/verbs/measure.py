@@ -1,0 +1,93 @@
+"""`dm measure`: take one map. `dm check`: compare one with the calibration in use, and let it improve it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
+from dm_tools.running_suite import hear_health, naming_holder, running_suite, standing, verdict
+
+
+def measure(
+    label: Annotated[str, typer.Option(help="Goes into the log.")] = "",
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Take one map of the mirror as it stands, and say what it shows. Nothing moves."""
+    from dm_common.optics.zernike import PISTON_TILT, SPOKEN, curvature_of
+
+    with running_suite(namespace) as client:
+        answer = client.measure(label)
+    info, coefficients = answer.info, list(answer.zernike.coefficients)
+    figures: dict[str, Any] = {
+        "curvature": curvature_of(coefficients, info.aperture_radius) if info.aperture_radius > 0 else None,
+        "rms_nm": nanometres(info.rms),
+        "pv_nm": nanometres(info.pv),
+        "valid_fraction": info.valid_fraction,
+        "zernike_nm": {name: nanometres(value) for name, value in zip(SPOKEN, coefficients, strict=True)},
+        "file": info.file,
+    }
+    terms = list(figures["zernike_nm"].items())[PISTON_TILT:]
+    largest = sorted(terms, key=lambda term: -abs(term[1]))[:3]
+    console.print(
+        f"{figures['rms_nm']:.1f} nm rms, {figures['pv_nm']:.1f} nm peak to valley, {info.valid_fraction:.0%} of the "
+        f"aperture valid; largest: {', '.join(f'{name} {value:+.1f} nm' for name, value in largest)}"
+    )
+    if figures["curvature"] is not None:
+        console.print(f"defocus: as of a surface of {figures['curvature']:+.4f} 1/m")
+    console.print(f"file: {info.file}", soft_wrap=True)
+    write_json(json, {"measure": figures})
+    next_step("./dm check compares a map with the calibration in use")
+
+
+def check(
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Compare only; the calibration stays as it is.")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="Drop all earlier updates; no map is taken.")] = False,
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Check the calibration against the mirror as it stands, and follow its drift.
+
+    Needs the running suite (`dm up`) with an interferometer. Nothing moves. Exit status 1 when the map disagrees.
+    """
+    if dry_run and forget:
+        raise typer.BadParameter("--dry-run and --forget: only one of them")
+    with running_suite(namespace) as client, naming_holder(client):
+        health = hear_health(client)
+        response = client.update_calibration(dry_run=dry_run, forget=forget)
+        shape, capabilities, calibration = standing(health), client.capabilities, client.latest("calibration")
+    promised = shape.bound if shape is not None else capabilities.error_bound
+    if forget:
+        console.print(response.message)
+    else:
+        console.print(f"largest coefficient: {verdict(promised, response.max_zernike)}")
+        if not response.accepted:
+            console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)
+    console.print(
+        f"since the calibration was made: {response.revision} maps taken in, gains changed by up to "
+        f"{response.gain_drift:.2%}, the figure by {nanometres(response.offset_drift):.2f} nm rms"
+    )
+    write_json(json, {"check": figures_of(response) | {"promised_nm": nanometres(promised)}})
+    if not (response.accepted or forget):
+        next_step("./dm degauss and ./dm check again; if it still disagrees, ./dm calibrate")
+        raise typer.Exit(1)
+    next_step(
+        "./dm report writes what the calibration holds"
+        if calibration.hysteresis.play_radius
+        else "./dm calibrate finds the hysteresis too, and promises far less than this"
+    )
+
+
+def figures_of(response: Any) -> dict[str, Any]:
+    """A check's figures for JSON."""
+    return {
+        "accepted": response.accepted,
+        "max_zernike_nm": nanometres(response.max_zernike),
+        "rms_nm": nanometres(response.rms),
+        "surprise": response.surprise,
+        "revision": response.revision,
+        "gain_drift": response.gain_drift,
+        "offset_drift_nm": nanometres(response.offset_drift),
+    }

@@ -1,0 +1,113 @@
+"""`dm status`: the running suite on one screen."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from dm_tools.output import JsonOption, NamespaceOption, console, write_json
+from dm_tools.running_suite import (
+    REPORT_S,
+    Standing,
+    hear_health,
+    holder,
+    nodes_of_suite,
+    promise,
+    running_suite,
+    standing,
+    where,
+)
+
+#: Nodes without which there is no bench.
+NEEDED = ("pdm_driver", "interferometer", "calibration", "focus_controller")
+
+
+def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
+    """Say on one screen what runs, where the mirror stands, what it promises, and what to do next."""
+    with running_suite(namespace) as client:
+        health = hear_health(client)
+        client.wait(lambda: set(NEEDED) <= health.keys() & nodes_of_suite(client).keys(), REPORT_S)
+        client.wait(lambda: {"mirror_info", "calibration", "capabilities"} <= client.messages.keys(), 0.5)
+        by = holder(client)
+        found, place = nodes_of_suite(client), where(client)
+    mirror, calibration, capabilities, state = (
+        client.messages.get(name) for name in ("mirror_info", "calibration", "capabilities", "actuator_state")
+    )
+    calibration = calibration if calibration is not None and calibration.id else None
+    shape, lacking = standing(health), [name for name in NEEDED if not found[name]]
+    rows = {
+        "nodes": f"{', '.join(found)}: running {place}"
+        + (f"; [red]not running: {', '.join(lacking)}[/]" if lacking else ""),
+        "mirror": f"{mirror.name} {mirror.serial}, {mirror.actuators} actuators" if mirror is not None else "not heard",
+        "now": _now(by, shape, state),
+        "calibration": _calibration(calibration),
+        "promise": _promise(capabilities) if calibration is not None else "none without a calibration",
+        "health": "; ".join(f"{name}: {each.message}" for name, each in health.items() if each.level != b"\0") or "ok",
+        "next": _next(lacking, by, calibration, shape, capabilities),
+    }
+    for name, text in rows.items():
+        console.print(f"[bold]{name:12s}[/]{text}", soft_wrap=True)
+    figures = {
+        "nodes": list(found),
+        "mirror": mirror.serial if mirror is not None else None,
+        "held_by": str(by) if by else None,
+        "curvature": shape.curvature if shape else None,
+        "bound_nm": 1e9 * shape.bound if shape else None,
+        "calibration": calibration.id if calibration is not None else None,
+        "error_bound_nm": 1e9 * capabilities.error_bound if calibration is not None and capabilities else None,
+    }
+    write_json(json, {"status": figures})
+
+
+def _now(by: Any, shape: Standing | None, state: Any) -> str:
+    if by is not None:
+        return f"{by} has the mirror"
+    if shape is not None:
+        return (
+            f"{shape.curvature:+.4f} 1/m ({2 * shape.curvature:+.3f} dioptre) for {_ago(shape.seconds)}, within "
+            f"{promise(shape.bound)}{', held against creep' if shape.held else ''}"
+        )
+    if state is None or not state.applied:
+        return "nothing was commanded yet, or the driver is not heard"
+    low, high = min(state.applied), max(state.applied)
+    return f"signals {low:+.2f} to {high:+.2f}, not asked for as a curvature{', moving' if state.moving else ''}"
+
+
+def _calibration(calibration: Any) -> str:
+    if calibration is None:
+        return "none in use"
+    age = time.time() - calibration.header.stamp.sec
+    doubtful = sum(grade != 0 for grade in calibration.actuator_grade)
+    law = "with hysteresis" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
+    return (
+        f"{calibration.id}: {calibration.maps_used} maps {_ago(age)} ago, {law}, "
+        f"{calibration.actuators - doubtful} of {calibration.actuators} actuators good"
+    )
+
+
+def _promise(capabilities: Any) -> str:
+    if capabilities is None:
+        return "not known: focus_controller is not heard"
+    return (
+        f"largest coefficient within {promise(capabilities.error_bound)} from {capabilities.curvature_min:+.4f} to "
+        f"{capabilities.curvature_max:+.4f} 1/m"
+    )
+
+
+def _next(lacking: list[str], by: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
+    if lacking:
+        return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
+    if by is not None:
+        return "wait for its end; ./dm console shows how far it is, and can cancel it"
+    if calibration is None or not calibration.hysteresis.play_radius:
+        return "./dm calibrate"
+    if capabilities is not None and "wider error bound" in capabilities.message:
+        return "./dm degauss: the actuators' history is not known, and the promise is wider for it"
+    return "./dm check" if shape is not None else "./dm focus 0.02"
+
+
+def _ago(seconds: float) -> str:
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"

@@ -1,0 +1,158 @@
+"""The command `dm` itself: arguments, standard output, exit codes, words; nothing runs but what is asked for."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import typer
+from dm_msgs.msg import FocusState
+from typer.testing import CliRunner
+
+from dm_client import DeformableMirrorError
+from dm_common.errors import ErrorCode
+from dm_common.ros.domains import own_domain
+from dm_tools import cli, output, running_suite
+from dm_tools.output import NotRunningError, write_json
+from dm_tools.running_suite import Standing, holder, naming_holder, standing, verdict
+from dm_tools.verbs.focus import _show
+from dm_tools.verbs.report import newest_store
+from test_console_external_goals import EXECUTING, FakeNode, Goal
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(autouse=True)
+def screen() -> Any:
+    """The console writes to standard output again after each test."""
+    yield
+    output.console.file = None  # type: ignore[assignment]
+
+
+def parsed(verb: str, *words: str) -> dict[str, Any]:
+    group: Any = typer.main.get_command(cli.app)
+    params: dict[str, Any] = group.commands[verb].make_context(verb, list(words)).params
+    return params
+
+
+@pytest.mark.parametrize("words", [("-0.02",), ("-0.02", "--dry-run"), ("--conic", "-1", "-2e-2"), ("--", "-.02")])
+def test_a_negative_curvature_is_a_number(words: tuple[str, ...]) -> None:
+    assert parsed("focus", *words)["curvature"] == -0.02
+    assert parsed("focus", *words)["conic"] == (-1.0 if "--conic" in words else 0.0)
+
+
+def test_what_is_mistyped_is_guessed_and_wrong_usage_is_2() -> None:
+    wrong_verb, wrong_option = (
+        CliRunner().invoke(cli.app, words) for words in (["focuss", "1"], ["focus", "--dry-rn"])
+    )
+    assert wrong_verb.exit_code == wrong_option.exit_code == 2
+    assert "Did you mean 'focus'" in wrong_verb.output and "--dry-run" in wrong_option.output
+    assert "╭" not in wrong_verb.output, "frames are for screens"
+
+
+def test_the_bare_command_helps() -> None:
+    done = subprocess.run([ROOT / "dm"], capture_output=True, text=True, check=True)
+    listed = {line.split()[0] for line in done.stdout.splitlines() if line.startswith("  ")}
+    assert {"up", "calibrate", "focus", "status", "check"} <= listed
+    assert "Exit codes" in done.stdout
+    assert all(verb in done.stdout for verb in cli.VERBS)
+
+
+def test_the_version_is_said() -> None:
+    said = CliRunner().invoke(cli.app, ["--version"])
+    assert said.exit_code == 0 and said.output.startswith("dm 0.")
+
+
+def test_figures_on_standard_output_stand_alone(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = parsed("status", "--json", "-")["json"]
+    output.console.print("for a person")
+    write_json(path, {"length": float("nan")})
+    said = capsys.readouterr()
+    assert json.loads(said.out) == {"length": None} and said.err == "for a person\n"
+    assert parsed("status", "--json", str(tmp_path / "f"))["json"] == tmp_path / "f"
+    output.console.print("again")
+    assert capsys.readouterr().out == "again\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(NotRunningError("none"), 3), (ValueError("[no] markup"), 1), (KeyboardInterrupt(), 130)]
+)
+def test_exit_codes(
+    error: BaseException, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(**_keywords: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "app", fails)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == code
+    assert str(error) in capsys.readouterr().err
+
+
+def test_with_nothing_running_the_way_out_is_named_at_once(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert running_suite.FIND_S <= 1.2
+    monkeypatch.setattr(running_suite, "BUSY_S", running_suite.FIND_S + 0.2)
+    with own_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        with pytest.raises(NotRunningError, match=r"\./dm up"), running_suite.running_suite(""):
+            pass
+    assert "./dm up" in capfd.readouterr().err
+
+
+class FakeClient:
+    """A client while a calibration runs, or nothing does."""
+
+    def __init__(self, busy: bool) -> None:
+        self.node: Any = FakeNode()
+        self._busy = busy
+
+    def wait(self, condition: Any, _timeout_s: float) -> bool:
+        if self._busy:
+            goal = Goal(self.node, 1)
+            goal.tell(EXECUTING)
+            feedback = SimpleNamespace(step=12, steps=86, residual_rms=0.0)
+            self.node.callbacks["calibrate/_action/feedback"](SimpleNamespace(goal_id=goal.identity, feedback=feedback))
+        return bool(condition())
+
+
+def test_who_holds_the_mirror_is_named() -> None:
+    client: Any = FakeClient(busy=True)
+    refusal = DeformableMirrorError(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
+    with pytest.raises(DeformableMirrorError, match=r"a calibration \(step 12 of 86\) has the mirror"):
+        with naming_holder(client):
+            raise refusal
+    idle: Any = FakeClient(busy=False)
+    assert holder(idle) is None
+    with pytest.raises(DeformableMirrorError, match="no calibration is in use"), naming_holder(idle):
+        raise refusal
+
+
+def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "promised 97 nm (95 % bound, λ/7), measured 1.3 nm: " in verdict(97e-9, 1.3e-9)
+    assert "inside" in verdict(97e-9, 1.3e-9) and "outside" in verdict(1e-9, 1.3e-9)
+    _show(FocusState(curvature=0.02, power=0.04, predicted_max_zernike_upper=1.3e-9, history_known=True))
+    said = capsys.readouterr().out
+    assert "promised 1.3 nm (95 % bound, λ/487)" in said and "0.00 nm" not in said
+
+
+def test_what_stands_is_read_from_the_controllers_health() -> None:
+    values = {"curvature": 0.02, "stands for": "40.0", "bound": 1.3e-9, "held": True}
+    pairs = [SimpleNamespace(key=key, value=str(value)) for key, value in values.items()]
+    assert standing({"focus_controller": SimpleNamespace(values=pairs)}) == Standing(0.02, 40.0, 1.3e-9, True)
+    assert standing({"focus_controller": SimpleNamespace(values=pairs[3:])}) is None
+    assert standing({}) is None
+
+
+def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> None:
+    older, newer = tmp_path / "a", tmp_path / "b"
+    assert newest_store((older, newer)) == older
+    newer.mkdir()
+    (newer / "c.h5").touch()
+    assert newest_store((older, newer)) == newer
