@@ -18,6 +18,7 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.errors import MeasurementError
+from dm_common.hysteresis.observer import Applied, HysteresisTracker
 from dm_common.measurement import Measurement
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
@@ -85,6 +86,25 @@ def test_the_law_is_fitted_to_the_very_maps_that_count(monkeypatch: pytest.Monke
     _, kept = hysteresis_fit._without_outliers(run, np.zeros(60, dtype=bool), (), print)
     assert kept is fitted_to[-1]
     assert kept.responses.usable.sum() == 60 - hysteresis_fit.OUTLIER_ROUNDS + 1
+
+
+def test_who_follows_the_reports_finds_the_signals_that_the_gains_belong_to() -> None:
+    """Creep of before the run fades as fast in the one as in the other, with a spectrum of each actuator's own too."""
+    maps, law = run(), fitted().law
+    own = np.exp(0.3 * np.random.default_rng(4).standard_normal((maps.actuators, len(law.creep_time))))
+    effective, law = hysteresis_fit._followed(maps, replace(law, creep_spectrum=own / own.mean()))
+    assert np.abs(law.crept).max() > 0.1
+    rest, moved = np.zeros(maps.actuators), 1e-9 * maps.moved_ns
+    tracker = HysteresisTracker(law)
+    tracker.observe(Applied(law.crept_at - 60.0, rest, 0, None, 0, False))
+    tracker.observe(Applied(law.crept_at - 0.5, rest, 2, rest, 1, True))
+    for turns, (shape, when) in enumerate(zip(maps.applied, moved, strict=True), start=3):
+        before = tracker.state
+        assert before is not None
+        tracker.observe(Applied(max(float(when), law.crept_at), shape, turns, before.signals, 1, True))
+    assert tracker.state is not None
+    found = law.effective(law.advance(tracker.state, 1e-9 * int(maps.stamp_ns[-1])))
+    np.testing.assert_allclose(found, effective.applied[-1], atol=2e-5)
 
 
 def test_a_map_of_something_else_does_not_enter_the_law() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
@@ -131,3 +132,13 @@ def follow(
         state = law.advance(law.move(state, shape, float(start)), float(when))
         result[row] = law.effective(state)
     return result, state
+
+
+def weights_of(features: Floats, left: Floats, gains: Floats, prior: Floats, between: Floats) -> Floats:
+    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md and the inverse prior covariance
+    `between` (N, N) over actuators times `prior` (F, F) over features."""
+    count, actuators = features.shape[1:]
+    flat = features.transpose(0, 2, 1).reshape(len(features), -1)
+    normal = flat.T @ flat * np.kron(gains @ gains.T, np.ones((count, count))) + np.kron(between, prior)
+    right = np.einsum("mfn,mn->nf", features, left @ gains.T)
+    return np.asarray(cho_solve(cho_factor(normal), right.ravel()).reshape(actuators, count).T)

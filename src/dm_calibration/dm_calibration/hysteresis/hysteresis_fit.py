@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
-from dm_calibration.hysteresis.features import follow
+from dm_calibration.hysteresis.features import follow, weights_of
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses, responses_of
-from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of
+from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, basis_of, in_parts, parts_of, starts_of, without
 from dm_calibration.influence.maps import CHECK, MapSet
 from dm_common.hysteresis.inverse import random_histories
 from dm_common.hysteresis.model import HysteresisModel
@@ -142,17 +142,18 @@ def _followed(maps: MapSet, law: HysteresisModel, responses: Responses | None = 
     effective = in_parts(parts, starts, followed)
     if not law.creep_rate:
         return replace(maps, applied=effective), law
-    fading = np.zeros((len(maps), len(parts)))
+    fading = np.zeros((len(maps), len(parts), maps.actuators))
     for number, part in enumerate(parts):
         fading[part, number] = _fading(law, time[part] - starts[number])
     crept = _crept_before(responses_of(maps) if responses is None else responses, effective, fading)
     began = 1e-9 * int(maps.stamp_ns[0]) + starts[-1]
-    return replace(maps, applied=effective + fading @ crept), replace(law, crept_at=began, crept=crept[-1])
+    effective = effective + np.einsum("msn,sn->mn", fading, crept)
+    return replace(maps, applied=effective), replace(law, crept_at=began, crept=crept[-1])
 
 
 def _fading(law: HysteresisModel, elapsed: Floats) -> Floats:
-    """(M,) how much of an old displacement still shows `elapsed` (M,) s after it ended, in the mean over actuators."""
-    return np.asarray(np.exp(-elapsed[:, None] / law.creep_time) @ np.atleast_2d(law.creep_share).mean(axis=0))
+    """(M, N) or (M, 1) how much of an old displacement of each actuator still shows `elapsed` (M,) s after it ended."""
+    return np.asarray(np.exp(-elapsed[:, None] / law.creep_time) @ np.atleast_2d(law.creep_share).T)
 
 
 def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Floats:
@@ -164,11 +165,10 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
 
     Args:
         effective: (M, N).
-        fading: (M, S) how much of it each map still shows.
+        fading: (M, S, N) how much of it each map still shows.
     """
     keep, count = responses.usable, responses.coefficients
-    parts = fading.shape[1]
-    whole = np.column_stack((np.ones(len(effective)), fading, effective))
+    whole = np.column_stack((np.ones(len(effective)), effective, fading.mean(axis=2)))
     for _ in range(OUTLIER_ROUNDS):
         design, values = whole[keep], responses.values[keep]
         solution = np.linalg.lstsq(design, values, rcond=1e-10)[0]
@@ -182,17 +182,10 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
     freedom = max(len(design) - design.shape[1], 1)
     scatter = np.sqrt(np.square(residual).sum(axis=0) / freedom)
     scatter[:count] = np.sqrt(np.mean(np.square(scatter[:count])))
-    uncertainty = np.sqrt(np.diag(np.linalg.pinv(design.T @ design))[1 : 1 + parts])
-    crept = []
-    for faded, sigma in zip(solution[1 : 1 + parts], uncertainty, strict=True):
-        if not sigma > 0.0:  # no map of that part can be used
-            crept.append(np.zeros(effective.shape[1]))
-            continue
-        influence = solution[1 + parts :] / (scatter * sigma)
-        crept.append(
-            np.linalg.solve(influence @ influence.T + np.eye(len(influence)), influence @ (faded / (scatter * sigma)))
-        )
-    return np.array(crept)
+    known = slice(1 + effective.shape[1])
+    free, gains = basis_of(design[:, known]), solution[known][1:] / scatter
+    unknown, left = without(fading[keep], free), without(values / scatter, free)
+    return weights_of(unknown, left, gains, np.eye(fading.shape[1]), np.eye(effective.shape[1]))
 
 
 def unknown_history_sigma(law: HysteresisModel, seed: int = 0, actuators: int = 500) -> float:

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Candidate, LawFit, Run
 from dm_calibration.hysteresis.features import (
@@ -30,6 +29,7 @@ from dm_calibration.hysteresis.features import (
     play_values,
     spectrum_prior,
     weight_of,
+    weights_of,
 )
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
 from dm_common.hysteresis.duhem import DuhemOperator
@@ -195,14 +195,14 @@ class OwnLaws:
     def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior."""
         left = measured - crept[:, 0] @ gains
-        solved = _solve(without(crept[:, 1:], free), without(left, free), gains, self._prior, self._between)
+        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, self._prior, self._between)
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(self, position: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats) -> Floats:
         """(J, N) weights of the creep elements."""
         elements = np.array(list(self._creep_states(position)))[keep]
         left = measured - (position[keep] + self._creep * elements.sum(axis=1)) @ gains
-        return self._creep + _solve(
+        return self._creep + weights_of(
             without(elements, free), without(left, free), gains, self._creep_prior, self._creep_between
         )
 
@@ -222,13 +222,3 @@ def pattern_basis(radius: Floats, orders: int) -> Floats:
 def _alike(actuators: int, spread: float) -> Floats:
     """(N, N) inverse prior covariance over actuators that share a common part and differ by `spread` of it."""
     return np.asarray(np.linalg.inv(np.ones((actuators, actuators)) + spread**2 * np.eye(actuators)))
-
-
-def _solve(features: Floats, left: Floats, gains: Floats, prior: Floats, between: Floats) -> Floats:
-    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md and the inverse prior covariance
-    `between` (N, N) over actuators times `prior` (F, F) over features."""
-    count, actuators = features.shape[1:]
-    flat = features.transpose(0, 2, 1).reshape(len(features), -1)
-    normal = flat.T @ flat * np.kron(gains @ gains.T, np.ones((count, count))) + np.kron(between, prior)
-    right = np.einsum("mfn,mn->nf", features, left @ gains.T)
-    return np.asarray(cho_solve(cho_factor(normal), right.ravel()).reshape(actuators, count).T)
