@@ -173,3 +173,20 @@ def test_progress_counts_the_steps(bench: LinearBench, mirror: Mirror) -> None:
 def test_no_maps_at_all(bench: LinearBench, mirror: Mirror) -> None:
     with pytest.raises(TooFewMapsError, match="no map was measured"):
         Procedure(make_plan(PlanKind.POKES, mirror), mirror, bench).outcome.maps()
+
+
+def test_checks_are_shapes_on_the_flat_surface() -> None:
+    """As in use: the figure is gone, and what is left is the shape of the plan."""
+    mirror = make_mirror(neighbour_difference_max=1.0)
+    plant = LinearMirror(mirror.x, mirror.y)
+    plant.figure_coefficients *= 5.0
+    outcome = run(LinearBench(mirror, plant), mirror, PlanKind.HYSTERESIS).outcome
+    steps = make_plan(PlanKind.HYSTERESIS, mirror).steps
+    planned = {step.label: step.signals for step in steps if step.signals is not None}
+    checks = [record for record in outcome.records if record.kind == StepKind.CHECK.value]
+    assert len(checks) == 60
+    shapes = np.array([plant.influence @ planned[record.label] for record in checks])
+    left = np.array([record.coefficients for record in checks]) - plant.fit_terms(shapes)
+    size = np.median(np.abs(left[:, 3:]).max(axis=1))
+    assert size < 0.1 * np.abs(plant.figure_coefficients).max()
+    assert all((mirror.limits.differences(record.signals) <= 1.0).all() for record in checks)

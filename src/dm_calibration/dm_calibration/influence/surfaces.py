@@ -128,17 +128,20 @@ def signal_surface(name: str, mirror: Mirror) -> Surface:
     return Surface(name, signals, remark=remark)
 
 
-def solve_shape(target: Floats, model: LinearModel, mirror: Mirror) -> tuple[Floats, float]:
+def solve_shape(
+    target: Floats, model: LinearModel, mirror: Mirror, limits: Limits | None = None
+) -> tuple[Floats, float]:
     """Signals inside the range for the sag `target` (P,), m, by bounded least squares; piston and tilt are free.
 
-    Neighbours may differ by more than they may: how far the shape must shrink for them is for the caller to say.
+    Args:
+        limits: to keep; None = the range alone: how far the shape must shrink for neighbours is for the caller to say.
 
     Returns:
         Signals (N,) and the rms sag that is left, m.
     """
     matrix, damping = _damped(model)
     wanted = remove_piston_tilt((target - model.sag_offset)[None, :], model.points)[0]
-    programme = BoundedProgramme(matrix, Limits(mirror.limits.low, mirror.limits.high))
+    programme = BoundedProgramme(matrix, limits or Limits(mirror.limits.low, mirror.limits.high))
     signals = programme.solve(np.concatenate((np.sqrt(model.points.weight) * wanted, damping * mirror.rest)))
     left = wanted - remove_piston_tilt((model.influence_sag @ signals)[None, :], model.points)[0]
     return signals, float(rms(left, model.points.weight))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 
 #: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
 HYSTERESIS_REFERENCE_EVERY = 100
+#: Share of the neighbour limit that checks may use: rounding must not break it.
+CHECK_ROOM = 0.999
 
 
 class PlanKind(IntEnum):
@@ -47,7 +49,8 @@ class Step:
     Attributes:
         label: unique in the plan.
         kind: see StepKind.
-        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes.
+        signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes. Of a check,
+            what it bends the mirror by when the figure is flat: see :func:`check_shape`.
         nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
         dwell: to hold the shape beyond the settle time, s.
         settle_share: of the settle time to wait.
@@ -63,7 +66,7 @@ class Step:
     @property
     def needs_model(self) -> bool:
         """Whether the signals must be solved from an influence function first."""
-        return self.kind is StepKind.SURFACE and self.signals is None
+        return self.kind is StepKind.CHECK or (self.kind is StepKind.SURFACE and self.signals is None)
 
 
 @dataclass(frozen=True)
@@ -145,6 +148,18 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
         if (k + 1) % HYSTERESIS_REFERENCE_EVERY == 0:
             steps.append(Step(f"reference {2 + k // HYSTERESIS_REFERENCE_EVERY}", StepKind.REFERENCE, mirror.rest))
     return Plan(PlanKind.HYSTERESIS, tuple(steps))
+
+
+def check_shape(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:
+    """`step` with the signals that make its shape on a flat surface, as every request in use does.
+
+    The law is tested, and fitted, where it will be used: about the signals that flatten the mirror.
+    """
+    assert step.signals is not None
+    limits = mirror.limits
+    inside = replace(limits, neighbour_difference=CHECK_ROOM * limits.neighbour_difference)
+    target = model.influence_sag @ (step.signals - mirror.rest)
+    return replace(step, signals=limits.scaled(surfaces.solve_shape(target, model, mirror, inside)[0])[0])
 
 
 def solve_step(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> tuple[Step, surfaces.Surface]:

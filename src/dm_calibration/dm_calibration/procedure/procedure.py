@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import fit_influence
-from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.maps import CHECK, MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import LinearModel
 from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
 from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, Unseen
-from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, solve_step
+from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, check_shape, solve_step
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench
 from dm_common.mirror import Mirror
@@ -155,8 +155,12 @@ class Procedure:
         try:
             if self._model is None:
                 self._model = fit_influence(self._maps_before_solving(), self._options.fit, rings=self._mirror.rings)
+            if step.kind is StepKind.CHECK:
+                return check_shape(step, self._model, self._mirror)
             solved, surface = solve_step(step, self._model, self._mirror)
         except TooFewMapsError as error:
+            if step.kind is StepKind.CHECK:
+                return step
             reason = f"{step.label}: no influence function to solve its signals from: {error}"
             self._note(Dropped(number, reason, whole=True))
             return None
@@ -166,7 +170,7 @@ class Procedure:
     def _maps_before_solving(self) -> MapSet:
         """The maps before the first solved shape: the same whether the run was interrupted after it or not."""
         maps = self.outcome.maps()
-        solved = np.isfinite(maps.nominal).any(axis=1)
+        solved = np.isfinite(maps.nominal).any(axis=1) | np.array([kind == CHECK for kind in maps.kind])
         return maps.select(~np.logical_or.accumulate(solved))
 
     def _measure_state(self, step: Step, number: int, repeats: int) -> None:

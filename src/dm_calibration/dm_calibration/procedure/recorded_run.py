@@ -213,7 +213,7 @@ def _agreement(plan: Plan, moves: Sequence[Move]) -> tuple[int, str]:
         if step.kind is StepKind.DEGAUSS:
             if not move.degauss:
                 return index, "the recorded run does not begin with a degauss"
-        elif step.signals is not None and not np.array_equal(move.requested, step.signals):
+        elif step.signals is not None and not step.needs_model and not np.array_equal(move.requested, step.signals):
             return index, f"step {step.label!r}: other signals were commanded"
     if len(moves) < len(plan.steps):
         return len(moves), f"step {plan.steps[len(moves)].label!r}: the recording ends before it"
