@@ -15,6 +15,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.recalibration.drift_filter import Drift
+from dm_common.hysteresis.model import HysteresisModel
 from dm_common.messages import doubles, recipe_book_message, time_message
 
 Floats = NDArray[np.float64]
@@ -105,6 +106,12 @@ def put_updates(
         message.quality = CalibrationMsg.APPROXIMATE
 
 
+def _slopes(law: HysteresisModel) -> Floats:
+    """As the message has them: of each actuator and way, where the weights are of each actuator."""
+    slope, count = law.duhem_slope, np.size(law.duhem_weight)
+    return np.broadcast_to(slope, (count, 2, slope.shape[-1])) if count > 1 and slope.size else slope
+
+
 def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
     """The hysteresis model of a calibration."""
     law = hysteresis.law
@@ -113,7 +120,7 @@ def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
         play_radius=doubles(law.play_radius),
         powers=law.play_weight.shape[-1],
         play_weight=doubles(law.play_weight),
-        duhem_slope=doubles(law.duhem_slope),
+        duhem_slope=doubles(_slopes(law)),
         duhem_weight=doubles(np.atleast_1d(law.duhem_weight)),
         creep_rate=law.creep_rate,
         creep_time=doubles(law.creep_time),

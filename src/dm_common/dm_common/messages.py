@@ -143,6 +143,9 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
             f"hysteresis: play_weight has {weight.size} values, must be {radius.size} x {message.powers} (for each)"
         )
     duhem_weight = np.array(message.duhem_weight, dtype=np.float64)
+    duhem_slope = np.array(message.duhem_slope, dtype=np.float64)
+    if duhem_weight.size > 1 and duhem_slope.size % (2 * duhem_weight.size):
+        raise ValueError(f"hysteresis: duhem_slope has {duhem_slope.size} values, must be {duhem_weight.size} x 2 x A")
     creep_time = np.array(message.creep_time, dtype=np.float64)
     spectrum = np.array(message.creep_spectrum, dtype=np.float64)
     if spectrum.size and (not creep_time.size or spectrum.size % creep_time.size):
@@ -157,7 +160,7 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     return HysteresisModel(
         radius,
         weight.reshape((-1, radius.size, message.powers) if weight.size > one else (radius.size, message.powers)),
-        np.array(message.duhem_slope, dtype=np.float64),
+        duhem_slope.reshape(duhem_weight.size, 2, -1) if duhem_weight.size > 1 and duhem_slope.size else duhem_slope,
         duhem_weight if duhem_weight.size > 1 else float(duhem_weight.sum()),
         message.creep_rate,
         creep_time,

@@ -136,3 +136,27 @@ def test_a_duhem_operator_without_end_is_refused() -> None:
 def test_a_law_that_makes_no_sense_is_refused(field: str, value: object, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         replace(rich(), **{field: value})  # type: ignore[arg-type]
+
+
+def test_duhem_operators_of_each_actuator_are_those_of_one() -> None:
+    """On moves of both directions; rises by the first polynomial, falls by the second."""
+    rng = np.random.default_rng(3)
+    slopes = np.array([1.6, 0.3]) * np.exp(0.1 * rng.standard_normal((5, 2, 2)))
+    slopes[0] = slopes[0, 0]
+    together = DuhemOperator(slopes)
+    alone = [DuhemOperator(np.stack((slope, slope))[:1]) for slope in slopes]
+    symmetric = DuhemOperator(slopes[0, 0])
+    z, change = np.zeros(5), rng.uniform(-1.0, 1.0, (40, 5))
+    first = np.zeros(1)
+    ones = np.zeros((5, 1))
+    for step in change:
+        before = z
+        z = together.move(z, step)
+        first = symmetric.move(first, step[:1])
+        ones = np.stack([one.move(old, to) for one, old, to in zip(alone, ones, step[:, None], strict=True)])
+        np.testing.assert_allclose(together.move(before[:, None], np.stack((step, 0.5 * step), axis=1))[:, 0], z)
+        slope = (together.move(before, step + 1e-6 * np.sign(step)) - z) / (1e-6 * np.sign(step))
+        inside = slope > 0.05  # not where a table ends
+        np.testing.assert_allclose(together.rise(z, np.sign(step))[inside], slope[inside], atol=5e-3)
+    assert z[0] == pytest.approx(first[0], abs=1e-9)
+    np.testing.assert_allclose(ones[:, 0], z, atol=1e-12)

@@ -18,6 +18,10 @@ PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIM
 #: Creep rate that a prior takes where a law has found less.
 RATE_MIN = 1e-3
 
+#: Fewest coefficients of a Duhem operator of its own, the step for derivatives by them, their largest change, and the
+#: weight of an operator below which nothing can be said of them.
+DUHEM_ORDERS, SLOPE_STEP, CHANGE_MAX, DUHEM_WEIGHT_MIN = 3, 0.02, 1.0, 0.01
+
 
 def play_values(signals: Floats, radius: Floats) -> Floats:
     """(M, R, N) values of play operators of half-widths `radius` (R,) along `signals` (M, N) from a degauss at 0 on."""
@@ -54,6 +58,43 @@ def fading_feature(signals: Floats, operator: DuhemOperator) -> Floats:
         z = operator.move(z, shape - last)
         values[row, 0], last = z, shape
     return values
+
+
+def padded_slope(slope: Floats, actuators: int) -> Floats:
+    """(N, 2, A) coefficients of a Duhem operator that begins as `slope` (A,), A being at least DUHEM_ORDERS."""
+    padded = np.zeros(max(DUHEM_ORDERS, len(slope)))
+    padded[: len(slope)] = slope
+    return np.tile(padded, (actuators, 2, 1))
+
+
+def fading_changes(signals: Floats, slope: Floats) -> Floats:
+    """(M, 2 A, N) derivatives of :func:`fading_feature` by the coefficients `slope` (N, 2, A) of its operator."""
+    still = fading_feature(signals, DuhemOperator(slope))
+    changes = []
+    for index in np.ndindex(*slope.shape[1:]):
+        changed = slope.copy()
+        changed[:, *index] += SLOPE_STEP
+        changes.append((fading_feature(signals, DuhemOperator(changed)) - still) / SLOPE_STEP)
+    return np.concatenate(changes, axis=1)
+
+
+def own_slopes(slope: Floats, weight: Floats, changes: Floats) -> Floats:
+    """(N, 2, A) coefficients of each actuator's operator, to first order.
+
+    Args:
+        slope: (N, 2, A) to begin with.
+        weight, changes: (N,) and (2 A, N) weights of the operator and of :func:`fading_changes`.
+    """
+    known = np.abs(weight) > DUHEM_WEIGHT_MIN
+    change = np.where(known, changes / np.where(known, weight, 1.0), 0.0).T.reshape(slope.shape)
+    change = np.clip(change, -CHANGE_MAX, CHANGE_MAX)
+    for share in (1.0, 0.5, 0.25):
+        try:
+            DuhemOperator(slope + share * change)
+        except ValueError:  # it leads nowhere
+            continue
+        return slope + share * change
+    return slope
 
 
 def creep_states(values: Floats, time: Floats, start: float, moved: Floats | None = None) -> Iterator[Floats]:

@@ -25,7 +25,10 @@ from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Candidate, LawF
 from dm_calibration.hysteresis.features import (
     PER_ELEMENT,
     creep_states,
+    fading_changes,
     fading_feature,
+    own_slopes,
+    padded_slope,
     play_values,
     spectrum_prior,
     weight_of,
@@ -45,8 +48,8 @@ PATTERNS = 40
 AMPLITUDE, CORRELATION, DECAY, ORDER_POWER = 0.2, 0.5, 0.35, 3.0
 #: Variance of the loading curve beside that of all play operators together.
 LOADING = 0.3
-#: Prior standard deviation of a Duhem operator's weight.
-DUHEM_WEIGHT = 0.3
+#: Prior standard deviations of a Duhem operator's weight, and of that times the change of a coefficient of its slope.
+DUHEM_WEIGHT, DUHEM_CHANGE = 0.3, 0.1
 #: Prior of the creep spectrum: standard deviation relative to the common rate, correlation over elements, and the
 #: spread between actuators relative to that.
 SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD = 0.5, 12.0, 0.3
@@ -81,7 +84,7 @@ class OwnLaws:
     Args:
         run: what was commanded and measured.
         candidate: play operators and orders of the Legendre series.
-        common: law of all actuators to begin with; its Duhem operator is kept.
+        common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
     """
 
@@ -97,15 +100,9 @@ class OwnLaws:
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
         columns = [signals[:, None, :], (flat @ self._basis).transpose(0, 2, 1)]
-        prior = np.ones(self._basis.shape[1])
-        if self._slope.size:
-            operator = DuhemOperator(self._slope)
-            columns.append(self._in_parts(lambda part, start: fading_feature(signals[part], operator)))
-            prior = np.append(prior, DUHEM_WEIGHT**2)
-        self._features = np.concatenate(columns, axis=1)
+        self._plain = np.concatenate(columns, axis=1)
         count = signals.shape[1]
         self._between = _alike(count, SPREAD)
-        self._prior = np.asarray(np.diag(1.0 / prior), dtype=np.float64)
         self._creeps = common.creep_rate > 0.0
         self._creep = weight_of(common.creep_rate)
         prior_of_creep = spectrum_prior(common.creep_rate, SPECTRUM, SPECTRUM_CORRELATION)
@@ -117,31 +114,62 @@ class OwnLaws:
         return in_parts(self._parts, self._starts, work)
 
     def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
-        """Fit to the rows in `keep` (M,), from `start` or from no hysteresis at all."""
+        """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all."""
+        actuators = self._plain.shape[2]
         if isinstance(start, OwnFit):
-            patterns, creep, scatter = start.patterns, start.creep, start.scatter
+            patterns, creep, scatter, slope = start.patterns, start.creep, start.scatter, start.law.duhem_slope
         else:
-            features, actuators = self._features.shape[1:]
-            patterns = np.zeros((features, actuators))
-            patterns[0] = 1.0
+            patterns = np.eye(self._plain.shape[1], 1) * np.ones(actuators)
             # Where the maps show no common creep, no actuator has any.
             creep = np.full((len(CREEP_TIMES), actuators), self._creep if self._creeps else 0.0)
-            scatter = self._scatter
+            scatter, slope = self._scatter, self._slope
+            if slope.size:
+                slope = padded_slope(slope, actuators)
+                changing = np.concatenate((self._features(slope), self._fading_changes(slope)), axis=1)
+                patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
+                own = len(patterns) - 2 * slope.shape[2]
+                slope = own_slopes(slope, patterns[own - 1], patterns[own:])
+                patterns = patterns[:own]
+        patterns, creep, scatter, residual = self._rounds(self._features(slope), keep, patterns, creep, scatter)
+        return OwnFit(self.candidate, self._law(patterns, creep, slope), residual, patterns, creep, scatter)
+
+    def _features(self, slope: Floats) -> Floats:
+        """(M, F, N) the signal, the patterns of the play operators, and the Duhem operator with `slope`, if any."""
+        if not slope.size:
+            return self._plain
+        operator, signals = DuhemOperator(slope), self.run.signals
+        fading = self._in_parts(lambda part, start: fading_feature(signals[part], operator))
+        return np.concatenate((self._plain, fading), axis=1)
+
+    def _fading_changes(self, slope: Floats) -> Floats:
+        """(M, 2 A, N) how the Duhem operator's value changes with its coefficients `slope` (N, 2, A)."""
+        signals = self.run.signals
+        return self._in_parts(lambda part, start: fading_changes(signals[part], slope))
+
+    def _rounds(
+        self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Patterns (F, N), creep (J, N), scatter (D,) and residual (M, D) after ROUNDS solutions in turn."""
+        more = features.shape[1] - self._plain.shape[1]
+        sigma = np.concatenate((np.ones(self._basis.shape[1]), np.full(min(more, 1), DUHEM_WEIGHT)))
+        sigma = np.concatenate((sigma, np.full(max(more - 1, 0), DUHEM_CHANGE)))
+        prior = np.diag(sigma**-2.0)
+        patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
         free = basis_of(self._figure[keep])
-        crept = self._with_creep(creep)
+        crept = self._with_creep(features, creep)
         gains, residual = self._gains(crept, patterns, keep)
         for number in range(ROUNDS):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
-            patterns = self._patterns(crept[keep], gains / scatter, measured, free)
+            patterns = self._patterns(crept[keep], gains / scatter, measured, free, prior)
             if self._creeps:
-                position = np.einsum("mfn,fn->mn", self._features, patterns)
+                position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, gains / scatter, measured, keep, free)
-                crept = self._with_creep(creep)
+                crept = self._with_creep(features, creep)
             gains, residual = self._gains(crept, patterns, keep)
-        return OwnFit(self.candidate, self._law(patterns, creep), residual, patterns, creep, scatter)
+        return patterns, creep, scatter, residual
 
-    def _law(self, patterns: Floats, creep: Floats) -> HysteresisModel:
+    def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
         """The law of the weights (F, N) and (J, N), each actuator's effective signal spanning 2 in a full cycle."""
         count, orders = self._basis.shape[1], self.candidate.powers
         series = (self._basis @ patterns[1 : 1 + count]).T.reshape(-1, len(self.radius), orders)
@@ -155,8 +183,8 @@ class OwnLaws:
         law = HysteresisModel(
             self.radius,
             play_weight,
-            self._slope.copy(),
-            patterns[-1].copy() if self._slope.size else 0.0,
+            slope,
+            patterns[-1].copy() if slope.size else 0.0,
             mean / PER_ELEMENT,
             CREEP_TIMES,
             share / mean if mean else np.zeros(0),
@@ -169,12 +197,11 @@ class OwnLaws:
         for part, start in zip(self._parts, self._starts, strict=True):
             yield from creep_states(values[part], run.time[part], start, run.moved_in(part))
 
-    def _with_creep(self, creep: Floats) -> Floats:
-        """(M, F, N) features with the creep that the spectra `creep` (J, N) add."""
+    def _with_creep(self, features: Floats, creep: Floats) -> Floats:
+        """`features` (M, F, N) with the creep that the spectra `creep` (J, N) add."""
         if not creep.any():
-            return self._features
-        added = [np.einsum("jfn,jn->fn", state, creep) for state in self._creep_states(self._features)]
-        return self._features + np.array(added)
+            return features
+        return features + np.array([np.einsum("jfn,jn->fn", state, creep) for state in self._creep_states(features)])
 
     def _gains(self, crept: Floats, patterns: Floats, keep: Rows) -> tuple[Floats, Floats]:
         """Gains (N, D) and residual (M, D), m."""
@@ -186,16 +213,16 @@ class OwnLaws:
     def _scatter_of(self, residual: Floats) -> Floats:
         """(D,) m, one value for all coefficients; maps that no law explains do not set it."""
         count, coefficients = len(residual), self.run.responses.coefficients
-        freedom = max(count - self._figure.shape[1] - self._features.shape[2], 1)
+        freedom = max(count - self._figure.shape[1] - self._plain.shape[2], 1)
         size = MEDIAN_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
         scatter = np.maximum(size, SCATTER_MIN)
         scatter[:coefficients] = np.median(scatter[:coefficients])
         return np.asarray(scatter)
 
-    def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats) -> Floats:
+    def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats, prior: Floats) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior."""
         left = measured - crept[:, 0] @ gains
-        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, self._prior, self._between)
+        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, prior, self._between)
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(self, position: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats) -> Floats:

@@ -3,6 +3,7 @@
 ``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 [21]. Play operators never forget what
 was not wiped out by a larger swing; this one forgets exponentially, as some ceramics do. f is a polynomial whose
 coefficients are fitted, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``; the law a mirror really has need not be one of them.
+Actuators may have polynomials of their own, and others on falling than on rising moves.
 
 The equation has no u in it, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.
 """
@@ -18,7 +19,7 @@ Floats = NDArray[np.float64]
 REACH = 2.5
 #: Longest straight way, from one end of the signals to the other.
 FULL_SWING = 2.0
-#: Slope at which the table ends: z comes no nearer to its limit.
+#: Slope at which a table ends: z comes no nearer to its limit.
 SLOPE_MIN = 1e-3
 KNOTS = 2001
 
@@ -27,36 +28,67 @@ class DuhemOperator:
     """The operator for any number of actuators at once.
 
     Args:
-        slope: (A,) coefficients a_1, a_2, ... of f.
+        slope: (A,) coefficients a_1, a_2, ... of f, or (N, 2, A) of each actuator, on rising and on falling moves.
 
     Raises:
         ValueError: coefficients that are not finite, or a state that no table holds.
+
+    Attributes:
+        slope_range: smallest and largest f that is met, of all.
     """
 
     def __init__(self, slope: Floats) -> None:
-        slope = np.asarray(slope, dtype=np.float64)
-        if slope.ndim != 1 or not slope.size or not np.isfinite(slope).all():
+        self.slope = slope = np.asarray(slope, dtype=np.float64)
+        if slope.ndim not in (1, 3) or not slope.size or not np.isfinite(slope).all():
             raise ValueError(f"duhem_slope = {slope.tolist()}: must be one or more finite numbers")
+        self._own = slope.ndim == 3
+        rows = np.arange(slope.size // slope.shape[-1])
+        self._polynomial = np.vstack((np.ones(len(rows)), -slope.reshape(len(rows), -1).T, np.zeros(len(rows))))
         z = np.linspace(-REACH, REACH, KNOTS)
-        f = 1.0 - np.polynomial.polynomial.polyval(z, np.concatenate(([0.0], slope)))
+        f = np.polynomial.polynomial.polyval(z, self._polynomial)  # (rows, KNOTS)
         # A rise ends where the slope does, or where a full swing leads; a fall at the opposite value.
         middle = KNOTS // 2
-        stopped = np.flatnonzero(f[middle:] < SLOPE_MIN)
-        end = middle + (int(stopped[0]) if stopped.size else KNOTS - middle) - 1
-        steps = 0.5 * (1.0 / f[middle + 1 : end + 1] + 1.0 / f[middle:end]) * np.diff(z[middle : end + 1])
-        end = middle + int(np.searchsorted(np.cumsum(steps), FULL_SWING))
-        begin = KNOTS - 1 - end
-        self._z, f = z[begin : end + 1], f[begin : end + 1]
-        if end == KNOTS - 1 or len(f) < 3 or f.min() <= 0.0:
+        onward = np.maximum(f[:, middle:], SLOPE_MIN)
+        travel = np.cumsum(0.5 * (1.0 / onward[:, 1:] + 1.0 / onward[:, :-1]) * np.diff(z[middle:]), axis=1)
+        over = (f[:, middle + 1 :] < SLOPE_MIN) | (travel >= FULL_SWING)
+        end = middle + np.where(over.any(axis=1), over.argmax(axis=1), KNOTS)
+        begin = KNOTS - 1 - (end.reshape(-1, 2)[:, ::-1].ravel() if self._own else end)
+        met = (np.arange(KNOTS) >= begin[:, None]) & (np.arange(KNOTS) <= end[:, None])
+        if end.max() >= KNOTS - 1 or end.min() < middle + 1 or f[met].min() <= 0.0:
             raise ValueError(f"duhem_slope = {slope.tolist()}: the state does not stay within +-{REACH:g}")
-        steps = 0.5 * (1.0 / f[1:] + 1.0 / f[:-1]) * np.diff(self._z)
-        travel = np.concatenate(([0.0], np.cumsum(steps)))
-        self._travel = travel - np.interp(0.0, self._z, travel)
-        self.slope = slope
-        self.slope_range = float(f.min()), float(f.max())
+        self.slope_range = float(f[met].min()), float(f[met].max())
+        f = np.maximum(f, SLOPE_MIN)
+        steps = 0.5 * (1.0 / f[:, 1:] + 1.0 / f[:, :-1]) * np.diff(z)
+        travel = np.hstack((np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)))
+        travel -= travel[:, [middle]]
+        self._ends = z[begin], z[end], travel[rows, end]
+        # All tables in one, each moved out of the others' way, so that one look-up serves all actuators.
+        self._z_apart, self._travel_apart = 2.0 * np.ptp(z) * rows, 2.0 * np.abs(travel).max() * rows
+        self._z, self._travel = np.tile(z, len(rows)), travel.ravel()
+        self._z_rows = (z + self._z_apart[:, None]).ravel()
+        self._travel_rows = (travel + self._travel_apart[:, None]).ravel()
+
+    def _rows(self, way: Floats) -> NDArray[np.intp]:
+        """The table of each element of `way`: actuators are along the only axis, or the last but one."""
+        if not self._own:
+            return np.zeros(way.shape, dtype=np.intp)
+        actuators = np.arange(len(self.slope))
+        return np.asarray(2 * (actuators if way.ndim == 1 else actuators[:, None]) + (way < 0.0))
 
     def move(self, z: Floats, change: Floats) -> Floats:
-        """The state z (N,) after signals changed by `change` (N,) on a straight way."""
-        way = np.where(change < 0.0, -1.0, 1.0)
-        travelled = np.interp(way * z, self._z, self._travel) + np.abs(change)
-        return np.asarray(way * np.interp(travelled, self._travel, self._z))
+        """The state z (N,) or (..., N, P) after signals changed by `change` on a straight way."""
+        way = np.where(np.broadcast_to(change, np.broadcast_shapes(np.shape(z), np.shape(change))) < 0.0, -1.0, 1.0)
+        rows = self._rows(way)
+        low, high, far = self._ends
+        along = np.minimum(np.maximum(way * z, low[rows]), high[rows]) + self._z_apart[rows]
+        travelled = np.minimum(np.interp(along, self._z_rows, self._travel) + np.abs(change), far[rows])
+        return np.asarray(way * np.interp(travelled + self._travel_apart[rows], self._travel_rows, self._z))
+
+    def rise(self, z: Floats, way: Floats) -> Floats:
+        """dz/du at the state z, on a way that rises (`way` 1) or falls (-1); shapes as in :meth:`move`."""
+        along = way * z
+        rows = self._rows(np.broadcast_to(way, along.shape))
+        total = self._polynomial[-1][rows]
+        for coefficient in self._polynomial[-2::-1]:
+            total = total * along + coefficient[rows]
+        return np.asarray(total)

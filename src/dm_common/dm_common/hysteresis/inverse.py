@@ -88,8 +88,7 @@ class Pieces:
             set in, on a falling [0] and on a rising [1] way; of all actuators, or of each.
         single: (D + 1, 1 or N, R) the same of each operator alone, in its own value.
         order: that sorts the law's operators; None = they are sorted.
-        duhem, duhem_weight, duhem_slope: the Duhem operator, None = none; its weight () or (N,), and the polynomial of
-            its slope in its value.
+        duhem, duhem_weight: the Duhem operator, None = none; its weight () or (N,).
     """
 
     def __init__(self, law: HysteresisModel) -> None:
@@ -110,7 +109,6 @@ class Pieces:
         self.polynomial = self.polynomial.cumsum(axis=-1)
         self.duhem = DuhemOperator(law.duhem_slope) if law.duhem_slope.size else None
         self.duhem_weight = np.asarray(law.duhem_weight, dtype=np.float64)
-        self.duhem_slope = np.concatenate(([1.0], -law.duhem_slope, [0.0]))
         self.powers = np.arange(1.0, powers)[:, None]
 
     def solve(self, state: HysteresisState, wanted: Floats, low: float, high: float) -> Inverted:
@@ -167,7 +165,7 @@ class Pieces:
             if self.duhem is not None:
                 fading = self.duhem.move(state.fading, signals - state.signals)
                 value += self.duhem_weight * fading
-                slope = slope + self.duhem_weight * horner(self.duhem_slope, sign * fading)
+                slope = slope + self.duhem_weight * self.duhem.rise(fading, sign)
             gap = value - wanted
             below = gap < 0.0
             low, high = np.where(below, signals, low), np.where(below, high, signals)

@@ -65,7 +65,7 @@ class HysteresisModel:
     Attributes:
         play_radius: (R,) half-widths, normalised; 0 = the signal itself.
         play_weight: (R, D) weights of the powers 1 .. D of each play operator's value, or (N, R, D) for each actuator.
-        duhem_slope: (A,) of the Duhem operator; empty = none.
+        duhem_slope: (A,) of the Duhem operator, or (N, 2, A) of each actuator, rising and falling; empty = none.
         duhem_weight: () or (N,) of the Duhem operator's value.
         creep_rate: growth of a step per decade of time, in the mean over actuators and elements.
         creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
@@ -104,9 +104,8 @@ class HysteresisModel:
         expected = (2, 1 + len(self.creep_time), 1 + len(self.creep_time))
         if self.creep_covariance.size and self.creep_covariance.shape != expected:
             raise ValueError(f"creep_covariance has the shape {self.creep_covariance.shape}: must be {expected}")
-        own = (self.play_weight.shape[:-2], np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1])
-        if len({shape for shape in own if shape}) > 1:
-            raise ValueError(f"play_weight, duhem_weight and creep_spectrum are of {own} actuators: must be of as many")
+        if len({shape for shape in self._own if shape}) > 1:
+            raise ValueError(f"play_weight, duhem_slope, duhem_weight, creep_spectrum: of {self._own} actuators")
         for name in (item.name for item in fields(self)):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} holds values that are not finite")
@@ -154,23 +153,20 @@ class HysteresisModel:
     @property
     def actuators(self) -> int:
         """Number of actuators that have laws of their own; 0 = one law for any number of them."""
-        own = (self.play_weight.shape[:-2], np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1])
-        return max(shape[0] if shape else 0 for shape in own)
+        return max(shape[0] if shape else 0 for shape in self._own)
+
+    @property
+    def _own(self) -> tuple[tuple[int, ...], ...]:
+        slope = self.duhem_slope.shape[:-2]
+        return self.play_weight.shape[:-2], slope, np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1]
 
     # --- states ---
 
     def demagnetised(self, actuators: int, time: float, middle: float = 0.0) -> HysteresisState:
         """The state after a degauss that ended at `middle`, long rested there."""
         play = np.full((actuators, len(self.play_radius)), middle)
-        state = HysteresisState(
-            time,
-            np.full(actuators, middle),
-            play,
-            np.zeros(actuators),
-            np.zeros(actuators),
-            np.zeros((actuators, len(self.creep_time))),
-            np.zeros(len(self.creep_time)),
-        )
+        none, crept = np.zeros(actuators), np.zeros((actuators, len(self.creep_time)))
+        state = HysteresisState(time, np.full(actuators, middle), play, none, none, crept, crept.sum(axis=0))
         position = self._position(play, state.fading)
         return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
 

@@ -173,10 +173,10 @@ class PreparedInverse:
         if duhem is not None and fading is not None:
             after = np.empty_like(fading)
             after[..., :-1] = fading[..., 1:]
-            after[..., -1] = duhem.move(hysteresis[..., -1], ends - self.state.signals)
+            after[..., -1:] = duhem.move(hysteresis[..., -1:], (ends - self.state.signals)[..., None])
             last[..., -1] += parts.duhem_weight * after[..., -1]
-            steep_first += parts.duhem_weight[..., None] * horner(parts.duhem_slope, sign * fading)
-            steep_last += parts.duhem_weight[..., None] * horner(parts.duhem_slope, sign * after)
+            steep_first += parts.duhem_weight[..., None] * duhem.rise(fading, sign)
+            steep_last += parts.duhem_weight[..., None] * duhem.rise(after, sign)
         with np.errstate(divide="ignore", invalid="ignore"):  # pieces of no width, which hold no solution
             rise = last - first
             chord, one, two = (end - begin) / rise, 1.0 / steep_first, 1.0 / steep_last

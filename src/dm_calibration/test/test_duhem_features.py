@@ -1,0 +1,45 @@
+"""Duhem operators of each actuator: found from how the common one's values differ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dm_calibration.calibration_messages import hysteresis_message
+from dm_calibration.hysteresis.features import fading_changes, fading_feature, own_slopes, padded_slope
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
+from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.messages import hysteresis_model_from
+
+ACTUATORS, WEIGHT = 4, -0.2
+
+
+def test_small_changes_of_the_slope_are_found() -> None:
+    rng = np.random.default_rng(2)
+    signals = rng.uniform(-1.0, 1.0, (300, ACTUATORS))
+    common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
+    true = common * (1.0 + 0.05 * rng.standard_normal(common.shape))
+    values = WEIGHT * fading_feature(signals, DuhemOperator(true))[:, 0]
+    columns = np.concatenate((fading_feature(signals, DuhemOperator(common)), fading_changes(signals, common)), axis=1)
+    weights = np.column_stack([np.linalg.lstsq(columns[..., n], values[:, n])[0] for n in range(ACTUATORS)])
+    found = own_slopes(common, weights[0], weights[1:])
+    left = WEIGHT * fading_feature(signals, DuhemOperator(found))[:, 0] - values
+    assert np.abs(left).max() < 0.1 * np.abs(WEIGHT * columns[:, 0] - values).max()
+
+
+def test_nothing_is_said_of_an_operator_without_weight() -> None:
+    common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
+    assert own_slopes(common, np.full(ACTUATORS, 1e-3), np.full((6, ACTUATORS), 0.1)) == pytest.approx(common)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_slopes_of_each_actuator_come_back_from_the_message(own: bool) -> None:
+    common = np.array([1.4, 0.5, 0.1])
+    slope = np.tile(common, (ACTUATORS, 2, 1)) * np.linspace(0.9, 1.1, 2 * ACTUATORS).reshape(ACTUATORS, 2, 1)
+    play = np.ones((ACTUATORS, 1, 1)) if own else np.ones((1, 1))
+    weight = np.full(ACTUATORS, WEIGHT) if own else WEIGHT
+    law = HysteresisModel(np.zeros(1), play, slope if own else common, weight, 0.0, np.zeros(0))
+    back = hysteresis_model_from(hysteresis_message(HysteresisFit("Duhem", law, np.zeros(21), 1e-9, 0.02, 100, ())))
+    assert back is not None
+    assert back.same_as(law)
