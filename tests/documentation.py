@@ -83,6 +83,7 @@ RUN = (
     "./dm calibrate --hysteresis 300 --dry-run",
     "./dm focus 0.02",
     "./dm focus 0.03",
+    "./dm status",
     "./dm check --dry-run",
     "./dm check",
     "./dm check --forget",
