@@ -16,9 +16,9 @@ import pytest
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode, ZernikeCoefficients
 
-from dm_bringup.suite import Suite, save_config
+from dm_bringup.suite import Suite, load_config, save_config
 from dm_calibration.map_files import read_map
-from dm_client import DeformableMirrorClient, DeformableMirrorError
+from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_simulation.parameters import PARAMETERS
 from dm_tools.demo.demo_bench import bench_config
@@ -29,23 +29,42 @@ pytestmark = pytest.mark.processes
 SEED = 20_11
 
 
-def test_poke_check_tells_what_is_wired_wrongly(tmp_path: Path) -> None:
+def test_poke_check_finds_how_the_mirror_stands_and_writes_it(tmp_path: Path) -> None:
+    """Turned by 35 degrees, mirrored, numbered from another actuator, two channels exchanged; then as configured."""
     config = fast_bench(tmp_path, SEED)
+    config["virtual_bench"] |= {
+        "interferometer.mount_angle": 0.611,
+        "interferometer.mount_mirrored": True,
+        "interferometer.mount_x": 0.001,
+        "plate.start_angle": 1.0472,
+    }
     wiring = list(next(parameter for parameter in PARAMETERS if parameter.name == "wiring").default)
     wiring[2], wiring[6] = wiring[6], wiring[2]
     config["virtual_bench"]["wiring"] = wiring
     config["virtual_bench"]["interferometer.pixels"] = 256  # bumps of actuators are large
+    first, second = tmp_path / "first.yaml", tmp_path / "second.yaml"
+    save_config(config, first)
+    options = ["calibrate", "--plan", "poke-check"]
+    with own_domain() as domain, Suite(config, tmp_path, domain):
+        done = subprocess.run(
+            [sys.executable, "-m", "dm_tools", *options, "--config", str(first), "--write", str(second)],
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+    told = " ".join((done.stdout + done.stderr).split())
+    assert done.returncode == 1, told
+    assert "actuators 3 and 7 are exchanged" in told and "mirrored left to right, then turned by " in told
+    assert told.count("exchanged") <= 3 and "permuted" not in told, told  # a finding, and the refusal in one sentence
     with (
         own_domain() as domain,
-        Suite(config, tmp_path, domain),
+        Suite(load_config(second), tmp_path, domain),
         DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
         client.wait_until_active()
-        with pytest.raises(DeformableMirrorError) as found:
-            client.calibrate(Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKE_CHECK))
-    assert found.value.error_code == ErrorCode.POKE_CHECK_FAILED
-    findings = " ".join(found.value.response.poke_findings)
-    assert "3 and 7" in findings
+        result = client.calibrate(Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKE_CHECK))
+    assert result.error_code == ErrorCode.OK and result.poke_check_passed and not result.parameters
 
 
 def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_parameters import fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_maps
 from dm_calibration.influence.fit import fit_influence
+from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
 from dm_calibration.procedure.forecast import forecast
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
@@ -260,11 +261,15 @@ class CalibrateAction:
         result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms
         result.condition_number = fit.condition_number
         result.poke_check_passed, result.poke_findings = check.passed, list(check.findings)
+        channels = self._driver_facts().get("channels", ())
+        changes, beyond = poke_cure(check, mirror, outcome.records[-1], channels)
+        result.parameters = parameter_text(changes)
+        result.poke_findings += [beyond] if beyond else []
         if calibration is None:
             run.journal.remove()
             if not check.passed:
                 raise Refusal(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
-            result.message = "wiring and orientation are as configured"
+            result.message = f"wiring and orientation are as configured: {check.standing}"
             return
         if (hysteresis := calibration.hysteresis) is not None:
             result.hysteresis_model, result.hysteresis_held_out_max_zernike = (

@@ -31,6 +31,7 @@ def driver_facts(message: MirrorInfo) -> dict[str, Any]:
     """What maps depend on beside the mirror itself: wiring, electronics and volts."""
     return {
         "wiring": message.wiring,
+        "channels": list(message.channels),
         "electronics": message.electronics,
         "volts_min": message.volts_min,
         "volts_max": message.volts_max,

@@ -40,8 +40,9 @@ def check_fit(fit: InfluenceFit, mirror: Mirror) -> PokeCheck:
     return check_pokes(
         fit.influence_sag,
         fit.points,
-        mirror.x / mirror.working_radius,
-        mirror.y / mirror.working_radius,
+        mirror.x,
+        mirror.y,
+        mirror.working_radius,
         silent=fit.grades == GRADE_DEAD,
         unmoved=fit.grades == GRADE_NOT_EXCITED,
     )

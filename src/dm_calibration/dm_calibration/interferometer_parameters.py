@@ -9,8 +9,8 @@ from typing import Any
 from dm_calibration.acquisition.acquisition import AcquisitionSettings
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.map_files import XYZ_UNITS
-from dm_calibration.optics.orientation import ROTATIONS, Orientation
-from dm_common.ros.parameters import Parameter, real, switch, text, texts, whole
+from dm_calibration.optics.orientation import Orientation
+from dm_common.ros.parameters import Parameter, real, switch, text, texts
 
 PARAMETERS = (
     Parameter("autostart", switch(True), "Configure and activate by itself after the start."),
@@ -56,8 +56,9 @@ PARAMETERS = (
     Parameter("orientation.flip_y", switch(False), "Exchange top and bottom of the instrument's picture.", live=True),
     Parameter(
         "orientation.rotate_deg",
-        whole(0, 0, 270),
-        f"Then rotate it counter-clockwise by {', '.join(map(str, ROTATIONS))} degrees.",
+        real(0.0, -360.0, 360.0, "deg"),
+        "Then rotate it counter-clockwise. `./dm calibrate --plan poke-check` finds flips and angle.",
+        live=True,
     ),
     Parameter(
         "wavelength.expected",
@@ -89,7 +90,7 @@ PARAMETERS = (
 
 
 def ingest_settings(values: Mapping[str, Any]) -> IngestSettings:
-    """Raises ValueError for a rotation that is not a multiple of 90 degrees."""
+    """What maps are read with."""
     return IngestSettings(
         xyz_unit=values["xyz_unit"],
         pitch=values["pitch"],
@@ -106,9 +107,18 @@ def ingest_settings(values: Mapping[str, Any]) -> IngestSettings:
 
 
 def acquisition_settings(values: Mapping[str, Any]) -> AcquisitionSettings:
+    """What maps are taken by.
+
+    Raises:
+        ValueError: values that contradict each other, or a folder of an unknown user.
+    """
     folder = values["watch_folder"]
+    try:
+        watched = Path(folder).expanduser() if folder else None
+    except RuntimeError as error:
+        raise ValueError(f"watch_folder = {folder!r}: {error}") from error
     return AcquisitionSettings(
-        folder=Path(folder).expanduser() if folder else None,
+        folder=watched,
         patterns=values["file_pattern"],
         stable_time=values["stable_time"],
         trigger_command=[argument for argument in values["trigger_command"]],

@@ -156,6 +156,46 @@ def test_orientation_of_a_letter(orientation: Orientation, expected: list[str]) 
     assert found == expected
 
 
-def test_other_rotations_are_refused() -> None:
-    with pytest.raises(ValueError, match="rotate_deg = 45"):
-        Orientation(rotate_deg=45)
+def hill(height: int, width: int, x: float, y: float) -> np.ndarray:
+    """A hill at `x`, `y` from the centre of the map, pixels, y up."""
+    column, row = np.arange(width) - (width - 1) / 2 - x, (height - 1) / 2 - y - np.arange(height)
+    return np.asarray(np.exp(-(column**2 + row[:, None] ** 2) / 200.0))
+
+
+@pytest.mark.parametrize("degrees", [35.0, -100.0, 217.5])
+def test_any_angle_turns_about_the_centre_and_loses_nothing(degrees: float) -> None:
+    turned = Orientation(rotate_deg=degrees).apply(hill(120, 160, 30.0, 20.0))
+    place = (30.0 + 20.0j) * np.exp(1j * np.radians(degrees))
+    expected = hill(turned.shape[0], turned.shape[1], place.real, place.imag)
+    valid = np.isfinite(turned)
+    assert abs(turned - expected)[valid].max() < 0.003
+    assert valid.sum() == pytest.approx(120 * 160, rel=0.03)
+
+
+def test_a_rotation_keeps_holes_and_edges_empty() -> None:
+    sag = np.zeros((50, 50))
+    sag[20, 30] = np.nan
+    turned = Orientation(rotate_deg=45.0).apply(sag)
+    assert turned.shape == (71, 71) and np.isnan(turned[0, 0])
+    place = (30 - 24.5 + 1j * (24.5 - 20)) * np.exp(0.25j * np.pi)
+    rows, columns = np.nonzero(np.isnan(turned[20:50, 20:50]))
+    assert 1 <= len(rows) <= 6
+    assert columns.mean() + 20 - 35.0 == pytest.approx(place.real, abs=1.0)
+    assert 35.0 - rows.mean() - 20 == pytest.approx(place.imag, abs=1.0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.booleans(), st.booleans(), st.floats(-180, 180), st.floats(-3.0, 3.0), st.booleans())
+def test_the_orientation_that_puts_a_turned_mirror_right(
+    flip_x: bool, flip_y: bool, rotate_deg: float, turn: float, mirrored: bool
+) -> None:
+    before = Orientation(flip_x, flip_y, rotate_deg)
+
+    def oriented(orientation: Orientation, place: complex) -> complex:
+        x, y = -place.real if orientation.flip_x else place.real, -place.imag if orientation.flip_y else place.imag
+        return complex(x, y) * complex(np.exp(1j * np.radians(orientation.rotate_deg)))
+
+    camera = 1.7 - 0.6j
+    seen = oriented(before, camera) * np.exp(-1j * turn)
+    configured = complex(-seen.conjugate() if mirrored else seen)
+    assert oriented(before.after(turn, mirrored), camera) == pytest.approx(configured, abs=1e-9)

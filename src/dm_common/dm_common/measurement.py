@@ -34,6 +34,7 @@ class Measurement:
         camera: width and height of the map, pixels; zeros = not known.
         centre: of the aperture from the left and top edge of the map, pixels; NaN = not known.
         radius_px: of the aperture, pixels; 0 = not known.
+        orientation: how the instrument's picture was turned: flips of x and y, then counter-clockwise by degrees.
         label: unique in a calibration, e.g. ``poke+07``, ``p55``, ``reference 3``; "" = not commanded by a run.
         kind: reference, poke, surface, excitation (shows hysteresis) or check (a move as in use, tests its model).
         step: index of the commanded state; maps repeated in one state share it.
@@ -61,6 +62,7 @@ class Measurement:
     camera: tuple[int, int] = (0, 0)
     centre: tuple[float, float] = (float("nan"), float("nan"))
     radius_px: float = 0.0
+    orientation: tuple[bool, bool, float] = (False, False, 0.0)
     label: str = ""
     kind: str = ""
     step: int = 0

@@ -107,6 +107,7 @@ def measurement_from(response: Any) -> Measurement:
         camera=(response.info.width, response.info.height),
         centre=(response.info.centre_x, response.info.centre_y),
         radius_px=response.info.aperture_radius_px,
+        orientation=(response.info.flip_x, response.info.flip_y, response.info.rotate_deg),
     )
 
 

@@ -108,6 +108,7 @@ def mirror_info_message(
         volts_max=configuration.output.scale.volts_max,
         safe_signals=doubles(configuration.safe_shape),
         wiring=values["mirror.wiring"],
+        channels=array.array("i", configuration.output.channels.astype(np.int32).tobytes()),
         electronics=configuration.kind,
     )
     message.header.frame_id = frame_id

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from dm_common.ros.parameters import Parameter, real, reals, switch, text, whole, wholes
-from dm_simulation.bench import BenchConfig, FilesConfig
+from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
 from dm_simulation.camera import CameraConfig
 from dm_simulation.electronics.drive_unit import DriveConfig
 from dm_simulation.electronics.framed_unit import BYTE_ORDERS, CHECK_LENGTH, FramedConfig
 from dm_simulation.electronics.monitor import MonitorConfig
-from dm_simulation.electronics.server import PortsConfig
+from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_simulation.interferometer.zygo_files import FORMATS, UNITS
 from dm_simulation.mirror.hysteresis import LAWS
@@ -109,6 +110,19 @@ PARAMETERS = (
     ),
     Parameter("interferometer.specks", whole(_INSTRUMENT.specks, 0, 1_000_000), "Mean number of dropped pixels."),
     Parameter("interferometer.blobs", whole(_INSTRUMENT.blobs, 0, 1000), "Dropped discs per map."),
+    Parameter(
+        "interferometer.mount_angle",
+        real(_INSTRUMENT.mount_angle, -7.0, 7.0, "rad"),
+        "How the mirror is mounted in the field of view: turned anticlockwise by this, after ...",
+    ),
+    Parameter("interferometer.mount_mirrored", switch(_INSTRUMENT.mount_mirrored), "... it was mirrored left-right."),
+    Parameter("interferometer.mount_x", real(_INSTRUMENT.mount_x, -0.1, 0.1, "m"), "Its centre in the field, x."),
+    Parameter("interferometer.mount_y", real(_INSTRUMENT.mount_y, -0.1, 0.1, "m"), "Its centre in the field, y."),
+    Parameter(
+        "interferometer.mount_scale",
+        real(_INSTRUMENT.mount_scale, 0.5, 2.0),
+        "Lengths as the instrument sees them / true ones: error of its lateral scale.",
+    ),
     Parameter("interferometer.flip_x", switch(_INSTRUMENT.flip_x), "Picture mirrored left-right, after turning."),
     Parameter("interferometer.flip_y", switch(_INSTRUMENT.flip_y), "Picture mirrored upside down, after turning."),
     Parameter(
@@ -218,6 +232,20 @@ PARAMETERS = (
     ),
     Parameter("clock.period", real(0.002, 1e-4, 1.0, "s"), "Wall time between two messages on /clock."),
 )
+
+
+def check_bench(values: Mapping[str, Any]) -> None:
+    """Build the bench of these values, away from its ports and folder, to see whether it can be built.
+
+    Raises:
+        ValueError: it cannot, naming the parameter.
+    """
+    config = bench_config(values)
+    with tempfile.TemporaryDirectory(prefix="virtual-bench-") as folder:
+        terminal = str(Path(folder) / "pty") if config.ports.pty_link else ""
+        ports = replace(config.ports, tcp_port=OFF, udp_port=OFF, discovery_port=OFF, pty_link=terminal)
+        files = replace(config.files, folder=Path(folder))
+        VirtualBench(replace(config, ports=ports, files=files, trigger_port=OFF)).close()
 
 
 def bench_config(values: Mapping[str, Any]) -> BenchConfig:

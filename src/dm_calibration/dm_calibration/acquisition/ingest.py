@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +119,7 @@ class Ingest:
             camera=(sag.shape[1], sag.shape[0]),
             centre=circle[:2],
             radius_px=aperture.radius_px,
+            orientation=astuple(settings.orientation),
         )
         if settings.remove_piston_tilt:
             surface = replace(surface, sag=remove_plane(sag), piston_tilt_removed=True)

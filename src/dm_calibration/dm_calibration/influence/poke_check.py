@@ -1,11 +1,7 @@
-"""Compare wiring and orientation with the configuration, from how the surface answers to each actuator.
+"""Compare wiring and mounting with the configuration, from how the surface answers to each actuator.
 
-Driving actuator i raises a broad bump over the place where that actuator stands. The bumps measured are correlated with
-bumps expected at each configured position, for the eight ways a map can be turned or mirrored, and assigned one to one
-(Hungarian method). What differs from the configuration is said in sentences.
-
-A hexagonal layout looks the same after turns by 60 degrees, so that a map turned by 180 degrees cannot be told from a
-numbering that starts on the other side: such findings name both.
+How the mirror stands in the maps as a whole is told first (:mod:`~dm_calibration.influence.registration`); what is left
+then belongs to single actuators: dead, weak, inverted, exchanged with another, or two on one channel.
 """
 
 from __future__ import annotations
@@ -15,36 +11,33 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
-from dm_common.geometry import pitch
-from dm_common.optics.piston_tilt import remove_piston_tilt, rms
+from dm_calibration.influence.registration import Registration, bumps, register, unit_responses
+from dm_common.geometry import pitch, rings
 from dm_common.optics.sampling import SamplePoints
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
-#: Widths tried for the expected bumps (standard deviation, in pitches); a stiffer plate answers more broadly.
-WIDTHS = (0.7, 0.9, 1.15, 1.5)
-#: Another orientation must beat the configured one by this much in mean correlation.
-ORIENTATION_MARGIN = 0.05
+#: The mirror stands as configured within these: rad, share of the pitch, relative.
+TURN_MAX = np.radians(1.5)
+SHIFT_MAX = 0.1
+SCALE_MAX = 0.03
 #: A displaced actuator must fit its new place better than its own by this much in correlation.
-PLACE_MARGIN = 0.10
+PLACE_MARGIN = 0.08
 #: A response that correlates less than this with any bump is not that of one actuator.
 LIKENESS_MIN = 0.4
-#: A symmetry of the layout explains the findings when no more than this share of the actuators disagrees with it.
-SYMMETRY_REST = 0.25
-
-#: The eight orientations of a map: name and the matrix that takes a configured position to where it appears.
-ORIENTATIONS: dict[str, Floats] = {
-    "as configured": np.array([[1, 0], [0, 1]], dtype=float),
-    "turned by 180 degrees": np.array([[-1, 0], [0, -1]], dtype=float),
-    "mirrored left to right": np.array([[-1, 0], [0, 1]], dtype=float),
-    "mirrored top to bottom": np.array([[1, 0], [0, -1]], dtype=float),
-    "turned by 90 degrees counter-clockwise": np.array([[0, -1], [1, 0]], dtype=float),
-    "turned by 90 degrees clockwise": np.array([[0, 1], [-1, 0]], dtype=float),
-    "mirrored about the rising diagonal": np.array([[0, 1], [1, 0]], dtype=float),
-    "mirrored about the falling diagonal": np.array([[0, -1], [-1, 0]], dtype=float),
-}
+#: Half of the responses must correlate so much with the bumps expected, else they are of another arrangement.
+FIT_MIN = 0.75
+#: Two bumps explain a response where they leave no more than this share of what one leaves, in squares, ...
+DOUBLED = 0.5
+#: ... and the smaller of them is at least this share of the larger.
+SECOND_MIN = 0.4
+#: An actuator is weak below this share of the median response of its ring.
+WEAK_SHARE = 0.4
+#: Fewest actuators that must answer, and share of them below which the pokes are too small.
+ANSWERS_MIN = 3
+ANSWERS_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,18 +45,33 @@ class PokeCheck:
     """Outcome of a poke check.
 
     Attributes:
-        orientation: a key of ORIENTATIONS.
-        place: (N,) 0-based index of the configured actuator over whose position actuator i raised the surface.
+        registration: how the mirror stands in the maps; None = not known.
+        place: (N,) 0-based index of the configured actuator over whose place actuator i raised the surface.
         sign: (N,) +1 or -1: which way a rising signal moves the surface; 0 = not known.
         likeness: (N,) correlation of each response with the bump expected at `place`; 0 = no response.
+        turned: whether the mirror stands turned, mirrored or shifted beyond what counts as configured.
         findings: sentences; empty = wiring and orientation are as configured.
     """
 
-    orientation: str
-    place: NDArray[np.int64]
-    sign: NDArray[np.int64]
+    registration: Registration | None
+    place: Indices
+    sign: Indices
     likeness: Floats
+    turned: bool = False
     findings: tuple[str, ...] = field(default=())
+
+    @property
+    def standing(self) -> str:
+        """How the mirror stands in the maps, with standard errors."""
+        found = self.registration
+        if found is None:
+            return "not known how the mirror stands"
+        turn, sigma = np.degrees((found.turn, found.turn_sigma))
+        (x, y), error = 1e3 * np.array(found.shift), 1e3 * found.shift_sigma
+        return (
+            f"turn {turn:+.2f} +- {sigma:.2f} degrees, {'' if found.mirrored else 'not '}mirrored, "
+            f"shift {x:+.2f}, {y:+.2f} +- {error:.2f} mm, scale {found.scale:.3f} +- {found.scale_sigma:.3f}"
+        )
 
     @property
     def passed(self) -> bool:
@@ -75,6 +83,7 @@ def check_pokes(
     points: SamplePoints,
     x: Floats,
     y: Floats,
+    radius: float,
     *,
     silent: NDArray[np.bool_] | None = None,
     unmoved: NDArray[np.bool_] | None = None,
@@ -84,101 +93,136 @@ def check_pokes(
     Args:
         response: (P, N) sag for a unit signal of each actuator, m; piston and tilt are ignored.
         points: the sampling points, of the unit disc.
-        x, y: (N,) configured positions in units of the aperture radius.
+        x, y: (N,) configured positions, m.
+        radius: of the aperture, m.
         silent: (N,) actuators without a response above the noise; None = those without any.
         unmoved: (N,) actuators that were not driven: left out without a finding; None = none.
     """
     count = x.size
-    if response.shape != (points.x.size, count):
-        raise ValueError(f"response has the shape {response.shape}: must be {(points.x.size, count)}")
-    measured = remove_piston_tilt(response.T, points)
-    size = rms(measured, points.weight)
+    if response.shape != (len(points), count):
+        raise ValueError(f"response has the shape {response.shape}: must be {(len(points), count)}")
+    unit, size = unit_responses(response.T, points)
     untried = np.zeros(count, dtype=bool) if unmoved is None else unmoved
     quiet = size <= 1e-12 * size.max(initial=0.0) if silent is None else silent | (size == 0.0)
+    quiet = quiet & ~untried
     active = np.flatnonzero(~(quiet | untried))
-    quiet &= ~untried
-    findings = (
-        [_numbered("shows no response above the noise", "show no response above the noise", np.flatnonzero(quiet))]
-        if quiet.any()
-        else []
-    )
-    if active.size < 3:
-        findings.append(f"only {active.size} actuators answer: wiring and orientation cannot be checked")
-        zero = np.zeros(count, dtype=np.int64)
-        return PokeCheck("as configured", np.arange(count), zero, np.zeros(count), tuple(findings))
-
-    root = np.sqrt(points.weight)
-    unit = root * measured[active] / size[active, None]
-    tables = {
-        name: _correlations(unit, root, points, matrix @ np.stack((x, y))) for name, matrix in ORIENTATIONS.items()
-    }
-    scores = {name: _assign(table)[1] for name, table in tables.items()}
-    places = {name: _places(table, active, count) for name, table in tables.items()}
-    top = max(scores.values())
-    if scores["as configured"] + ORIENTATION_MARGIN > top:
-        orientation = "as configured"
-    else:
-        # Orientations that map the layout onto itself fit alike: the one that leaves most actuators in place is it.
-        alike = [name for name, score in scores.items() if score > top - ORIENTATION_MARGIN]
-        orientation = min(alike, key=lambda name: int((places[name] != np.arange(count)).sum()))
-    table, place = tables[orientation], places[orientation]
-    likeness = np.zeros(count)
-    likeness[active] = np.abs(table[np.arange(active.size), place[active]])
-    sign = np.zeros(count, dtype=np.int64)
-    sign[active] = np.sign(table[np.arange(active.size), place[active]]).astype(np.int64)
-
-    if orientation != "as configured":
-        findings.append(f"the map is {orientation} with respect to the actuators: check the orientation of the maps")
-    findings += _sign_findings(sign, active)
-    findings += _place_findings(place, active, x, y)
-    unlike = active[likeness[active] < LIKENESS_MIN]
-    if unlike.size:
-        text = "does not look like that of one actuator"
-        findings.append(_numbered(f"answers in a way that {text}", f"answer in a way that {text}", unlike))
-    return PokeCheck(orientation, place, sign, likeness, tuple(findings))
+    zero = np.zeros(count, dtype=np.int64)
+    nothing = PokeCheck(None, np.arange(count), zero, np.zeros(count))
+    findings = _named(quiet, "show{} no response above the noise")
+    if active.size < max(ANSWERS_MIN, ANSWERS_SHARE * (active.size + quiet.sum())):
+        problem = (
+            f"only {active.size} of {active.size + quiet.sum()} actuators answer above the noise: the pokes are too "
+            "small, or the drive is off; wiring and orientation cannot be checked (poke_amplitude)"
+        )
+        return _with(nothing, [problem, *findings])
+    registration = register(unit[active], active, points, x, y, radius)
+    expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points)
+    height = np.maximum(height, np.finfo(float).tiny)
+    table = np.zeros((count, count))
+    table[active] = (unit[active] * points.weight) @ expected.T
+    double = _doubled(table, (expected * points.weight) @ expected.T, height)
+    place = _places(np.abs(table), active, double)
+    found = table[np.arange(count), place]
+    if np.median(np.abs(found[active])) < FIT_MIN:
+        problem = (
+            "the responses do not fit the configured positions however the mirror is turned: check mirror.pitch or "
+            "mirror.actuator_x and _y, and that the maps show the whole working aperture of this mirror"
+        )
+        return _with(nothing, [*findings, problem])
+    sign = np.sign(found).astype(np.int64)
+    standing, turned = _standing(registration, pitch(x, y))
+    findings += standing + _sign_findings(sign, active) + _place_findings(place)
+    for actuator, pair in double.items():
+        findings.append(f"actuator {actuator + 1} moves the places of {pair[0] + 1} and {pair[1] + 1} together")
+    alone = np.isin(np.arange(count), active) & ~np.isin(np.arange(count), list(double))
+    unlike = alone & (np.abs(found) < LIKENESS_MIN)
+    findings += _named(unlike, "answer{} in a way that does not look like that of one actuator")
+    weak = alone & ~unlike & _weak(size, height[place], rings(x, y)[place], alone)
+    findings += _named(weak, f"answer{{}} weakly, below {WEAK_SHARE:.0%} of the others of the ring")
+    return PokeCheck(registration, place, sign, np.abs(found), turned, tuple(findings))
 
 
-def _correlations(unit: Floats, root: Floats, points: SamplePoints, positions: Floats) -> Floats:
-    """(A, N) correlation of each unit response with a bump at each position, for the width that fits best in all."""
-    distance = cdist(np.column_stack((points.x, points.y)), positions.T)
-    step = pitch(*positions)
-    best, best_score = np.zeros((len(unit), positions.shape[1])), -1.0
-    for width in WIDTHS:
-        expected = remove_piston_tilt(np.exp(-0.5 * np.square(distance / (width * step))).T, points)
-        expected /= np.maximum(rms(expected, points.weight), np.finfo(float).tiny)[:, None]
-        table = unit @ (root * expected).T
-        score = _assign(table)[1]
-        if score > best_score:
-            best, best_score = table, score
-    return best
+def _with(check: PokeCheck, findings: list[str]) -> PokeCheck:
+    return PokeCheck(check.registration, check.place, check.sign, check.likeness, False, tuple(findings))
 
 
-def _assign(table: Floats) -> tuple[NDArray[np.int64], float]:
-    """The place of each response, one to one, and the mean |correlation|."""
-    rows, columns = linear_sum_assignment(-np.abs(table))
-    return columns, float(np.abs(table)[rows, columns].mean())
+def _standing(found: Registration, step: float) -> tuple[list[str], bool]:
+    """What of `found` stands otherwise than configured: sentences, and whether parameters of the maps cure it."""
+    parts = []
+    turn, sigma = np.degrees(found.turn), np.degrees(found.turn_sigma)
+    if abs(found.turn) > TURN_MAX + 3.0 * found.turn_sigma:
+        way = "counter-clockwise" if turn > 0 else "clockwise"
+        parts.append(f"turned by {abs(turn):.2f} +- {sigma:.2f} degrees {way}")
+    if found.mirrored:
+        parts.append("mirrored left to right" + (", then " + parts.pop() if parts else ""))
+    if np.hypot(*found.shift) > SHIFT_MAX * step + 3.0 * found.shift_sigma:
+        right, up = (1e3 * value for value in found.shift)
+        parts.append(f"shifted by {right:+.2f} mm in x and {up:+.2f} mm in y, +- {1e3 * found.shift_sigma:.2f} mm")
+    sentences = [f"the maps show the mirror {' and '.join(parts)}"] if parts else []
+    if abs(found.scale - 1.0) > SCALE_MAX + 3.0 * found.scale_sigma:
+        sentences.append(
+            f"the maps show the actuators {found.scale * step * 1e3:.2f} +- {found.scale_sigma * step * 1e3:.2f} mm "
+            f"apart, configured are {step * 1e3:.2f} mm: correct the lateral scale of the instrument, or mirror.pitch"
+        )
+    return sentences, bool(parts)
 
 
-def _places(table: Floats, active: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _places(table: Floats, active: Indices, double: dict[int, tuple[int, int]]) -> Indices:
     """(N,) the place of each actuator; moves that do not fit clearly better than staying are not believed."""
+    table = table.copy()
+    for actuator, pair in double.items():  # one of its two, its own where it can be
+        table[actuator] = np.arange(len(table)) == (actuator if actuator in pair else pair[0])
+    count = table.shape[1]
     place = np.full(count, -1)
-    place[active] = _assign(table)[0]
-    row = {int(actuator): i for i, actuator in enumerate(active)}
-    free = sorted(set(range(place.size)) - set(place[active].tolist()))
-    for actuator in sorted(set(range(place.size)) - set(active.tolist())):
+    place[active] = linear_sum_assignment(-table[active])[1]
+    free = sorted(set(range(count)) - set(place[active].tolist()))
+    for actuator in sorted(set(range(count)) - set(active.tolist())):
         # A silent actuator keeps its own place when nobody else was found there.
         place[actuator] = free.pop(free.index(actuator)) if actuator in free else -1
     for index in np.flatnonzero(place < 0):
         place[index] = free.pop(0)
     for cycle in cycles(place):
-        members = [actuator for actuator in cycle if actuator in row]
-        gain = [abs(table[row[a], place[a]]) - abs(table[row[a], a]) for a in members]
+        members = [actuator for actuator in cycle if actuator in active]
+        gain = [table[a, place[a]] - table[a, a] for a in members]
         if not gain or float(np.mean(gain)) < PLACE_MARGIN:
             place[list(cycle)] = list(cycle)
     return place
 
 
-def cycles(place: NDArray[np.int64]) -> list[tuple[int, ...]]:
+def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[int, int]]:
+    """Actuators that raise two places at once, and which.
+
+    Args:
+        table: (N, N) correlations of each response with the bumps expected at each place.
+        overlap: (N, N) of these bumps with each other.
+        height: (N,) their rms for a rise of 1.
+    """
+    found: dict[int, tuple[int, int]] = {}
+    apart = ~np.eye(len(overlap), dtype=bool)
+    determinant = np.where(apart, 1.0 - np.square(overlap), 1.0)
+    for actuator, row in enumerate(table):
+        first = (row[:, None] - overlap * row) / determinant  # [j, k] of the bump at j beside one at k
+        explained = first * row[:, None] + first.T * row  # by both, in squares
+        rise = first / height[:, None]
+        both = (rise * rise.T > 0.0) & (abs(rise) >= SECOND_MIN * abs(rise.T)) & (abs(rise.T) >= SECOND_MIN * abs(rise))
+        explained[~(both & apart)] = 0.0
+        best = np.unravel_index(explained.argmax(), explained.shape)
+        if explained[best] > 0.0 and 1.0 - explained[best] < DOUBLED * (1.0 - np.square(row).max()):
+            found[actuator] = (int(min(best)), int(max(best)))
+    return found
+
+
+def _weak(size: Floats, height: Floats, ring: Indices, counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Actuators below WEAK_SHARE of their ring, both as they are and for how far from the aperture they stand."""
+    weak = counted.copy()
+    for response in (size, size / height):
+        for number in np.unique(ring[counted]):
+            same = counted & (ring == number)
+            weak[same] &= response[same] < WEAK_SHARE * np.median(response[same])
+    return weak
+
+
+def cycles(place: Indices) -> list[tuple[int, ...]]:
     """The cycles of a permutation that are longer than 1, each from its smallest member on."""
     found = []
     seen: set[int] = set()
@@ -194,16 +238,9 @@ def cycles(place: NDArray[np.int64]) -> list[tuple[int, ...]]:
     return found
 
 
-def _place_findings(place: NDArray[np.int64], active: NDArray[np.int64], x: Floats, y: Floats) -> list[str]:
-    """The permutation in sentences: a symmetry of the layout when that says most of it, then exchanges and cycles."""
-    if not cycles(place):
-        return []
+def _place_findings(place: Indices) -> list[str]:
+    """The permutation in sentences."""
     findings = []
-    text, symmetry = _nearest_symmetry(place, active, x, y)
-    if text:
-        findings.append(text)
-        inverse = np.argsort(symmetry)
-        place = inverse[place]
     for cycle in cycles(place):
         numbers = [actuator + 1 for actuator in cycle]
         if len(numbers) == 2:
@@ -216,62 +253,22 @@ def _place_findings(place: NDArray[np.int64], active: NDArray[np.int64], x: Floa
     return findings
 
 
-def _nearest_symmetry(
-    place: NDArray[np.int64], active: NDArray[np.int64], x: Floats, y: Floats
-) -> tuple[str, NDArray[np.int64]]:
-    """The turn or mirror image of the layout that explains most of `place`: a sentence and a permutation."""
-    identity = np.arange(x.size)
-    best, best_text = identity, ""
-    fewest = int((place != identity)[active].sum())
-    for text, permutation in layout_symmetries(x, y):
-        wrong = int((place != permutation)[active].sum())
-        if wrong < fewest and wrong <= SYMMETRY_REST * active.size:
-            fewest, best, best_text = wrong, permutation, text
-    return best_text, best
-
-
-def layout_symmetries(x: Floats, y: Floats) -> list[tuple[str, NDArray[np.int64]]]:
-    """Turns by multiples of 60 degrees and mirror images that map the layout onto itself: sentences and permutations.
-
-    Layouts without hexagonal symmetry simply have fewer of them.
-    """
-    place = x - x.mean() + 1j * (y - y.mean())
-    turned = "start of the numbering in the rings, or the mirror or the map is turned"
-    mirrored = "sense of the numbering in the rings, or a mirrored map"
-    # Mirror axes of a hexagon lie every 30 degrees, its turns every 60.
-    images = [
-        (f"turned by {angle} degrees counter-clockwise: {turned}", place * np.exp(1j * np.radians(angle)))
-        for angle in range(60, 360, 60)
-    ] + [
-        (f"mirrored about the axis at {angle} degrees: {mirrored}", place.conj() * np.exp(2j * np.radians(angle)))
-        for angle in range(0, 180, 30)
-    ]
-    found = []
-    for text, image in images:
-        distance = np.abs(image[:, np.newaxis] - place)
-        permutation = distance.argmin(axis=1)
-        if distance.min(axis=1).max() < 0.1 * pitch(x, y) and np.unique(permutation).size == x.size:
-            found.append((f"the whole pattern is {text}", permutation))
-    return found
-
-
-def _sign_findings(sign: NDArray[np.int64], active: NDArray[np.int64]) -> list[str]:
-    negative = active[sign[active] < 0]
-    if negative.size == 0:
-        return []
-    if negative.size == active.size:
+def _sign_findings(sign: Indices, active: Indices) -> list[str]:
+    negative = sign < 0
+    if 2 * negative.sum() <= active.size:
+        return _named(negative, "move{} the surface the opposite way")
+    if negative.sum() == active.size:
         return [
             "all actuators move the surface the opposite way: a rising signal lowers it; "
             "check the sign of the maps and the polarity of the electronics"
         ]
-    if 2 * negative.size > active.size:
-        positive = active[sign[active] > 0]
-        text = "the opposite way to most others, which lower the surface as the signal rises"
-        return [_numbered(f"moves {text}", f"move {text}", positive)]
-    return [_numbered("moves the surface the opposite way", "move the surface the opposite way", negative)]
+    return _named(sign > 0, "move{} the opposite way to most others, which lower the surface as the signal rises")
 
 
-def _numbered(singular: str, plural: str, actuators: NDArray[np.int64]) -> str:
-    """ "actuator 3 <singular>" or "actuators 3, 7 <plural>"."""
-    numbers = ", ".join(str(actuator + 1) for actuator in actuators)
-    return f"actuator {numbers} {singular}" if actuators.size == 1 else f"actuators {numbers} {plural}"
+def _named(which: NDArray[np.bool_], text: str) -> list[str]:
+    """ "actuator 3 <text with s for {}>" or "actuators 3, 7 <text without>"; nothing when there is none."""
+    numbers = np.flatnonzero(which) + 1
+    if numbers.size == 0:
+        return []
+    one = numbers.size == 1
+    return [f"actuator{'' if one else 's'} {', '.join(map(str, numbers))} {text.format('s' if one else '')}"]

@@ -197,6 +197,11 @@ def _other_setup(measured: Measurement, setup: Setup) -> str:
     elif not np.isclose(measured.pitch, setup.pitch, rtol=PITCH_TOLERANCE, atol=0.0):
         before = f"{setup.pitch * 1e6:.3f} um (0 = not known)"
         different = f"pixel pitch {measured.pitch * 1e6:.3f} um, before it was {before}"
+    elif measured.orientation != setup.orientation:
+        here, before = (
+            "flip_x {}, flip_y {}, rotate_deg {:g}".format(*each) for each in (measured.orientation, setup.orientation)
+        )
+        return f"orientation {here}, before it was {before}: leave the interferometer's orientation.* alone in a run"
     if different:
         return f"{different}: never mix instruments in one fit, measure the whole run with one"
     if measured.system_error_subtracted != setup.system_error_subtracted:

@@ -33,6 +33,7 @@ class Setup:
     instrument: str = ""
     pitch: float = 0.0
     camera: tuple[int, int] = (0, 0)
+    orientation: tuple[bool, bool, float] = (False, False, 0.0)
 
     @classmethod
     def of(cls, measured: Measurement) -> Setup:

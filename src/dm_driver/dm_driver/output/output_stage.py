@@ -25,7 +25,8 @@ class OutputStage:
         self.connected: NDArray[np.bool_] = channel_of_actuator != NOT_WIRED
         #: (channels,) True where an actuator is connected.
         self.wired: NDArray[np.bool_] = np.zeros(channels, dtype=np.bool_)
-        self._channel = channel_of_actuator
+        #: (N,) connector channel of each actuator, `NOT_WIRED` for those without one.
+        self.channels = channel_of_actuator
         self.wired[channel_of_actuator[self.connected]] = True
         # Units that always set every channel get the lowest actuator voltage on those without an actuator.
         self._rest = np.full(channels, scale.codes(np.array([-1.0]))[0], dtype=np.uint16)
@@ -33,10 +34,10 @@ class OutputStage:
     def codes(self, shape: Shape) -> NDArray[np.uint16]:
         """(channels,) codes for a shape of (N,) signals -1..+1."""
         codes = self._rest.copy()
-        codes[self._channel[self.connected]] = self.scale.codes(shape)[self.connected]
+        codes[self.channels[self.connected]] = self.scale.codes(shape)[self.connected]
         return codes
 
     def outcome(self, codes: NDArray[np.uint16]) -> tuple[Shape, NDArray[np.float64]]:
         """(N,) signals and (N,) V at the actuators for these codes; an actuator without a channel rests at -1."""
-        of_actuator = np.where(self.connected, codes[self._channel], self._rest[0])
+        of_actuator = np.where(self.connected, codes[self.channels], self._rest[0])
         return self.scale.signals_of_codes(of_actuator), self.scale.volts_of_codes(of_actuator)

@@ -35,6 +35,8 @@ class InterferometerConfig:
         piston_spread, tilt_spread: standard deviations of piston and of the edge sag of each tilt, per map, m.
         specks: mean number of dropped single pixels per map.
         blobs: number of dropped discs per map, of 3 to 16 pixels radius (scaled with the camera).
+        mount_angle, mount_mirrored, mount_x, mount_y, mount_scale: how the mirror stands in the field: its own frame is
+            mirrored left-right, turned anticlockwise (rad), enlarged (lateral scale of the instrument) and shifted (m).
         flip_x, flip_y, rotate_deg: the camera turns the picture anticlockwise by rotate_deg (0, 90, 180, 270), then
             mirrors it left-right (flip_x) and upside down (flip_y).
     """
@@ -49,6 +51,11 @@ class InterferometerConfig:
     tilt_spread: float = 300e-9
     specks: int = 400
     blobs: int = 6
+    mount_angle: float = 0.0
+    mount_mirrored: bool = False
+    mount_x: float = 0.0
+    mount_y: float = 0.0
+    mount_scale: float = 1.0
     flip_x: bool = False
     flip_y: bool = False
     rotate_deg: int = 0
@@ -101,7 +108,7 @@ class Interferometer:
         def interpolate(values: Array) -> Array:
             return np.einsum("py,qx,yxk->kpq", inverse, inverse, values, optimize=True)
 
-        metres_x, metres_y = x * self._field_radius, y * self._field_radius
+        metres_x, metres_y = self._on_mirror(x * self._field_radius, y * self._field_radius)
         self._influence = interpolate(plate.influence_at(metres_x, metres_y))
         # Over the field disc: piston, two tilts, then orders 2 to 5.
         self._low_orders = interpolate(zernike.evaluate(x, y, zernike.terms_to_order(5)))
@@ -111,6 +118,14 @@ class Interferometer:
         self._figure = interpolate((shapes @ amplitudes)[..., None])[0]
         inside = self._evaluate(self._figure)[self.aperture]
         self._figure *= config.figure_rms / np.sqrt(np.mean((inside - inside.mean()) ** 2))
+
+    def _on_mirror(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Places of the field (m) in the frame of the mirror as it is mounted."""
+        mount = self.config
+        x, y = (x - mount.mount_x) / mount.mount_scale, (y - mount.mount_y) / mount.mount_scale
+        cosine, sine = np.cos(mount.mount_angle), np.sin(mount.mount_angle)
+        x, y = cosine * x + sine * y, cosine * y - sine * x
+        return (-x if mount.mount_mirrored else x), y
 
     def with_noise(self, noise_rng: np.random.Generator) -> Interferometer:
         """This very instrument and plate, drawing what differs from map to map from `noise_rng`.

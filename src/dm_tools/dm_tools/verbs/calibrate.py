@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -87,8 +88,43 @@ def show_result(result: Any) -> None:
         console.print(f"[yellow]dropped[/] {entry}")
     for entry in result.poke_findings:
         console.print(f"[yellow]poke check[/] {entry}")
+    if result.parameters:
+        console.print("poke check: to have it so, put into the parameter file (--write FILE does):")
+        console.print(result.parameters, markup=False, highlight=False)
     if result.poke_check_passed:
         console.print("poke check: wiring and orientation are as configured")
+
+
+def write_parameters(parameters: str, target: Path, config: Path | None, serial: str) -> None:
+    """Write the parameter file `target` with the `parameters` that a poke check found; comments are kept.
+
+    Args:
+        config: the file that the nodes run with; None = `target` where there is one, else that of the virtual bench.
+        serial: of the running mirror.
+
+    Raises:
+        ConfigError: the file cannot be used, or is of another mirror.
+        OSError: it cannot be written.
+    """
+    import yaml
+
+    from dm_bringup.config_edit import edited
+    from dm_bringup.suite import ConfigError, load_config
+    from dm_tools.verbs.up import shared_config
+
+    source = config or (target if target.exists() else shared_config("bench.yaml"))
+    written = str(load_config(source).get("pdm_driver", {}).get("mirror.serial", ""))
+    if written != serial:
+        raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
+    changes = yaml.safe_load(parameters) or {}
+    plain = {key.rsplit("/", 1)[-1]: section["ros__parameters"] for key, section in changes.items()}
+    text = edited(source.read_text(), plain)
+    if target.exists():
+        before = target.with_name(target.name + ".before")
+        before.write_text(target.read_text())
+        console.print(f"{target} as it was is kept as {before}")
+    target.write_text(text)
+    console.print(f"{target} is written from {source}: start the nodes with it, then check again")
 
 
 def _foretold(result: Any) -> str:
@@ -111,6 +147,7 @@ def figures_of(result: Any) -> dict[str, Any]:
         "expected_max_zernike_nm": nanometres(result.expected_max_zernike),
         "expected_seconds": result.expected_duration,
         "poke_findings": list(result.poke_findings),
+        "parameters": result.parameters,
     }
 
 
@@ -134,6 +171,15 @@ def calibrate(
     ] = False,
     activate: Annotated[bool, typer.Option(help="Use the new calibration at once.")] = True,
     note: Annotated[str, typer.Option(help="Stored with the calibration.")] = "",
+    write: Annotated[
+        Path | None, typer.Option(help="Write what a poke check finds into this copy of the parameter file.")
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --write: the file that the nodes run with; none = FILE of --write, or the shipped one."
+        ),
+    ] = None,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
@@ -167,7 +213,11 @@ def calibrate(
         except DeformableMirrorError as error:
             if error.response is not None:
                 show_result(error.response)
+                if write is not None and error.response.parameters:
+                    write_parameters(error.response.parameters, write, config, client.mirror_info.serial)
             raise
+        if write is not None and result.parameters:
+            write_parameters(result.parameters, write, config, client.mirror_info.serial)
     if dry_run:
         console.print(result.message)
     else:

@@ -1,0 +1,75 @@
+"""Change values in a parameter file and leave all else as it is: comments, order, spelling."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+from dm_bringup.suite import ConfigError
+
+Changes = Mapping[str, Mapping[str, Any]]
+
+
+def edited(text: str, changes: Changes) -> str:
+    """The parameter file `text` with the values of `changes`, {node: {parameter: value}}.
+
+    A value stands where it stood; a new parameter comes first in its section, a new section last in the file.
+
+    Raises:
+        ConfigError: the text has a form that cannot be changed so; nothing is lost by an edit.
+    """
+    expected = _read(text)
+    for node, values in changes.items():
+        expected[node] = expected.get(node, {}) | dict(values)
+        for name, value in values.items():
+            text = _with_value(text, node, name, value)
+    if _read(text) != expected:
+        raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
+    return text
+
+
+def _with_value(text: str, node: str, name: str, value: Any) -> str:
+    section, literal = _section(text, node), _literal(value)
+    if section is None:
+        return f"{text.rstrip()}\n\n/**/{node}:\n  ros__parameters:\n    {name}: {literal}\n"
+    for key, old in section.value:
+        if key.value == name:
+            start, end = old.start_mark, old.end_mark.index
+            if isinstance(old, yaml.SequenceNode) and not old.flow_style:  # an item on each line: so it stays
+                end = old.value[-1].end_mark.index
+                literal = f"\n{' ' * start.column}".join(f"- {_literal(item)}" for item in value)
+            return text[: start.index] + literal + text[end:]
+    if section.flow_style or not section.value:
+        begin = section.start_mark.index + 1
+        return f"{text[:begin]}{name}: {literal}{', ' if section.value else ''}{text[begin:]}"
+    first = section.value[0][0].start_mark
+    return f"{text[: first.index]}{name}: {literal}\n{' ' * first.column}{text[first.index :]}"
+
+
+def _section(text: str, node: str) -> Any:
+    """The YAML node of the parameters of `node`; None where it has none."""
+    top = yaml.compose(text, yaml.SafeLoader)
+    for key, content in top.value if top is not None else ():
+        if _node_name(key.value) == node:
+            return next(section for inner, section in content.value if inner.value == "ros__parameters")
+    return None
+
+
+def _read(text: str) -> dict[str, dict[str, Any]]:
+    """The values of a parameter file by nodes. Raises ConfigError."""
+    try:
+        content = yaml.safe_load(text) or {}
+        return {_node_name(key): dict(section["ros__parameters"]) for key, section in content.items()}
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"not a parameter file: {type(error).__name__}: {error}") from error
+
+
+def _node_name(key: Any) -> str:
+    return str(key).rsplit("/", 1)[-1]
+
+
+def _literal(value: Any) -> str:
+    """`value` on one line of YAML."""
+    return yaml.safe_dump(value, default_flow_style=True, width=10**6).removesuffix("\n").removesuffix("\n...")

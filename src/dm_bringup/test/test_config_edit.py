@@ -1,0 +1,61 @@
+"""Values change, all else stays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from dm_bringup.config_edit import edited
+from dm_bringup.suite import ConfigError
+
+FILE = Path(__file__).parents[1] / "config" / "hardware.yaml"
+CHANGES = {
+    "interferometer": {"orientation.rotate_deg": -35.02, "orientation.flip_x": True, "aperture.radius": 0.012},
+    "pdm_driver": {"mirror.wiring": "custom", "mirror.channels": [3, 1, 2]},
+}
+
+
+def values(text: str) -> dict[str, dict[str, object]]:
+    return {key.rsplit("/", 1)[-1]: part["ros__parameters"] for key, part in yaml.safe_load(text).items()}
+
+
+def test_comments_and_all_other_lines_stay() -> None:
+    before = FILE.read_text()
+    after = edited(before, CHANGES)
+    expected = values(before)
+    for node, own in CHANGES.items():
+        expected[node] |= own
+    assert values(after) == expected
+    kept = set(after.splitlines())
+    lost = [line for line in before.splitlines() if line not in kept]
+    assert [line.split(":")[0].strip() for line in lost] == ["mirror.wiring", "aperture.radius"]
+    assert "# trihex | 37ch_30mm" in after and "# m: the working aperture; 0 = the whole valid region" in after
+    assert edited(after, CHANGES) == after
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "# nothing yet\n",
+        "/**/pdm_driver:\n  ros__parameters: {}\n",
+        "/**/pdm_driver: {ros__parameters: {mirror.serial: a, mirror.channels: [1,\n 2]}}\n",
+        "pdm_driver:\n  ros__parameters:\n    mirror.channels:  # as wired\n    - 1\n    - 2\n    # that is all\n"
+        "    mirror.serial: a\n",
+    ],
+)
+def test_files_of_other_forms(text: str) -> None:
+    after = values(edited(text, CHANGES))
+    assert after["pdm_driver"]["mirror.channels"] == [3, 1, 2]
+    assert after["interferometer"]["orientation.flip_x"] is True
+    if "serial" in text:
+        assert after["pdm_driver"]["mirror.serial"] == "a"
+    assert all(comment in edited(text, CHANGES) for comment in ("# as wired", "# that is all") if comment in text)
+
+
+def test_what_is_no_parameter_file_is_refused() -> None:
+    for text in ("a: [", "- 1\n- 2\n", "/**/pdm_driver: 7\n"):
+        with pytest.raises(ConfigError):
+            edited(text, CHANGES)

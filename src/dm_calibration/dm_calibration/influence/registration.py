@@ -1,0 +1,242 @@
+"""How the mirror stands in the maps: turn, mirror image, shift, scale and numbering, in one estimate from its pokes.
+
+A poke raises a broad bump over its actuator. Each bump is located by itself, the places are assigned one to one to the
+configured ones (Hungarian method) under a similarity that is fitted in turn (iterative closest point) from starts all
+around, and the similarity found is refined on the maps themselves.
+
+A regular arrangement looks the same after some turns: then a turned mirror cannot be told from one whose numbering
+begins elsewhere. Of the descriptions that fit alike, the one that leaves most actuators where they are configured
+holds, and among those that do so alike the one nearest to the configuration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, linear_sum_assignment
+
+from dm_common.geometry import pitch
+from dm_common.optics.piston_tilt import remove_piston_tilt, rms
+from dm_common.optics.sampling import SamplePoints
+
+Floats = NDArray[np.float64]
+#: Places in the plane as complex numbers, x + iy.
+Places = NDArray[np.complex128]
+
+#: Widths tried for the expected bumps (standard deviation, in pitches); a stiffer plate answers more broadly.
+WIDTHS = (0.5, 0.7, 0.9, 1.15, 1.5)
+#: Bumps are looked for up to this distance from the centre of the aperture, in its radii, ...
+REACH = 1.45
+#: ... on a grid of this spacing, in pitches.
+GRID = 0.25
+#: Starts of the search, all around, for each image and scale.
+STARTS = 36
+#: Those that lie best are followed: a hexagonal arrangement looks the same in twelve positions.
+TRIED = 36
+ROUNDS = 20
+#: A bump further than this from every configured place, in pitches, belongs to none.
+TOLERANCE = 0.7
+#: Descriptions whose mean square distances differ by less than this, in square pitches, fit alike.
+ALIKE = 0.02
+#: Among those, this share of the actuators more in place is worth another turn.
+SHARE = 0.25
+#: Actuators nearer to the centroid than this share of the outermost are used for the refinement: those at the rim
+#: answer otherwise, since the plate ends there.
+INNER = 0.72
+INNER_MIN = 6
+#: What bumps of another shape than the expected do to scale and shift, relatively.
+SCALE_BIAS = 0.005
+SHIFT_BIAS = 0.02
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How the mirror stands in the maps, against the configuration.
+
+    An actuator configured at p is seen at ``scale * turn(turn, image(p)) + shift``; the image exchanges left and right.
+
+    Attributes:
+        turn: counter-clockwise, rad, -pi to pi.
+        mirrored: whether the maps show the mirror image.
+        shift: (2,) x and y of the mirror's origin from the centre of the aperture, m.
+        scale: distances seen / configured.
+        turn_sigma, shift_sigma, scale_sigma: standard errors, in the same units.
+        width: of a bump, standard deviation, m.
+    """
+
+    turn: float
+    mirrored: bool
+    shift: tuple[float, float]
+    scale: float
+    turn_sigma: float
+    shift_sigma: float
+    scale_sigma: float
+    width: float
+
+    def seen(self, x: Floats, y: Floats) -> Places:
+        """Where actuators configured at `x`, `y` (m) are seen, m from the centre of the aperture."""
+        return _seen(_Similarity(self.scale * np.exp(1j * self.turn), complex(*self.shift), self.mirrored), x + 1j * y)
+
+
+class _Similarity(NamedTuple):
+    factor: complex
+    shift: complex
+    mirrored: bool
+
+
+class _Match(NamedTuple):
+    """A similarity, the place (A,) of each bump under it, their mean square distance (in square pitches), and which
+    (A,) lie at their places."""
+
+    similarity: _Similarity
+    place: NDArray[np.int64]
+    distance: float
+    placed: NDArray[np.bool_]
+
+
+def _seen(similarity: _Similarity, places: Places) -> Places:
+    return similarity.factor * (-places.conj() if similarity.mirrored else places) + similarity.shift
+
+
+def bumps(places: Places, width: float, points: SamplePoints) -> tuple[Floats, Floats]:
+    """Bumps of unit height at `places` (N,), `width` as they in radii of the aperture: see :func:`unit_responses`."""
+    distance = np.abs(places[:, None] - (points.x + 1j * points.y))
+    return unit_responses(np.exp(-0.5 * np.square(distance / width)), points)
+
+
+def unit_responses(sag: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
+    """`sag` (N, P) without piston and tilt, each of unit rms, and the rms (N,) that each had."""
+    left = remove_piston_tilt(sag, points)
+    size = rms(left, points.weight)
+    return np.asarray(left / np.maximum(size, np.finfo(float).tiny)[:, None]), np.asarray(size)
+
+
+def register(
+    unit: Floats, active: NDArray[np.int64], points: SamplePoints, x: Floats, y: Floats, radius: float
+) -> Registration:
+    """Find how the mirror stands in the maps; where the responses are of something else, it is what fits least badly.
+
+    Args:
+        unit: (A, P) responses of the `active` actuators, of unit rms, piston and tilt removed.
+        active: (A,) their indices, at least 3.
+        points: the sampling points, of the unit disc.
+        x, y: (N,) configured positions, m.
+        radius: of the aperture, m.
+    """
+    places: Places = np.asarray((x + 1j * y) / radius, dtype=np.complex128)
+    step = pitch(places.real, places.imag)
+    seen, width = _located(unit, points, step)
+    match = _matched(seen, active, places, step)
+    return _refined(match, unit, points, places, width, radius)
+
+
+def _located(unit: Floats, points: SamplePoints, step: float) -> tuple[Places, float]:
+    """Where each response (A, P) looks most like a bump, and the width that fits best in all."""
+    line = np.arange(-REACH, REACH + step * GRID, step * GRID)
+    grid = (line[:, None] + 1j * line).ravel()
+    grid = grid[np.abs(grid) <= REACH]
+    tables = [np.abs((unit * points.weight) @ bumps(grid, width * step, points)[0].T) for width in WIDTHS]
+    best = int(np.argmax([table.max(axis=1).mean() for table in tables]))
+    return grid[tables[best].argmax(axis=1)], WIDTHS[best] * step
+
+
+def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: float) -> _Match:
+    """The similarity and numbering that take the configured `places` to those `seen`."""
+    spread = float(np.std(seen) / np.std(places))
+    starts = [
+        _over_each_other(seen, places, size * np.exp(1j * angle), mirrored)
+        for mirrored in (False, True)
+        for size in {1.0, round(spread, 2)}
+        for angle in np.arange(STARTS) * 2 * np.pi / STARTS
+    ]
+    nearest = [np.abs(_seen(start, places)[:, None] - seen).min(axis=0) / step for start in starts]
+    order = np.argsort([np.mean(np.minimum(distance, TOLERANCE) ** 2) for distance in nearest], kind="stable")
+    matches = [_closest(seen, places, starts[index], step) for index in order[:TRIED]]
+    least = min(match.distance for match in matches)
+    alike = [match for match in matches if match.distance < least + ALIKE]
+    moved = [int((match.place != active).sum()) for match in alike]
+    within = min(moved) + SHARE * len(seen)
+    near = [match for match, count in zip(alike, moved, strict=True) if count <= within]
+    return min(near, key=lambda match: (match.similarity.mirrored, round(abs(np.angle(match.similarity.factor)), 3)))
+
+
+def _over_each_other(seen: Places, places: Places, factor: complex, mirrored: bool) -> _Similarity:
+    """The similarity of this `factor` that puts the centroids over each other."""
+    centroid = _seen(_Similarity(factor, 0j, mirrored), places).mean()
+    return _Similarity(factor, complex(seen.mean() - centroid), mirrored)
+
+
+def _closest(seen: Places, places: Places, start: _Similarity, step: float) -> _Match:
+    """Iterative closest point from `start`."""
+    image = -places.conj() if start.mirrored else places
+    factor, shift = start.factor, start.shift
+    before = np.full(seen.size, -1)
+    for _ in range(ROUNDS):
+        distance = np.abs(seen[:, None] - factor * image - shift) / step
+        place = linear_sum_assignment(np.minimum(distance, TOLERANCE) ** 2)[1]
+        own = distance[np.arange(seen.size), place]
+        placed = own < TOLERANCE
+        if (place == before).all() or placed.sum() < 3:
+            break
+        before = place
+        design = np.column_stack((image[place[placed]], np.ones(placed.sum())))
+        factor, shift = (complex(value) for value in np.linalg.lstsq(design, seen[placed], rcond=None)[0])
+    similarity = _Similarity(factor, shift, start.mirrored)
+    return _Match(similarity, place, float(np.mean(np.minimum(own, TOLERANCE) ** 2)), placed)
+
+
+def _refined(
+    match: _Match, unit: Floats, points: SamplePoints, places: Places, width: float, radius: float
+) -> Registration:
+    """Fit similarity and width to the maps of actuators that are well inside both aperture and arrangement."""
+    away = np.abs(places - places.mean())[match.place]
+    inside = match.placed & (np.abs(_seen(match.similarity, places)[match.place]) < 1.0)
+    inner = inside & (away <= INNER * np.abs(places - places.mean()).max())
+    use = next((some for some in (inner, inside) if some.sum() >= INNER_MIN), match.placed).copy()
+    mirrored, root = match.similarity.mirrored, np.sqrt(points.weight)
+
+    def residual(values: Floats, chosen: NDArray[np.bool_]) -> Floats:
+        factor = np.exp(values[0] + 1j * values[1])
+        similarity = _Similarity(factor, complex(values[2], values[3]), mirrored)
+        expected, _ = bumps(_seen(similarity, places[match.place[chosen]]), np.exp(values[4]), points)
+        measured = unit[chosen]
+        share = (measured * expected) @ points.weight  # the expected bumps are of unit rms
+        return np.asarray(root * (measured - share[:, None] * expected))
+
+    logarithm, shift = np.log(match.similarity.factor), match.similarity.shift
+    start = np.array([logarithm.real, logarithm.imag, shift.real, shift.imag, np.log(width)])
+    fitted = least_squares(lambda values: residual(values, use).ravel(), start)
+    left = np.linalg.norm(fitted.fun.reshape(-1, len(points)), axis=1)
+    good = left <= 3.0 * np.median(left)
+    if not good.all() and good.sum() >= 3:  # again without those that answer otherwise
+        use[np.flatnonzero(use)[~good]] = False
+        fitted = least_squares(lambda values: residual(values, use).ravel(), fitted.x)
+    sigma = _standard_errors(fitted.jac.reshape(-1, len(points), start.size), fitted.fun.reshape(-1, len(points)))
+    values, scale = fitted.x, float(np.exp(fitted.x[0]))
+    metres = (float(values[2] * radius), float(values[3] * radius))
+    return Registration(
+        turn=float(np.angle(np.exp(1j * values[1]))),
+        mirrored=mirrored,
+        shift=metres,
+        scale=scale,
+        turn_sigma=float(sigma[1]),
+        shift_sigma=float(np.hypot(max(sigma[2], sigma[3]) * radius, SHIFT_BIAS * np.hypot(*metres))),
+        scale_sigma=float(np.hypot(sigma[0], SCALE_BIAS) * scale),
+        width=float(np.exp(values[4]) * radius),
+    )
+
+
+def _standard_errors(jacobian: Floats, residual: Floats) -> Floats:
+    """Of parameters K, from the scatter between actuators A: jacobian (A, P, K), residual (A, P).
+
+    Neighbouring points of one response err alike, so each actuator counts as one observation.
+    """
+    count, _, unknowns = jacobian.shape
+    hessian = np.einsum("apk,apl->kl", jacobian, jacobian)
+    gradient = np.einsum("apk,ap->ak", jacobian, residual)
+    inverse = np.linalg.pinv(hessian)
+    covariance = inverse @ (gradient.T @ gradient) @ inverse * count / max(count - 0.4 * unknowns, 1.0)
+    return np.sqrt(np.diag(covariance))

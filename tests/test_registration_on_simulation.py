@@ -1,0 +1,128 @@
+"""The poke check on the simulated instrument and mirror, mounted in any way: found, put right, then as configured."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
+from dm_calibration.calibrator import calibrate, check_fit
+from dm_calibration.influence.poke_check import PokeCheck
+from dm_calibration.influence.poke_cure import parameter_text, poke_cure
+from dm_calibration.map_files import SurfaceMap
+from dm_calibration.optics.aperture import InsufficientDataError
+from dm_calibration.optics.orientation import Orientation
+from dm_calibration.procedure.map_acquisition import check_comparable
+from dm_calibration.procedure.outcome import Outcome
+from dm_common.errors import MeasurementError
+from dm_common.geometry import hexagonal_positions
+from dm_common.measurement import Measurement
+from dm_common.mirror import Mirror
+from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
+from dm_simulation.mirror.plate import Plate, PlateConfig
+
+RADIUS = 11e-3
+MIRROR = Mirror("PDM30-37", "T-1", *hexagonal_positions(), RADIUS)
+CAMERA = InterferometerConfig(pixels=260, field_diameter=26e-3, specks=20, blobs=2)
+
+
+class MountedMirror:
+    """The simulated plate in front of the simulated instrument; `channel` (N,) of each actuator, truly."""
+
+    def __init__(self, plate: PlateConfig, camera: InterferometerConfig, channel: np.ndarray) -> None:
+        self.camera = Interferometer(camera, Plate(plate), np.random.default_rng(1), np.random.default_rng(2))
+        self.channel = channel
+        self.ingest = Ingest(300)
+
+    def check(self, settings: IngestSettings, channels: np.ndarray) -> tuple[PokeCheck, Measurement]:
+        """Poke all actuators by their configured `channels` (N,)."""
+        signals = np.vstack((np.zeros(37), np.kron(np.eye(37), [[0.5], [-0.5]])))
+        maps = []
+        for row in signals:
+            at_channel = dict(zip(channels, row, strict=True))
+            maps.append(
+                self._map(np.array([4e-6 * at_channel.get(channel, 0.0) for channel in self.channel]), settings)
+            )
+        return check_fit(calibrate(maps, signals, mirror=MIRROR).fit, MIRROR), maps[-1]
+
+    def _map(self, bases: np.ndarray, settings: IngestSettings) -> Measurement:
+        sag = self.camera.measure(bases)
+        return self.ingest.measure(SurfaceMap(sag, CAMERA.wavelength, self.camera.pitch, "simulation"), settings)[1]
+
+
+def settings_from(values: dict[str, object]) -> IngestSettings:
+    orientation = Orientation(*(values[f"orientation.{name}"] for name in ("flip_x", "flip_y", "rotate_deg")))  # type: ignore[arg-type]
+    return IngestSettings(
+        orientation=orientation,
+        aperture_radius=float(values["aperture.radius"]),  # type: ignore[arg-type]
+        aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),  # type: ignore[arg-type]
+    )
+
+
+@pytest.mark.parametrize(
+    ("start_deg", "camera", "before"),
+    [
+        (60.0, {"mount_angle": np.radians(35.0), "mount_mirrored": True}, Orientation()),
+        (0.0, {"mount_angle": -2.5, "mount_x": 1.5e-3, "mount_y": -0.8e-3, "flip_x": True}, Orientation(flip_y=True)),
+        (-120.0, {"mount_x": -1e-3, "rotate_deg": 90, "mount_scale": 1.02}, Orientation(True, False, 20.0)),
+        (17.0, {"mount_mirrored": True, "mount_y": 1.5e-3, "mount_scale": 0.98}, Orientation(True, True, -100.0)),
+    ],
+)
+@pytest.mark.parametrize("crossed", [False, True])
+def test_what_is_found_puts_it_right(
+    start_deg: float, camera: dict[str, object], before: Orientation, crossed: bool
+) -> None:
+    wiring = np.random.default_rng(5).permutation(40)[:37]
+    true = wiring.copy()
+    if crossed:
+        true[[4, 20]], true[[9, 10]] = true[[20, 4]], true[[10, 9]]
+    plate = PlateConfig(start_angle=float(np.radians(start_deg)))
+    mounted = MountedMirror(plate, replace(CAMERA, **camera), true)  # type: ignore[arg-type]
+    settings = IngestSettings(orientation=before, aperture_radius=RADIUS, aperture_centre=(0.0, 2e-4))
+    first, last = mounted.check(settings, wiring)
+    assert not first.passed and first.turned
+    assert sum("exchanged" in finding for finding in first.findings) == (2 if crossed else 0), first.findings
+    assert len(first.findings) == (3 if crossed else 1)
+    changes, beyond = poke_cure(first, MIRROR, last, list(wiring))
+    assert not beyond
+    text = parameter_text(changes)
+    cure = {key.rsplit("/", 1)[-1]: part["ros__parameters"] for key, part in yaml.safe_load(text).items()}
+    assert ("pdm_driver" in cure) == crossed
+    channels = np.array(cure["pdm_driver"]["mirror.channels"]) if crossed else wiring
+    second, _ = mounted.check(settings_from(cure["interferometer"]), channels)
+    assert second.passed, second.findings
+    assert second.registration is not None
+    assert abs(second.registration.turn) < np.radians(0.2) and np.hypot(*second.registration.shift) < 1e-4
+    assert second.registration.scale == pytest.approx(float(camera.get("mount_scale", 1.0)), abs=0.01)  # type: ignore[arg-type]
+
+
+def test_a_mirror_as_configured_passes() -> None:
+    wiring = np.arange(37)
+    found, _ = MountedMirror(PlateConfig(), CAMERA, wiring).check(IngestSettings(aperture_radius=RADIUS), wiring)
+    assert found.passed and "not mirrored" in found.standing
+
+
+def test_an_aperture_that_the_camera_does_not_hold() -> None:
+    """No parameter helps: the mirror has to be moved."""
+    wiring = np.arange(37)
+    camera = replace(CAMERA, pixels=220, field_diameter=22e-3, mount_x=1.5e-3, mount_angle=1.0)
+    found, last = MountedMirror(PlateConfig(), camera, wiring).check(IngestSettings(aperture_radius=RADIUS), wiring)
+    changes, beyond = poke_cure(found, MIRROR, last, [])
+    assert re.search(r"move the mirror or the camera by -1\.[45]\d mm in x", beyond), beyond
+    assert changes["interferometer"].keys() == {f"orientation.{name}" for name in ("flip_x", "flip_y", "rotate_deg")}
+
+
+def test_a_third_of_the_pupil_is_no_map() -> None:
+    """Refused before any check: fewer pixels than the aperture needs, or another aperture than the mirror's."""
+    sag = np.zeros((260, 260))
+    sag[:, 90:] = np.nan
+    surface = SurfaceMap(sag, CAMERA.wavelength, 1e-4, "a third")
+    with pytest.raises(InsufficientDataError, match=r"27\.4 % of the aperture"):
+        Ingest(300).measure(surface, IngestSettings(aperture_radius=RADIUS))
+    _, found = Ingest(300).measure(surface, IngestSettings())
+    with pytest.raises(MeasurementError, match="aperture radius 4"):
+        check_comparable(found, Outcome(), RADIUS)
