@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import socket
 import subprocess
 import sys
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
+from dm_bringup.nodes import NODES
 from dm_bringup.suite import load_config
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
@@ -44,9 +47,10 @@ def test_the_shipped_benches_are_well(name: str) -> None:
         doctor_bench.required_parameters,
         doctor_bench.own_values,
         doctor_bench.parameters,
-        doctor_bench.driver_configuration,
     ):
         assert check(config) is None
+    for node in NODES:
+        assert doctor_bench.node_configuration(config, node) is None
 
 
 @pytest.mark.parametrize(
@@ -65,10 +69,118 @@ def test_wrong_parameters_are_named(node: str, name: str, value: Any, words: str
     assert finding is not None and words in finding.problem and not finding.note
 
 
-def test_values_that_contradict_each_other_are_named() -> None:
-    finding = doctor_bench.driver_configuration(bench({"pdm_driver": {"mirror.actuators": 19}}))
-    assert finding is not None
-    assert "lists 37 channels: must be 19" in finding.problem
+FRAMED = {"electronics.kind": "framed_serial", "electronics.serial_port": "/dev/ttyUSB0"}
+WIRING = list(range(1, 38))
+TWO_RINGS = {"mirror.actuators": 19, "mirror.wiring": "custom", "mirror.channels": WIRING[:19]}
+LINK = {"electronics.pty_link": "tty", "framed.channels": 40}
+
+#: Values that contradict each other: node, what differs from the shipped bench, words of the reason.
+CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
+    ("interferometer", {"watch_folder": ""}, "trigger_command needs watch_folder"),
+    ("interferometer", {"watch_folder": "~nobody-of-that-name/maps"}, "watch_folder = '~nobody"),
+    ("interferometer", {"trigger_command": ["", "x"]}, "must name a program"),
+    ("interferometer", {"trigger_output_suffix": "../x"}, "must be an ending such as .datx"),
+    ("pdm_driver", {"mirror.serial": " "}, "mirror.serial is empty"),
+    ("pdm_driver", {"mirror.actuators": 19}, "lists 37 channels: must be 19"),
+    ("pdm_driver", {"mirror.wiring": "other"}, "mirror.wiring = 'other': unknown"),
+    ("pdm_driver", {"mirror.channels": WIRING}, "mirror.channels is given but mirror.wiring = 'trihex'"),
+    ("pdm_driver", {"mirror.wiring": "custom", "mirror.channels": [40, *WIRING[1:]]}, "on channel 40; must be -1 to"),
+    ("pdm_driver", {"mirror.wiring": "custom", "mirror.channels": [2, *WIRING[1:]]}, "used more than once"),
+    ("pdm_driver", {"mirror.wiring": "custom", "mirror.channels": [-1] * 37}, "no actuator has a channel"),
+    ("pdm_driver", {"electronics.address": ""}, "electronics.address is empty"),
+    ("pdm_driver", {"electronics.kind": "usb_dac40"}, "electronics.serial_port is empty"),
+    ("pdm_driver", {"volts.dac_at_full": 0.0}, "volts.dac_at_full"),
+    ("pdm_driver", {"volts.amplifier_gain": 0.0}, "volts.amplifier_gain = 0"),
+    ("pdm_driver", {"volts.max": 0.0}, "must be above volts.min"),
+    ("pdm_driver", {"volts.max": 900.0}, "volts.max"),
+    ("pdm_driver", {"volts.min": -10.0, "drive.law": "square"}, "must be at least 0 with drive.law"),
+    ("pdm_driver", {"volts.min": 0.0, "volts.max": 0.001}, "volts"),
+    (
+        "pdm_driver",
+        {"mirror.actuators": 20, "mirror.wiring": "custom", "mirror.channels": WIRING[:20]},
+        "no full hexagonal",
+    ),
+    ("pdm_driver", TWO_RINGS | {"mirror.actuator_x": [0.0] * 18, "mirror.actuator_y": [0.0] * 19}, "has 18 values"),
+    ("pdm_driver", TWO_RINGS | {"mirror.actuator_x": [0.0] * 19, "mirror.actuator_y": [0.0] * 19}, "at the same place"),
+    ("pdm_driver", {"mirror.working_aperture_diameter": 0.04}, "must be at most mirror.full_aperture_diameter"),
+    ("pdm_driver", {"limits.signal_min": 0.5, "limits.signal_max": 0.2}, "limits.signal_min"),
+    ("pdm_driver", {"limits.step": 1e-4, "volts.dac_at_full": 500.0}, "signal of one DAC code"),
+    ("pdm_driver", {"safe_signals": [0.0]}, "safe_signals"),
+    ("pdm_driver", FRAMED | {"framed_serial.channels": 8}, "actuator 1 on channel 14; must be 0 to 7"),
+    ("pdm_driver", FRAMED | {"framed_serial.header": "A"}, "framed_serial.header"),
+    ("pdm_driver", FRAMED | {"framed_serial.channel_order": [1, 1]}, "framed_serial.channel_order"),
+    ("pdm_driver", FRAMED | {"framed_serial.word_bits": 8}, "framed_serial.word_bits"),
+    ("pdm_driver", FRAMED | {"framed_serial.scale": 0}, "framed_serial.scale = 0"),
+    ("pdm_driver", FRAMED | {"framed_serial.scale": 70000}, "framed_serial"),
+    ("pdm_driver", FRAMED | {"framed_serial.frame_rate": 1e6}, "framed_serial.frame_rate"),
+    ("autofocus", {"region": [0.0, 0.0, 1.0]}, "must be four numbers"),
+    ("autofocus", {"region": [0.5, 0.0, 1.0, 1.0]}, "shares of the image"),
+    ("autofocus", {"optics.rest_distance": 0.5, "optics.pupil_offset": -1.0}, "inside the camera"),
+    ("virtual_bench", {"wiring": WIRING[:19]}, "37 are needed"),
+    ("virtual_bench", {"wiring": [2, *WIRING[1:]]}, "must be different channels"),
+    ("virtual_bench", {"volts.max": 0.0}, "volts"),
+    ("virtual_bench", {"plate.actuators": 20}, "full rings hold 1, 7, 19"),
+    ("virtual_bench", {"plate.actuator_x": [0.0]}, "must be as many"),
+    ("virtual_bench", {"plate.pitch": 0.01}, "beyond the edge of the plate"),
+    ("virtual_bench", {"piezo.law": "preisach", "piezo.hysteresis": 0.3}, "piezo.hysteresis = 0.3"),
+    ("virtual_bench", {"interferometer.field_diameter": 0.04}, "must not exceed the mirror"),
+    ("virtual_bench", {"interferometer.rotate_deg": 45}, "must be 0, 90, 180 or 270"),
+    ("virtual_bench", {"camera.rate": 1.0, "camera.distances": [-1.0]}, "camera.distances"),
+    ("virtual_bench", {"camera.rate": 1.0, "camera.pixel_pitch": 1e-4}, "camera.pixel_pitch"),
+    ("virtual_bench", {"piezo.law": "bouc_wen", "piezo.hysteresis": 0.3}, "too wide"),
+    ("virtual_bench", LINK | {"framed.header": "A"}, "must be hexadecimal bytes"),
+    ("virtual_bench", LINK | {"framed.channel_order": [1, 1]}, "framed.channel_order"),
+    ("virtual_bench", LINK | {"framed.word_bits": 8}, "framed.word_bits"),
+    ("virtual_bench", LINK | {"framed.scale": 0}, "framed.scale = 0"),
+    ("virtual_bench", {"mirror.principle": "membrane", "membrane.pitch": 0.01}, "membrane"),
+]
+
+
+@pytest.mark.parametrize(("name", "values", "words"), CONTRADICTIONS)
+def test_values_that_contradict_each_other_are_named(name: str, values: dict[str, Any], words: str) -> None:
+    config = {**GOOD, "autofocus": {}}
+    config[name] = config[name] | values
+    node = next(node for node in NODES if node.name == name)
+    finding = doctor_bench.node_configuration(config, node) or doctor_bench.parameters(config)
+    assert finding is not None and words in finding.problem, finding
+
+
+def _raising(error: BaseException) -> list[tuple[str, int]]:
+    """Where each of an error and its causes was raised."""
+    places = []
+    cause: BaseException | None = error
+    while cause is not None:
+        *_, (frame, line) = traceback.walk_tb(cause.__traceback__)
+        places.append((str(Path(frame.f_code.co_filename).resolve()), line))
+        cause = cause.__cause__
+    return places
+
+
+def test_every_reason_to_refuse_a_configuration_is_gone_through() -> None:
+    """Each `raise ValueError` of the modules that configure is reached by a case above, or by no values of the table."""
+    reached = set()
+    for name, values, _words in CONTRADICTIONS:
+        node = next(node for node in NODES if node.name == name)
+        configuring = node.load_configuring()
+        assert configuring is not None
+        try:
+            configuring(doctor_bench.effective(name, GOOD.get(name, {}) | values))
+        except ValueError as error:
+            reached |= set(_raising(error))
+    # What no values come to that the parameters' table allows, and what is not of a configuration.
+    elsewhere = (
+        *("must be one of", "must be {low} to {high}", "max_code", "must be finite", "leaves unconnected", "no camera"),
+        *("path {", "px of an image"),
+    )
+    missed = []
+    for file in sorted({file for file, _ in reached if "/src/" in file}):
+        for node_ in ast.walk(ast.parse(Path(file).read_text())):
+            if isinstance(node_, ast.Raise) and "ValueError" in ast.unparse(node_):
+                lines = range(node_.lineno, (node_.end_lineno or node_.lineno) + 1)
+                known = any(words in ast.unparse(node_) for words in elsewhere)
+                if not known and not any((file, line) in reached for line in lines):
+                    missed.append(f"{Path(file).name}: {ast.unparse(node_.exc)[:90]}")  # type: ignore[arg-type]
+    assert not missed, "\n".join(missed)
 
 
 def test_what_is_left_of_the_template_is_named() -> None:

@@ -81,5 +81,5 @@ def test_files_of_others_are_opened_as_hdf5_in_the_sandbox_only() -> None:
 @pytest.mark.parametrize("suffix", ["/../../x.dat", "", "dat", "./x", ".d/x", ".dat\0", ".dat;rm"])
 def test_the_trigger_writes_inside_the_watched_folder_only(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(ValueError, match="trigger_output_suffix"):
-        AcquisitionSettings(tmp_path, ["*.dat"], 0.1, ["program", "{path}"], suffix).check()
-    AcquisitionSettings(tmp_path, ["*.dat"], 0.1, ["program", "{path}"], ".tar.dat").check()
+        AcquisitionSettings(tmp_path, ["*.dat"], 0.1, ["program", "{path}"], suffix)
+    AcquisitionSettings(tmp_path, ["*.dat"], 0.1, ["program", "{path}"], ".tar.dat")

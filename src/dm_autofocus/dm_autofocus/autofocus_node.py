@@ -12,9 +12,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities, tolerance_of
-from dm_autofocus.autofocus_parameters import PARAMETERS
+from dm_autofocus.autofocus_parameters import PARAMETERS, focus_optics
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
-from dm_autofocus.optics import FocusOptics, dioptre_of, distance_of
+from dm_autofocus.optics import dioptre_of, distance_of
 from dm_autofocus.search import Phase
 from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode, Refusal
@@ -30,13 +30,7 @@ class AutofocusNode(Node):
     def __init__(self, **keywords: Any) -> None:
         super().__init__("autofocus", **keywords)
         self._values = declare(self, PARAMETERS)
-        check_region(self._values["region"])
-        self._optics = FocusOptics.from_rest_distance(
-            self._values["optics.rest_distance"],
-            self._values["optics.relay_magnification"],
-            self._values["optics.incidence"],
-            self._values["optics.pupil_offset"],
-        )
+        self._optics = focus_optics(self._values)
         self._probe = FocusProbe(self, self._values)
         self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.STATE)
         self._set_focus = self.create_client(SetFocus, "set_focus")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
-from dm_autofocus.sharpness import METRICS
+from dm_autofocus.optics import FocusOptics
+from dm_autofocus.sharpness import METRICS, check_region
 from dm_common.ros.parameters import Parameter, real, reals, text, whole
 
 PARAMETERS: Final = (
@@ -73,3 +75,18 @@ PARAMETERS: Final = (
     Parameter("track.drop", real(0.3, 0.01, 0.99), "Tracking: relative loss of sharpness that starts a new search."),
     Parameter("track.patience", whole(3, 1, 1000), "Tracking: images in a row that must have lost it."),
 )
+
+
+def focus_optics(values: Mapping[str, Any]) -> FocusOptics:
+    """The optics of the camera.
+
+    Raises:
+        ValueError: they make no sense, or the region does not lie in the image.
+    """
+    check_region(values["region"])
+    return FocusOptics.from_rest_distance(
+        values["optics.rest_distance"],
+        values["optics.relay_magnification"],
+        values["optics.incidence"],
+        values["optics.pupil_offset"],
+    )

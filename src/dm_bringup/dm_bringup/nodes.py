@@ -6,10 +6,10 @@ Standard library only, for `./dm` takes the environment of the nodes from here b
 from __future__ import annotations
 
 import importlib
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,8 @@ class SuiteNode:
         package: that holds it.
         class_name: of the node, in its module.
         parameter_module: of the package; its `PARAMETERS` is the table of the node's parameters.
+        configuring: "module.function" of the package that the node makes its parts with from the values of all its
+            parameters, or checks them by, raising ValueError; "" = any values that the table allows will do.
         lifecycle: whether it is a lifecycle node (it configures and activates itself).
         optional: whether it runs only where a configuration has a section for it.
     """
@@ -29,6 +31,7 @@ class SuiteNode:
     package: str
     class_name: str
     parameter_module: str
+    configuring: str = ""
     lifecycle: bool = False
     optional: bool = False
 
@@ -46,15 +49,47 @@ class SuiteNode:
         table: tuple[Any, ...] = importlib.import_module(f"{self.package}.{self.parameter_module}").PARAMETERS
         return table
 
+    def load_configuring(self) -> Callable[[Mapping[str, Any]], Any] | None:
+        """The function of `configuring`; None where there is none."""
+        if not self.configuring:
+            return None
+        module, _, name = self.configuring.rpartition(".")
+        return cast(
+            "Callable[[Mapping[str, Any]], Any]", getattr(importlib.import_module(f"{self.package}.{module}"), name)
+        )
+
 
 #: In the order of their start. They stop in reverse, so that the bench outlives the driver's last ramp.
 NODES = (
-    SuiteNode("virtual_bench", "dm_simulation", "VirtualBenchNode", "parameters", optional=True),
-    SuiteNode("pdm_driver", "dm_driver", "PdmDriverNode", "driver_parameters", lifecycle=True),
-    SuiteNode("interferometer", "dm_calibration", "InterferometerNode", "interferometer_parameters", lifecycle=True),
+    SuiteNode(
+        "virtual_bench", "dm_simulation", "VirtualBenchNode", "parameters", "parameters.check_bench", optional=True
+    ),
+    SuiteNode(
+        "pdm_driver",
+        "dm_driver",
+        "PdmDriverNode",
+        "driver_parameters",
+        "driver_configuration.build_configuration",
+        True,
+    ),
+    SuiteNode(
+        "interferometer",
+        "dm_calibration",
+        "InterferometerNode",
+        "interferometer_parameters",
+        "interferometer_parameters.acquisition_settings",
+        True,
+    ),
     SuiteNode("calibration", "dm_calibration", "CalibrationNode", "calibration_parameters"),
     SuiteNode("focus_controller", "dm_controller", "FocusControllerNode", "focus_parameters"),
-    SuiteNode("autofocus", "dm_autofocus", "AutofocusNode", "autofocus_parameters", optional=True),
+    SuiteNode(
+        "autofocus",
+        "dm_autofocus",
+        "AutofocusNode",
+        "autofocus_parameters",
+        "autofocus_parameters.focus_optics",
+        optional=True,
+    ),
 )
 NAMES = tuple(node.name for node in NODES)
 #: `python -m` by the name of the node.

@@ -68,11 +68,10 @@ class InterferometerNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            ingest_settings(self._values)
             self._acquisition = Acquisition(
                 acquisition_settings(self._values), self._read, self._now_ns, self._on_new_file, self._warn_of_file
             )
-        except (ValueError, RuntimeError) as error:  # RuntimeError: ~name of an unknown user
+        except ValueError as error:
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._map_publisher = self.create_lifecycle_publisher(Image, "surface_map", qos.MAP)

@@ -47,7 +47,7 @@ class AcquisitionSettings:
         """Whether the trigger command is told which file to write."""
         return any(PLACEHOLDER in argument for argument in self.trigger_command)
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Raise ValueError when the settings contradict each other."""
         if self.trigger_command and self.folder is None:
             raise ValueError("trigger_command needs watch_folder, where its map files arrive; watch_folder is empty")
@@ -96,7 +96,6 @@ class Acquisition:
             on_file: called in the watching thread with each new file.
             on_trouble: called there with a sentence, once each: a file refused unread, or the folder unreadable.
         """
-        settings.check()
         self.settings = settings
         self.folder_trouble = ""
         self._read = read

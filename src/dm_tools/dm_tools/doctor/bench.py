@@ -7,11 +7,11 @@ import shutil
 import socket
 import time
 from collections.abc import Iterator, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from dm_bringup.nodes import NODES
+from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.suite import Config, ConfigError, load_config
 from dm_common.names import unknown_name
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
@@ -36,7 +36,9 @@ def bench_checks(file: Path) -> Iterator[Check]:
     yield "required parameters", lambda: required_parameters(config)
     yield "values of your own", lambda: own_values(config)
     yield "parameters", lambda: parameters(config)
-    yield "configuration of the driver", lambda: driver_configuration(config)
+    for node in nodes_of(config):
+        if node.configuring:
+            yield f"configuration of {node.name}", partial(node_configuration, config, node)
     if "virtual_bench" in config:
         yield "ports of the virtual bench", lambda: free_ports(config["virtual_bench"])
     else:
@@ -56,7 +58,12 @@ def bench_checks(file: Path) -> Iterator[Check]:
 
 def _folder_of(config: Config, node: str, name: str) -> Path | None:
     text = str(config.get(node, {}).get(name, ""))
-    return Path(text).expanduser() if text and text != UNSET else None
+    if not text or text == UNSET:
+        return None
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:  # an unknown user
+        return Path(text)
 
 
 @cache
@@ -118,17 +125,21 @@ def _wrong(parameter: Parameter, value: Any) -> str:
     return ""
 
 
-def driver_configuration(config: Config) -> Finding | None:
-    """Whether the driver's values fit each other: wiring, volts, limits, frames."""
-    from dm_driver.driver_configuration import build_configuration
-
-    given = config.get("pdm_driver", {})
-    if any(value == UNSET for value in given.values()) or required_parameters(config) or parameters(config):
+def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
+    """Whether the values of `node` fit each other, by the function with which it configures itself."""
+    own = {node.name: config.get(node.name, {})}
+    configuring = node.load_configuring()
+    if (
+        configuring is None
+        or own_values(own)
+        or parameters(own)
+        or (node.name == "pdm_driver" and required_parameters(config))
+    ):
         return None  # reported already
     try:
-        build_configuration(effective("pdm_driver", given))
+        configuring(effective(node.name, own[node.name]))
     except ValueError as error:
-        return Finding(str(error), "correct the value; the driver refuses to configure with it")
+        return Finding(str(error), f"correct the value; {node.name} refuses to configure with it")
     return None
 
 
