@@ -80,11 +80,8 @@ def effective(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
 def required_parameters(config: Config) -> Finding | None:
     driver = config.get("pdm_driver", {})
     missing = [name for name, item in _known("pdm_driver").items() if item.default is REQUIRED and name not in driver]
-    if missing:
-        return Finding(
-            f"pdm_driver lacks {', '.join(missing)}", "add them; docs/parameters.md says what each of them means"
-        )
-    return None
+    cure = "add them; docs/parameters.md says what each of them means"
+    return Finding(f"pdm_driver lacks {', '.join(missing)}", cure) if missing else None
 
 
 def own_values(config: Config) -> Finding | None:
@@ -127,15 +124,10 @@ def _wrong(parameter: Parameter, value: Any) -> str:
 
 def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
     """Whether the values of `node` fit each other, by the function with which it configures itself."""
-    own = {node.name: config.get(node.name, {})}
-    configuring = node.load_configuring()
-    if (
-        configuring is None
-        or own_values(own)
-        or parameters(own)
-        or (node.name == "pdm_driver" and required_parameters(config))
-    ):
-        return None  # reported already
+    own, configuring = {node.name: config.get(node.name, {})}, node.load_configuring()
+    missing = node.name == "pdm_driver" and required_parameters(config)
+    if configuring is None or missing or own_values(own) or parameters(own):
+        return None  # nothing to check, or reported already
     try:
         configuring(effective(node.name, own[node.name]))
     except ValueError as error:
