@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from dm_common.mirror import APERTURE_TOLERANCE
-from dm_common.ros.parameters import Parameter, real, switch, text, whole
+from dm_common.ros.parameters import APERTURE_PARAMETER, Parameter, real, switch, text, whole
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.focus_actions import LOOP_PARAMETERS
 from dm_controller.planning.planner import SETTLE_S
@@ -72,10 +71,6 @@ PARAMETERS: Final = (
         text("~/.ros/focus_controller"),
         "folder that keeps what the actuators of each mirror have crept to, for the next start; empty = keep nothing",
     ),
-    Parameter(
-        "aperture_tolerance",
-        real(APERTURE_TOLERANCE, 0.0, 0.5),
-        "largest relative difference between the aperture radius of a calibration and the mirror's",
-    ),
+    APERTURE_PARAMETER,
     *LOOP_PARAMETERS,
 )

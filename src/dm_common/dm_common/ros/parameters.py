@@ -16,6 +16,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
+from dm_common.mirror import APERTURE_TOLERANCE
+
 _TYPES: dict[type | str, RosParameter.Type] = {
     bool: RosParameter.Type.BOOL,
     int: RosParameter.Type.INTEGER,
@@ -128,6 +130,15 @@ class Parameter:
                 IntegerRange(from_value=int(max(value.low, -(2**62))), to_value=int(min(value.high, 2**62)))
             ]
         return descriptor
+
+
+#: Of every node that holds calibrations against the mirror.
+APERTURE_PARAMETER = Parameter(
+    "aperture_tolerance",
+    real(APERTURE_TOLERANCE, 0.0, 0.5),
+    "Largest relative difference between the aperture radius of maps or calibrations and the mirror's.",
+    live=True,
+)
 
 
 def declare(
