@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from dm_tools.demo.demo_bench import bench_config
+from fault_injection.rigs.forked_node import ForkedNode
 from ros_fixtures import Observer
 from waiting import wait_until
 
@@ -65,13 +64,9 @@ class NodeProcess:
         parameter_file = folder / f"{executable}.yaml"
         parameter_file.write_text(yaml.safe_dump({"/**": {"ros__parameters": dict(parameters)}}))
         module = f"{package}.{executable}_node"
-        self._output = self.log.open("ab")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments, "--ros-args", "--params-file", str(parameter_file)],
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-        )
+        self.log.touch()
+        command = [*arguments, "--ros-args", "--params-file", str(parameter_file)]
+        self.process = ForkedNode(module, command, self.log, {"ROS_DOMAIN_ID": str(domain)})
 
     @property
     def output(self) -> str:
@@ -92,5 +87,3 @@ class NodeProcess:
             self.process.kill()
             self.process.wait()
             raise AssertionError(f"the node did not end on signal {number}:\n{self.output}") from None
-        finally:
-            self._output.close()

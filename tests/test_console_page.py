@@ -21,9 +21,9 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
-from dm_bringup.suite import Suite
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
+from fault_injection.rigs.forked_node import ForkedSuite
 from support import wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
@@ -37,7 +37,7 @@ class RunningConsole:
     folder: Path
     domain: int
     address: str
-    suite: Suite
+    suite: ForkedSuite
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningConsole]:
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 3, 20.0)
     config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.005}
     with own_domain() as domain, served(domain, folder) as address:
-        bench = RunningConsole(config, folder, domain, address, Suite(config, folder, domain).__enter__())
+        bench = RunningConsole(config, folder, domain, address, ForkedSuite(config, folder, domain).__enter__())
         try:
             yield bench
             bench.suite.check()
@@ -177,7 +177,7 @@ def test_nodes_that_are_started_again_are_found_again(page: Browser, bench: Runn
     page.wait_for("No node of the suite is heard.", 60)
     assert not page.find("Move", "button").is_enabled()
     bench.config["calibration"]["load_on_start"] = "newest"
-    bench.suite = Suite(bench.config, bench.folder, bench.domain).__enter__()
+    bench.suite = ForkedSuite(bench.config, bench.folder, bench.domain).__enter__()
     page.wait_for("driver: active", 90)
     page.wait_for(": approximate", 60)
     page.enter("Curvature, 1/m", "0.01")

@@ -17,12 +17,12 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, ErrorCode
 from std_srvs.srv import SetBool
 
-from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.ros.action_client import ThreadedActionClient
 from dm_common.ros.domains import own_domain
 from dm_controller.planning.target import FocusTarget
 from dm_tools.verify import map_of, surface_error
+from fault_injection.rigs.forked_node import ForkedSuite
 from support import bench_figures, fast_bench, wait_until
 
 pytestmark = pytest.mark.processes
@@ -42,7 +42,7 @@ def mirror(folder: Path) -> Iterator[DeformableMirrorClient]:
     config = fast_bench(folder, SEED)
     with (
         own_domain() as domain,
-        Suite(config, folder, domain) as suite,
+        ForkedSuite(config, folder, domain) as suite,
         DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
         try:

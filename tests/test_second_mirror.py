@@ -13,7 +13,6 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode
 from scipy.optimize import lsq_linear
 
-from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt
@@ -25,6 +24,7 @@ from dm_controller.planning.target import FocusTarget
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
 from dm_tools.verbs.up import shared_config
 from dm_tools.verify import map_of, surface_error
+from fault_injection.rigs.forked_node import ForkedSuite
 from support import bench_figures, fast_bench
 
 pytestmark = pytest.mark.processes
@@ -41,7 +41,7 @@ def mirror(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirro
     config["calibration"]["updates.enable"] = False  # what is judged is this calibration, not what follows from maps
     with (
         own_domain() as domain,
-        Suite(config, folder, domain) as suite,
+        ForkedSuite(config, folder, domain) as suite,
         DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
         try:

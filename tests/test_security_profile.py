@@ -9,7 +9,6 @@ from xml.etree import ElementTree as xml
 import pytest
 from typer.testing import CliRunner
 
-from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_tools.cli import app
@@ -18,6 +17,7 @@ from dm_tools.demo.demo_bench import bench_config
 from dm_tools.security.interfaces import interfaces
 from dm_tools.security.keystore import check_keystore, keys_missing
 from dm_tools.security.policy import Profile, dds_topics, write_profile
+from fault_injection.rigs.forked_node import ForkedSuite
 from running_interfaces import declaration_of, differences
 from support import wait_until
 
@@ -38,7 +38,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
     config["autofocus"] = {"use_sim_time": True}
     with (
         own_domain() as domain,
-        Suite(config, folder, domain),
+        ForkedSuite(config, folder, domain),
         DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
         side = ConsoleNode(domain=domain)

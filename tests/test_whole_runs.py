@@ -16,12 +16,13 @@ import pytest
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode, ZernikeCoefficients
 
-from dm_bringup.suite import Suite, load_config, save_config
+from dm_bringup.suite import load_config, save_config
 from dm_calibration.map_files import read_map
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
 from dm_simulation.parameters import PARAMETERS
 from dm_tools.demo.demo_bench import bench_config
+from fault_injection.rigs.forked_node import ForkedSuite
 from support import fast_bench, wait_until
 
 pytestmark = pytest.mark.processes
@@ -45,7 +46,7 @@ def test_poke_check_finds_how_the_mirror_stands_and_writes_it(tmp_path: Path) ->
     first, second = tmp_path / "first.yaml", tmp_path / "second.yaml"
     save_config(config, first)
     options = ["calibrate", "--plan", "poke-check"]
-    with own_domain() as domain, Suite(config, tmp_path, domain):
+    with own_domain() as domain, ForkedSuite(config, tmp_path, domain):
         done = subprocess.run(
             [sys.executable, "-m", "dm_tools", *options, "--config", str(first), "--write", str(second)],
             env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
@@ -59,7 +60,7 @@ def test_poke_check_finds_how_the_mirror_stands_and_writes_it(tmp_path: Path) ->
     assert told.count("exchanged") <= 3 and "permuted" not in told, told  # a finding, and the refusal in one sentence
     with (
         own_domain() as domain,
-        Suite(load_config(second), tmp_path, domain),
+        ForkedSuite(load_config(second), tmp_path, domain),
         DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
     ):
         client.wait_until_active()
@@ -79,7 +80,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
     trigger = Path(sys.modules["dm_simulation"].__path__[0]) / "interferometer" / "trigger.py"
     with (
         own_domain() as elsewhere,
-        Suite(bench, tmp_path / "bench", elsewhere, nodes=("virtual_bench",)),
+        ForkedSuite(bench, tmp_path / "bench", elsewhere, nodes=("virtual_bench",)),
         own_domain() as domain,
     ):
         log = (tmp_path / "up.log").open("w+")

@@ -11,7 +11,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import yaml
 
@@ -102,7 +102,7 @@ class Suite:
             self._environment["ROS_DOMAIN_ID"] = str(domain)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
-    def __enter__(self) -> Suite:
+    def __enter__(self) -> Self:
         self.folder.mkdir(parents=True, exist_ok=True)
         parameters = self.folder / "config.yaml"
         save_config(self._config, parameters)

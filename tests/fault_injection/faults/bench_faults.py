@@ -19,11 +19,11 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.srv import Measure
 
-from dm_bringup.suite import Suite
 from dm_client import STARTING_S, DeformableMirrorClient, DeformableMirrorError
 from dm_tools.demo.demo_bench import bench_config
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import ACTUATORS, PATIENCE_S, RigError
+from fault_injection.rigs.forked_node import ForkedSuite
 
 BENCH = "virtual_bench"
 SAFE_SHAPE = [-1.0] * ACTUATORS
@@ -41,8 +41,8 @@ class BenchRig:
         self.bench = self._suite(BENCH)
         self.others = self._suite("pdm_driver", "interferometer")
 
-    def _suite(self, *nodes: str) -> Suite:
-        return Suite(self._config, self._folder / nodes[0], self._domain, nodes=nodes)
+    def _suite(self, *nodes: str) -> ForkedSuite:
+        return ForkedSuite(self._config, self._folder / nodes[0], self._domain, nodes=nodes)
 
     @contextmanager
     def running(self) -> Iterator[DeformableMirrorClient]:

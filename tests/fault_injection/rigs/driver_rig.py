@@ -6,10 +6,8 @@ limiter.
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -36,6 +34,7 @@ from dm_simulation.electronics.drive_unit import DriveConfig
 from dm_simulation.electronics.monitor import MonitorConfig
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
+from fault_injection.rigs.forked_node import ForkedNode, Process
 
 ACTUATORS = 37
 #: Of the rig's mirror.
@@ -90,7 +89,7 @@ class DriverRig:
             **{name.replace("__", "."): value for name, value in changes.items()},
         }
         self._parameters.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: Process | None = None
         self.states: list[ActuatorState] = []
 
     def _bench_config(self, serial: str) -> BenchConfig:
@@ -133,15 +132,9 @@ class DriverRig:
         assert self.process is None
         self.process = self._start(MODULES["pdm_driver"], self._parameters, self.folder / "driver.log")
 
-    def _start(self, module: str, parameters: Path, log: Path) -> subprocess.Popen[bytes]:
-        with log.open("ab") as output:
-            return subprocess.Popen(
-                [sys.executable, "-m", module, "--ros-args", "--params-file", str(parameters)],
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, "ROS_DOMAIN_ID": str(self._domain)},
-                start_new_session=True,
-            )
+    def _start(self, module: str, parameters: Path, log: Path) -> Process:
+        command = ["--ros-args", "--params-file", str(parameters)]
+        return ForkedNode(module, command, log, {"ROS_DOMAIN_ID": str(self._domain)})
 
     def send_signal(self, number: int) -> None:
         """Send the driver a signal."""
@@ -282,7 +275,7 @@ class DriverRig:
             raise RigError(f"{client.srv_name}: {refusal}: {error}") from error
 
 
-def end_process(process: subprocess.Popen[bytes], number: int, name: str) -> int:
+def end_process(process: Process, number: int, name: str) -> int:
     """End a process, stopped or not, by a signal; its exit status.
 
     Raises:

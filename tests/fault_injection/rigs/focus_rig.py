@@ -7,7 +7,6 @@ interferometer answers at once with the surface which that plate has under the s
 from __future__ import annotations
 
 import signal
-import subprocess
 import time
 from collections import deque
 from pathlib import Path
@@ -40,6 +39,7 @@ from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
 from fault_injection.fault import FaultRecord
 from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
+from fault_injection.rigs.forked_node import Process
 from studies.benchmarks import stand_in_mirror
 
 LAW = "Prandtl-Ishlinskii"
@@ -76,7 +76,7 @@ class FocusRig(DriverRig):
         }
         self._controller_parameters = folder / "controller.yaml"
         self._controller_parameters.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
-        self.controller: subprocess.Popen[bytes] | None = None
+        self.controller: Process | None = None
         self.focus_states: deque[FocusState] = deque(maxlen=50_000)
         self.domain = domain
         self.capabilities: list[Capabilities] = []

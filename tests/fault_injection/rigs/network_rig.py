@@ -23,6 +23,7 @@ from rclpy.serialization import serialize_message
 from dm_bringup.nodes import MODULES
 from fault_injection.rigs.driver_rig import end_process
 from fault_injection.rigs.focus_rig import FocusRig
+from fault_injection.rigs.forked_node import Process
 from fault_injection.rigs.netem import bad_network
 from studies.network_namespaces import command_on, inside
 
@@ -39,7 +40,7 @@ class NetworkRig(FocusRig):
     """
 
     def __init__(self, folder: Path, domain: int, random: Random, **changes: Any) -> None:
-        self._latch: subprocess.Popen[bytes] | None = None
+        self._latch: Process | None = None
         self._stack = contextlib.ExitStack()
         try:
             self.left, self.right, self.netem = self._stack.enter_context(bad_network(random))
@@ -68,7 +69,7 @@ class NetworkRig(FocusRig):
         """The cable is as good as new."""
         self.netem.loss, self.netem.delay_s, self.netem.plugged = 0.0, 0.0, True
 
-    def _start(self, module: str, parameters: Path, log: Path) -> subprocess.Popen[bytes]:
+    def _start(self, module: str, parameters: Path, log: Path) -> Process:
         host = self.right if module == _RIGHT_SIDE else self.left
         with log.open("ab") as output:
             return subprocess.Popen(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -32,6 +31,7 @@ from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer import trigger
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
+from fault_injection.rigs.forked_node import Process
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 NODES = ("interferometer", "calibration", "focus_controller")
@@ -57,7 +57,7 @@ class ProcessRig(DriverRig):
     def __init__(self, folder: Path, domain: int, nodes: tuple[str, ...] = NODES, **changes: Any) -> None:
         super().__init__(folder, domain, **changes)
         self._nodes = nodes
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.processes: dict[str, Process] = {}
         self.calibrations = folder / "calibrations"
         port = self.bench.endpoints["trigger_port"]
         script = str(Path(trigger.__file__))

@@ -1,0 +1,111 @@
+"""Nodes as processes forked off one that has imported them already.
+
+A fresh interpreter takes most of a second of processor time to import ROS, numerics and a node. Tests start hundreds of
+nodes, so they are forked off a server that has imported them all once. Nothing of ROS is initialised there; from
+`main()` of the node on all is as with `python -m`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any, cast
+
+from dm_bringup.nodes import MODULES
+from dm_bringup.suite import Suite
+
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(list(MODULES.values()))
+
+
+class ForkedNode:
+    """A node's process, to be handled as a :class:`subprocess.Popen`.
+
+    Args:
+        module: of the node, as `python -m` takes it.
+        arguments: of its command line.
+        log: file that its output is added to.
+        environment: variables beside those of this process.
+    """
+
+    def __init__(
+        self, module: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str] | None = None
+    ) -> None:
+        self.args = ["python", "-m", module, *arguments]
+        job = (module, [module, *arguments], str(log), {**os.environ, **(environment or {})}, str(Path.cwd()))
+        # A daemon ends with this process, whatever becomes of a test.
+        self._process = _CONTEXT.Process(target=_run, args=job, daemon=True)
+        self._process.start()
+        assert self._process.pid is not None
+        self.pid: int = self._process.pid
+
+    def poll(self) -> int | None:
+        """The exit status, below 0 the signal that ended it; None = it runs."""
+        return self._process.exitcode
+
+    @property
+    def returncode(self) -> int | None:
+        """As :meth:`poll`."""
+        return self.poll()
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the end; the exit status.
+
+        Raises:
+            subprocess.TimeoutExpired: it goes on.
+        """
+        wait([self._process.sentinel], timeout)
+        status = self.poll()
+        if status is None:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        return status
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal, unless it has ended."""
+        try:
+            os.kill(self.pid, number)
+        except ProcessLookupError:
+            pass
+
+    def kill(self) -> None:
+        """End it without warning."""
+        self.send_signal(signal.SIGKILL)
+
+
+#: What nodes run as.
+Process = subprocess.Popen[bytes] | ForkedNode
+
+
+class ForkedSuite(Suite):
+    """The nodes named in a configuration, forked off the server."""
+
+    def _start(self, name: str, module: str, parameters: Path) -> None:
+        arguments = ["--ros-args", "--params-file", str(parameters)]
+        if self._namespace:
+            arguments += ["-r", f"__ns:=/{self._namespace.strip('/')}"]
+        self._processes[name] = cast(Any, ForkedNode(module, arguments, self.log(name), self._environment))
+
+
+def _run(module: str, arguments: list[str], log: str, environment: dict[str, str], folder: str) -> None:
+    """What the forked process does."""
+    os.setsid()
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    with open(log, "ab", buffering=0) as output:  # noqa: PTH123
+        for number in (1, 2):
+            os.dup2(output.fileno(), number)
+    sys.argv = arguments
+    try:
+        status = importlib.import_module(module).main()
+    finally:
+        atexit._run_exitfuncs()
+    sys.exit(status)
