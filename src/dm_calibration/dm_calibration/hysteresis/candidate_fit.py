@@ -51,8 +51,8 @@ class Candidate:
         plays: number of play operators beside the signal itself.
         powers: of their values.
         slopes: coefficients of the Duhem operator's slope; 0 = no such operator.
-        own: each actuator has its own weights, drawn towards common ones, and the Duhem operator is that of the best
-            candidate before (:mod:`~dm_calibration.hysteresis.own_laws`).
+        own: each actuator has its own weights, drawn towards common ones (:mod:`~dm_calibration.hysteresis.own_laws`);
+            its Duhem operator begins as that of the best common candidate that has one.
     """
 
     name: str
@@ -65,6 +65,11 @@ class Candidate:
     def hysteretic(self) -> bool:
         """Whether it has more than a static response to the signal."""
         return bool(self.plays or self.slopes)
+
+    @property
+    def kind(self) -> tuple[bool, bool]:
+        """Whether it has hysteresis, and whether some of that fades."""
+        return self.hysteretic, bool(self.slopes)
 
     @property
     def radius(self) -> Floats:
@@ -82,6 +87,7 @@ CANDIDATES = (
     PREISACH_AND_DUHEM,
     Candidate("static, each actuator its own", 0, 5, 0, own=True),
     Candidate("Preisach, each actuator its own", 30, 5, 0, own=True),
+    Candidate("Preisach and Duhem, each actuator its own", 30, 5, 4, own=True),
 )
 
 

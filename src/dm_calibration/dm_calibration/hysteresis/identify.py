@@ -33,6 +33,8 @@ Rows = NDArray[np.bool_]
 SLOPE_MIN = 0.1
 #: A simpler candidate is taken when its held-out error is at most this much larger.
 PARSIMONY = 1.03
+#: Own laws are tried of a kind whose common ones have a held-out error at most this much larger than the least.
+NEAR = 1.15
 
 
 class ExcitationError(TooFewMapsError):
@@ -70,8 +72,8 @@ def identify(
 
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
-        candidates: in this order; the first has no hysteresis to invert, an own one follows common ones and counts
-            only where the best of them has hysteresis as it has.
+        candidates: in this order; the first has no hysteresis to invert. An own one begins with the best common one of
+            its kind, if that comes near the best of all.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
         slope_min: smallest slope of a law over the signals of the run.
@@ -90,6 +92,7 @@ def identify(
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
+    common: dict[tuple[bool, bool], tuple[float, LawFit]] = {}  # the best of each kind
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
     reach = float(run.signals.min()), float(run.signals.max())
@@ -110,12 +113,16 @@ def identify(
         scores[name] = float(np.sqrt(np.mean(np.square(held_out[train] / scatter))))
         if best is None or PARSIMONY * scores[name] < best[0]:
             best = (scores[name], problem, whole, held_out)
+        if not whole.candidate.own and scores[name] < common.get(whole.candidate.kind, (np.inf,))[0]:
+            common[whole.candidate.kind] = (scores[name], whole)
 
     for candidate in candidates:
         if not candidate.own:
             consider(preisach if candidate == PREISACH else CandidateProblem(run, candidate, scatter))
-        elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
-            consider(OwnLaws(run, candidate, best[2].law, scatter))
+        elif candidate.kind in common:
+            score, fit = common[candidate.kind]
+            if score < NEAR * min(near for near, _ in common.values()):
+                consider(OwnLaws(run, candidate, fit.law, scatter))
     assert best is not None  # the linear candidate can always be inverted
     score, problem, fitted, held_out = best
     if test.any():
