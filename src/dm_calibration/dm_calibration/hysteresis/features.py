@@ -68,13 +68,19 @@ def padded_slope(slope: Floats, actuators: int) -> Floats:
 
 
 def fading_changes(signals: Floats, slope: Floats) -> Floats:
-    """(M, 2 A, N) derivatives of :func:`fading_feature` by the coefficients `slope` (N, 2, A) of its operator."""
+    """(M, 2 A, N) derivatives of :func:`fading_feature` by the coefficients `slope` (N, 2, A) of its operator.
+
+    0 for those whose change leads to no operator.
+    """
     still = fading_feature(signals, DuhemOperator(slope))
     changes = []
     for index in np.ndindex(*slope.shape[1:]):
         changed = slope.copy()
         changed[:, *index] += SLOPE_STEP
-        changes.append((fading_feature(signals, DuhemOperator(changed)) - still) / SLOPE_STEP)
+        try:
+            changes.append((fading_feature(signals, DuhemOperator(changed)) - still) / SLOPE_STEP)
+        except ValueError:
+            changes.append(np.zeros_like(still))
     return np.concatenate(changes, axis=1)
 
 

@@ -72,8 +72,8 @@ def identify(
 
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
-        candidates: in this order; the first has no hysteresis to invert. An own one begins with the best common one of
-            its kind, if that comes near the best of all.
+        candidates: in this order; the first has no hysteresis to invert. An own one counts where the best before has
+            hysteresis as it has, and begins with the best common one of its kind, if that comes near the best of all.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
         slope_min: smallest slope of a law over the signals of the run.
@@ -119,7 +119,7 @@ def identify(
     for candidate in candidates:
         if not candidate.own:
             consider(preisach if candidate == PREISACH else CandidateProblem(run, candidate, scatter))
-        elif candidate.kind in common:
+        elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic and candidate.kind in common:
             score, fit = common[candidate.kind]
             if score < NEAR * min(near for near, _ in common.values()):
                 consider(OwnLaws(run, candidate, fit.law, scatter))
