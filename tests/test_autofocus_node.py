@@ -40,7 +40,7 @@ PARAMETERS = {
 }
 
 
-class Bench:
+class FilmedScene:
     """Controller, driver and camera. The scene is one textured plane, in focus at `object_curvature`."""
 
     def __init__(self, observer: Observer, object_curvature: float, rate: float = 100.0) -> None:
@@ -65,7 +65,7 @@ class Bench:
         self._stop = threading.Event()
         self._camera = threading.Thread(target=self._film, args=(1 / rate,), daemon=True)
 
-    def __enter__(self) -> Bench:
+    def __enter__(self) -> FilmedScene:
         capabilities = Capabilities(
             quality=Capabilities.CALIBRATED, curvature_min=LOW, curvature_max=HIGH, aperture_radius=RADIUS
         )
@@ -125,14 +125,14 @@ Start = Callable[..., NodeProcess]
 
 
 @pytest.fixture
-def bench(start: Start, observer: Observer) -> Iterator[Bench]:
-    with Bench(observer, object_curvature=0.0173) as played:
+def scene(start: Start, observer: Observer) -> Iterator[FilmedScene]:
+    with FilmedScene(observer, object_curvature=0.0173) as played:
         start("dm_autofocus", "autofocus", PARAMETERS)
         wait_until(lambda: played.states, 60, "the first figure of an image")
         yield played
 
 
-def test_the_sharpest_focus_is_found_and_told_as_distance(bench: Bench, observer: Observer) -> None:
+def test_the_sharpest_focus_is_found_and_told_as_distance(scene: FilmedScene, observer: Observer) -> None:
     feedback: list[Any] = []
     goal = Autofocus.Goal()
     _handle, result = observer.send_goal(Autofocus, "autofocus", goal, lambda m: feedback.append(m.feedback))
@@ -142,34 +142,34 @@ def test_the_sharpest_focus_is_found_and_told_as_distance(bench: Bench, observer
     assert found.curvature == pytest.approx(0.0173, abs=0.0012)
     assert found.distance == pytest.approx(distance_of(OPTICS.dioptre_for(found.curvature)))
     assert found.images == len(feedback)
-    assert bench.requests[-1].curvature == found.curvature
+    assert scene.requests[-1].curvature == found.curvature
     assert {item.phase for item in feedback} == {AutofocusState.PHASE_COARSE, AutofocusState.PHASE_FINE}
 
 
-def test_what_the_controller_refuses_is_left_out(bench: Bench, observer: Observer) -> None:
-    bench.refuse_beyond = 0.043
+def test_what_the_controller_refuses_is_left_out(scene: FilmedScene, observer: Observer) -> None:
+    scene.refuse_beyond = 0.043
     found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert found.error_code == ErrorCode.OK, found.message
     assert found.curvature == pytest.approx(0.0173, abs=0.0012)
 
 
-def test_a_scene_without_texture_ends_without_a_focus(bench: Bench, observer: Observer) -> None:
-    bench.texture[:] = 100.0
-    bench.request.publish(FocusRequest(curvature=0.004))
-    wait_until(lambda: bench.states[-1].curvature == 0.004, what="the focus that was there before")
+def test_a_scene_without_texture_ends_without_a_focus(scene: FilmedScene, observer: Observer) -> None:
+    scene.texture[:] = 100.0
+    scene.request.publish(FocusRequest(curvature=0.004))
+    wait_until(lambda: scene.states[-1].curvature == 0.004, what="the focus that was there before")
     found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert found.error_code == ErrorCode.NOT_CONVERGED
-    assert bench.requests[-1].curvature == 0.004, "back where it was"
+    assert scene.requests[-1].curvature == 0.004, "back where it was"
 
 
-def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(bench: Bench, observer: Observer) -> None:
+def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedScene, observer: Observer) -> None:
     handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
-    wait_until(lambda: bench.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
-    bench.object_curvature = -0.03
-    wait_until(lambda: bench.states[-1].phase == AutofocusState.PHASE_COARSE, 60, "a new search")
+    wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    scene.object_curvature = -0.03
+    wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_COARSE, 60, "a new search")
 
     def on_it() -> bool:
-        last = bench.states[-1]
+        last = scene.states[-1]
         return last.phase == AutofocusState.PHASE_TRACK and abs(last.curvature + 0.03) < 0.002
 
     wait_until(on_it, 60, "tracking of the moved object")
@@ -179,18 +179,18 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(bench: Bench, ob
     assert result.result().result.curvature == pytest.approx(-0.03, abs=0.002)
 
 
-def test_another_node_that_moves_the_mirror_ends_the_search(bench: Bench, observer: Observer) -> None:
+def test_another_node_that_moves_the_mirror_ends_the_search(scene: FilmedScene, observer: Observer) -> None:
     _handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal())
-    wait_until(lambda: len(bench.requests) > 5, what="the search to be under way")
+    wait_until(lambda: len(scene.requests) > 5, what="the search to be under way")
     while not result.done():
-        bench.request.publish(FocusRequest(curvature=0.0421))
+        scene.request.publish(FocusRequest(curvature=0.0421))
         time.sleep(0.02)
     found = result.result().result
     assert found.error_code == ErrorCode.PREEMPTED
     assert "+0.0421" in found.message
 
 
-def test_focus_by_distance_and_by_dioptre(bench: Bench, observer: Observer) -> None:
+def test_focus_by_distance_and_by_dioptre(scene: FilmedScene, observer: Observer) -> None:
     def ask(**fields: float) -> SetFocusDistance.Response:
         return observer.call(SetFocusDistance, "set_focus_distance", SetFocusDistance.Request(**fields))
 
@@ -209,7 +209,7 @@ def test_focus_by_distance_and_by_dioptre(bench: Bench, observer: Observer) -> N
     assert ask(distance=-1.0).error_code == ErrorCode.OUT_OF_RANGE
 
 
-def test_the_focus_range_comes_from_the_capabilities(bench: Bench, observer: Observer) -> None:
+def test_the_focus_range_comes_from_the_capabilities(scene: FilmedScene, observer: Observer) -> None:
     answer = observer.call(GetFocusRange, "get_focus_range")
     assert answer.error_code == ErrorCode.OK
     assert answer.distance_near == pytest.approx(5.0)
@@ -231,7 +231,7 @@ def test_a_senseless_region_ends_with_the_reason(start: Start) -> None:
     assert "region = [0.5, 0.0, 0.9, 1.0]" in process.output
 
 
-def test_the_example_of_the_documentation_runs(bench: Bench, domain: int) -> None:
+def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) -> None:
     root = Path(__file__).resolve().parents[1]
     example = (root / "examples" / "camera_focus.py").read_text()
     code = example[example.index("from dm_autofocus") :]
