@@ -45,6 +45,7 @@ ROS = sorted({command for _, command in SHELL if command.startswith("ros2 ")})
 INTERFACES = (ROOT / "docs" / "interfaces.md").read_text()
 #: The longest that a command of the scene may take on a busy machine.
 PATIENCE_S = 300.0
+WAVELENGTH = 632.8e-9
 #: Exit status of a command that Ctrl-C ended before it could prepare for it.
 INTERRUPTED = 130
 
@@ -276,7 +277,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     config = bench_config(folder / "bench", "off", 0.0, 2026, 20.0)
     config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.005}
     config["calibration"]["calibration_folder"] = "~/.ros/dm_calibrations"
-    config["calibration"]["load_on_start"] = "newest"
+    config["calibration"] |= {"load_on_start": "newest", "hysteresis_maps": 80}
     home.mkdir()
     save_config(config, folder / "my_bench.yaml")
     with own_domain() as domain:
@@ -304,8 +305,20 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
 def test_it_runs(scene: Scene, command: str) -> None:
     said = scene.run(shlex.split(command))
     assert said.strip()
-    if command.startswith("./dm calibrate --plan"):
+    if command == "./dm calibrate":
         assert scene.client.wait(lambda: scene.client.capabilities.calibration_id, 30.0)
+        assert 0.0 < scene.client.capabilities.error_bound < WAVELENGTH / 200
+        assert "promise:" in said
+    if command.startswith(("./dm calibrate", "./dm focus", "./dm check", "./dm status", "./dm degauss", "./dm report")):
+        assert "next" in said.splitlines()[-1]
+
+
+def test_the_first_hour_is_run_as_written() -> None:
+    """The commands of the newcomer's page, in their order, are those that run here."""
+    page = [command for where, command in SHELL if where.startswith("first-run.md") and command.startswith("./dm ")]
+    hour = page[page.index("./dm up") + 1 : page.index("./dm degauss") + 1]
+    assert [command for command in told.RUN if command in hour] == hour
+    assert page[page.index("./dm up")] in told.WATCHED
 
 
 @pytest.mark.parametrize("place", sorted(told.PRELUDES), ids=str)

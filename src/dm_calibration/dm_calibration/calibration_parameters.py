@@ -28,7 +28,7 @@ PARAMETERS = (
     ),
     Parameter("poke_amplitude", real(0.5, 0.01, 1.0), "Half-swing of a push-pull poke, normalised.", live=True),
     Parameter("reference_every", whole(10, 1, 1000), "Steps between two reference frames.", live=True),
-    Parameter("hysteresis_maps", whole(300, 60, 2000), "Commands of a hysteresis plan; more, less noise.", live=True),
+    Parameter("hysteresis_maps", whole(200, 60, 2000), "Commands of a hysteresis plan; more, less noise.", live=True),
     Parameter("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time.", live=True),
     Parameter("measure_retries", whole(1, 0, 20), "Further tries after a map that failed.", live=True),
     Parameter(
@@ -91,7 +91,12 @@ PARAMETERS = (
         live=True,
     ),
     Parameter("dead_sigmas", real(3.0, 0.0, 1e3), "Dead below this many standard errors.", live=True),
-    Parameter("weak_sigmas", real(10.0, 0.0, 1e3), "Weak below this many standard errors.", live=True),
+    Parameter(
+        "weak_sigmas",
+        real(10.0, 0.0, 1e3),
+        "Weak below this many standard errors, where they are twice those of the other actuators.",
+        live=True,
+    ),
     Parameter(
         "weak_share", real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring.", live=True
     ),

@@ -49,7 +49,7 @@ class FitOptions:
         hysteresis_allowance: share of an actuator's move by which it may miss its mark because of hysteresis (half the
             loop, whose width is 7-15 % of the move) without the map counting as an outlier.
         dead_sigmas: an actuator is dead below this many standard errors of its response.
-        weak_sigmas: it is weak below this many standard errors ...
+        weak_sigmas: it is weak below this many standard errors, where they stand out from those of the others ...
         weak_share: ... or below this share of the median response of its ring.
 
     Raises:
@@ -282,5 +282,9 @@ def _judge(
         signal_covariance=covariance,
         grades=grades,
         drift_rms=float(np.sqrt(np.mean(np.square(rms(figure_sag - figure_sag.mean(axis=0), weight))))),
-        limitations=(*quality.limitations(good, design, grades, tilt_known, untested), *remarks),
+        limitations=(
+            *quality.limitations(good, design, grades, tilt_known, untested),
+            *quality.blur(response, standard_error, design.excited, options.weak_sigmas),
+            *remarks,
+        ),
     )

@@ -16,6 +16,10 @@ EXTRAPOLATION_MAX = 10.0
 #: Share of the median response of all excited actuators below which one is dead.
 DEAD_SHARE = 0.02
 
+#: An actuator is uncertain when its relative error is so many times that of the others: an error that all share, as
+#: hysteresis makes it in pokes, says nothing of one of them.
+STANDS_OUT = 2.0
+
 # Values of dm_msgs/Calibration.actuator_grade.
 GRADE_GOOD = 0
 GRADE_WEAK = 1
@@ -38,15 +42,37 @@ def grade(
 
     A response is the weighted rms sag of a unit signal, piston and tilt removed.
     """
+    uncertainty = _relative(response, standard_error)
+    uncertain = (response < weak_sigmas * standard_error) & (uncertainty > STANDS_OUT * _typical(uncertainty, excited))
     rings = np.zeros(response.size, dtype=np.int64) if rings is None else rings
     overall = float(np.median(response[excited])) if excited.any() else 0.0
     ring_median = np.array(
         [np.median(response[excited & (rings == ring)]) if e else 0.0 for ring, e in zip(rings, excited, strict=True)]
     )
     dead = (response < dead_sigmas * standard_error) | (response < DEAD_SHARE * overall)
-    weak = (response < weak_sigmas * standard_error) | (response < weak_share * ring_median)
+    weak = uncertain | (response < weak_share * ring_median)
     grades = np.where(dead, GRADE_DEAD, np.where(weak, GRADE_WEAK, GRADE_GOOD))
     return np.where(excited, grades, GRADE_NOT_EXCITED).astype(np.uint8)
+
+
+def _relative(response: Floats, standard_error: Floats) -> Floats:
+    """Standard errors (N,) as shares of the responses (N,)."""
+    return np.divide(standard_error, response, out=np.full(response.size, np.inf), where=response > 0.0)
+
+
+def _typical(uncertainty: Floats, excited: NDArray[np.bool_]) -> float:
+    return float(np.median(uncertainty[excited])) if excited.any() else 0.0
+
+
+def blur(response: Floats, standard_error: Floats, excited: NDArray[np.bool_], weak_sigmas: float) -> list[str]:
+    """What is to be said of responses (N,) that are all uncertain, in sentences."""
+    typical = _typical(_relative(response, standard_error), excited)
+    if typical * weak_sigmas < 1.0:
+        return []
+    return [
+        f"Responses are known to {typical:.0%} only (one standard error, median of the actuators): hysteresis, which a "
+        "hysteresis plan takes apart from them, or noise blurs them all."
+    ]
 
 
 def held_out_residual(

@@ -85,7 +85,7 @@ class PlanOptions:
     reference_every: int = 10
     surfaces: Sequence[str] = ()
     degauss: bool = True
-    hysteresis_maps: int = 300
+    hysteresis_maps: int = 200
 
     def __post_init__(self) -> None:
         if not 0.0 < self.poke_amplitude <= 1.0:

@@ -152,7 +152,9 @@ def figures_of(result: Any) -> dict[str, Any]:
 
 
 def calibrate(
-    plan: Annotated[CalibrationPlan, typer.Option(help="What to measure.")] = CalibrationPlan.full,
+    plan: Annotated[
+        CalibrationPlan, typer.Option(help="What to measure; the others are for who knows why.")
+    ] = CalibrationPlan.hysteresis,
     surfaces: Annotated[
         str, typer.Option(help="Names from Table 1, comma separated, such as p01,pz02; empty = all.")
     ] = "",
@@ -161,9 +163,7 @@ def calibrate(
     maps_per_state: Annotated[int, typer.Option(min=1, help="Maps averaged per state.")] = 1,
     hysteresis: Annotated[
         int | None,
-        typer.Option(
-            min=60, max=2000, help="Identify hysteresis and creep from so many maps: short for --plan hysteresis."
-        ),
+        typer.Option(min=60, max=2000, help="Maps of the hysteresis plan; none = as configured."),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict duration and accuracy, move nothing.")] = False,
     fresh: Annotated[
@@ -185,8 +185,9 @@ def calibrate(
 ) -> None:
     """Calibrate the mirror on the bench: command, settle, measure, fit, store.
 
-    Needs the running suite (`dm up`). Ctrl-C cancels and leaves the mirror at mid range; what was measured is kept, and
-    the same command goes on from there.
+    One run finds the influence function, the hysteresis and the creep of all actuators, and checks the wiring. Needs
+    the running suite (`dm up`). Ctrl-C cancels and leaves the mirror at mid range; what was measured is kept, and the
+    same command goes on from there.
     """
     from dm_msgs.action import Calibrate
 
