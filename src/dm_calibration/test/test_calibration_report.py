@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from reportlab.platypus import LongTable, Paragraph
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, calibrate
@@ -17,10 +20,13 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
 from dm_calibration.report import content, content_hysteresis
+from dm_calibration.report.certificate import certificate, curvatures, doubts, keep_people, people
+from dm_calibration.report.document import Section, Table
 from dm_calibration.report.figures import on_disc
 from dm_calibration.report.html_page import one_html
 from dm_calibration.report.hysteresis_figures import loop_opening, step_response
 from dm_calibration.report.page import figures_of, write_report
+from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.hysteresis.model import HysteresisModel
@@ -94,6 +100,51 @@ def test_the_page_names_what_was_dropped_and_every_limitation(page: str, calibra
     for sentence in calibration.limitations:
         assert sentence.removeprefix("Poke check: ") in text
     assert "Not identified" in page
+
+
+def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) -> None:
+    first = page[page.index("<h2>Certificate") : page.index("<h2>Summary")]
+    assert "approximate: hysteresis was not identified" in first and "<img " in first
+    assert f"{calibration.fit.held_out_max_zernike * 1e9:.2f} nm" in first and "95 % bound" in first
+    assert "2023-12-14" in first, "valid for thirty days"
+    low, high = curvatures(calibration)
+    assert -0.2 < low < -0.05 and 0.05 < high < 0.2 and f"{low:+.3f} to {high:+.3f} 1/m" in first
+    assert '<th scope="col">SHA' not in page[: page.index("<h2>Appendix: files")]
+
+
+def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibration, tmp_path: Path) -> None:
+    file = tmp_path / "people.json"
+    keep_people(file, operator="A. N. Other", instrument="")
+    keep_people(file, instrument="Verifire")
+    keep_people(file, operator="")
+    hysteresis = HysteresisFit("Prandtl-Ishlinskii", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
+    text = one_html("", [certificate(replace(calibration, hysteresis=hysteresis), people(file))])
+    for expected in ("<td>calibrated</td>", "2.00 nm (λ/316)", "A. N. Other", "Verifire"):
+        assert expected in text
+    dead = replace(calibration.fit, grades=np.array([2] + [0] * 36, dtype=np.uint8))
+    assert "actuators 1 are dead" in doubts(replace(calibration, fit=dead))[0]
+    assert people(tmp_path / "none.json") == {}
+
+
+@pytest.mark.parametrize("lines", range(0, 60, 4))
+def test_headings_stay_with_what_is_below_them(lines: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However far down a page it begins, a heading is on the page of its table."""
+    pages: dict[str, int] = {}
+
+    def recorded_draw(kind: type, name: Callable[[Any], str]) -> None:
+        original = kind.draw  # type: ignore[attr-defined]
+
+        def draw(flowable: Any) -> None:
+            pages.setdefault(name(flowable), flowable.canv.getPageNumber())
+            original(flowable)
+
+        monkeypatch.setattr(kind, "draw", draw)
+
+    recorded_draw(Paragraph, lambda paragraph: paragraph.text)
+    recorded_draw(LongTable, lambda _table: "rows")
+    table = Table("Its table", ("item", "value"), [(f"row {k}", str(k)) for k in range(12)])
+    pdf_pages("", [Section("Filler", ["filler"] * lines), Section("The heading", ["Some words."], [table])])
+    assert pages["The heading"] == pages["Its table"] == pages["rows"] <= 3
 
 
 def test_every_map_has_a_row(page: str, calibration: Calibration) -> None:

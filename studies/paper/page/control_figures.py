@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from dm_calibration.report.colours import BLUE, GREEN, ORANGE, PURPLE, VERMILION
+from dm_calibration.report.document import BLUE, GREEN, ORANGE, PURPLE, VERMILION
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from studies.paper.control import LOOP_HYSTERESIS, OPEN_HYSTERESIS, Series
 from studies.paper.page.figures import NM

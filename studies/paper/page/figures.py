@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from dm_calibration.influence.region_weighting import RegionWeighting
-from dm_calibration.report.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
+from dm_calibration.report.document import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.sample_regions import AREA_FRACTIONS

@@ -89,7 +89,7 @@ def summary(calibration: Calibration) -> Section:
     )
 
 
-def provenance(calibration: Calibration, file: str, sha256: str) -> Section:
+def provenance(calibration: Calibration) -> Section:
     """What was measured, when, with what."""
     maps, fit = calibration.maps, calibration.fit
     first, last = int(maps.stamp_ns.min()), int(maps.stamp_ns.max())
@@ -111,8 +111,6 @@ def provenance(calibration: Calibration, file: str, sha256: str) -> Section:
         ("software", f"dm_calibration {calibration.software_version}"),
         ("note", calibration.note or "none"),
     ]
-    if file:
-        rows += [("file", file), ("SHA-256 of the file", sha256)]
     shapes = [(name, target.strip()) for name, _, target in (text.partition(":") for text in calibration.targets)]
     solved = (
         [Table("Shapes that were solved on an influence function", ("surface", "aim"), shapes, textual=True)]
@@ -149,33 +147,53 @@ def cautions(calibration: Calibration) -> Section:
 def every_map(calibration: Calibration) -> Section:
     """One row per map."""
     maps, fit = calibration.maps, calibration.fit
-    files = any(maps.file)
-    header = ["map", "kind", "time, s", "residual, nm", "beyond 21 terms, nm", "valid, %"]
-    if files:
-        header += ["file", "SHA-256"]
-    rows = []
     seconds = (maps.stamp_ns - maps.stamp_ns.min()) * 1e-9
-    for i, label in enumerate(maps.label):
-        left = f"{fit.map_residual[i] * NM:.2f}" if fit.used[i] else "dropped"
-        row = [
+    rows = [
+        (
             label,
             maps.kind[i],
             f"{seconds[i]:.1f}",
-            left,
+            f"{fit.map_residual[i] * NM:.2f}" if fit.used[i] else "dropped",
             f"{maps.residual_rms[i] * NM:.2f}",
             f"{100 * maps.valid_fraction[i]:.1f}",
-        ]
-        if files:
-            row += [PurePath(maps.file[i]).name, maps.sha256[i][:SHA_SHOWN]]
-        rows.append(row)
-    folders = sorted({str(PurePath(name).parent) for name in maps.file if name})
-    where = [f"Map files lay in {', '.join(folders)}."] if folders else []
+        )
+        for i, label in enumerate(maps.label)
+    ]
     return Section(
-        "Every map",
+        "Appendix: every map",
         [
             "Residual: rms sag that the fit leaves. Beyond 21 terms: what the Zernike terms leave of the map itself, "
-            "print-through and noise.",
-            *where,
+            "print-through and noise."
         ],
-        [Table("Maps in the order measured", header, rows)],
+        [
+            Table(
+                "Maps in the order measured",
+                ("map", "kind", "time, s", "residual, nm", "beyond 21 terms, nm", "valid, %"),
+                rows,
+            )
+        ],
+    )
+
+
+def files(calibration: Calibration, file: str, sha256: str) -> Section:
+    """Files and their hashes.
+
+    Args:
+        file: name of the calibration's; "" = not stored.
+        sha256: of it.
+    """
+    maps = calibration.maps
+    rows = [
+        (label, PurePath(name).name, digest[:SHA_SHOWN])
+        for label, name, digest in zip(maps.label, maps.file, maps.sha256, strict=True)
+        if name
+    ]
+    folders = sorted({str(PurePath(name).parent) for name in maps.file if name})
+    return Section(
+        "Appendix: files",
+        [
+            *([f"This report was made of {file}, SHA-256 {sha256}."] if file else []),
+            *([f"Map files lay in {', '.join(folders)}."] if folders else ["The maps came without files."]),
+        ],
+        [Table("Map files", ("map", "file", "SHA-256"), rows, textual=True)] if rows else [],
     )

@@ -46,11 +46,6 @@ def influence(calibration: Calibration) -> Section:
             Picture(
                 "influence", "Influence functions of all actuators on one scale.", figures.influence_sheet(calibration)
             ),
-            Picture(
-                "responses",
-                "Responses with their standard errors, and where the actuators stand; dashed: calibrated aperture.",
-                figures.response_figure(calibration),
-            ),
         ],
     )
 

@@ -15,7 +15,7 @@ from scipy.interpolate import RBFInterpolator
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.maps import KINDS
 from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
-from dm_calibration.report.colours import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, VERMILION
+from dm_calibration.report.document import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from dm_calibration.report.residuals import Residuals
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints

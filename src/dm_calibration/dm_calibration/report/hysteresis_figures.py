@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dm_calibration.report.colours import BLUE, GREEN, GREY, ORANGE, VERMILION
+from dm_calibration.report.document import BLUE, GREEN, GREY, ORANGE, VERMILION
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.recipes import RecipeBook
 

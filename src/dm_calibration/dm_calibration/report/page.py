@@ -10,7 +10,7 @@ import numpy as np
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
-from dm_calibration.report import content, content_fit, content_hysteresis
+from dm_calibration.report import certificate, content, content_fit, content_hysteresis
 from dm_calibration.report.document import Section
 from dm_calibration.report.html_page import one_html
 from dm_calibration.report.hysteresis_figures import loop_opening
@@ -35,8 +35,9 @@ def sections(calibration: Calibration, file: Path | None = None) -> list[Section
     left = residuals(calibration)
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
     return [
+        certificate.certificate(calibration, certificate.people()),
         content.summary(calibration),
-        content.provenance(calibration, file.name if file is not None else "", sha256),
+        content.provenance(calibration),
         content.cautions(calibration),
         content_fit.residual(calibration),
         content_fit.regions(calibration, left),
@@ -45,6 +46,7 @@ def sections(calibration: Calibration, file: Path | None = None) -> list[Section
         content_hysteresis.hysteresis(calibration),
         content_hysteresis.recipes(calibration),
         content.every_map(calibration),
+        content.files(calibration, file.name if file is not None else "", sha256),
     ]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cache
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 from reportlab.lib.colors import HexColor
@@ -36,6 +36,8 @@ MARGIN = 48.0
 WIDTH = A4[0] - 2 * MARGIN
 #: Tallest picture: the page less margins and room for a caption.
 HEIGHT = A4[1] - 2 * MARGIN - 60.0
+#: Room for text on a page, less the frame's own padding.
+PAGE = A4[1] - 2 * MARGIN - 12.0
 #: Around the text of a cell.
 PADDING = 4.0
 #: Widest column of numbers whose text is not broken over lines, as a share of the page.
@@ -55,6 +57,13 @@ CAPTION = ParagraphStyle("caption", fontName=REGULAR, fontSize=8, leading=10.5, 
 TABLE_TITLE = ParagraphStyle("table", fontName=BOLD, fontSize=8.5, leading=11, spaceBefore=6, spaceAfter=3)
 
 
+class Room(NamedTuple):
+    """Flowables and the height (points) that a page must have left for them to begin on it."""
+
+    height: float
+    flowables: list[Flowable]
+
+
 def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     """All sections as a PDF: text, tables and pictures one below the other, title and page number at the foot."""
     _register_fonts()
@@ -64,11 +73,14 @@ def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     document = SimpleDocTemplate(stream, pagesize=A4, title=title, invariant=1, **margins)
     story: list[Flowable] = [_paragraph(title, TITLE)]
     for section in sections:
-        story.append(_paragraph(section.title, HEADING))
-        story += [_paragraph(text, BODY) for text in section.paragraphs]
-        for table in section.tables:
-            story += _table(table)
-        story += [_picture(picture) for picture in section.pictures]
+        text = [_paragraph(section.title, HEADING), *(_paragraph(text, BODY) for text in section.paragraphs)]
+        shown = [_table(table) for table in section.tables] + [_picture(picture) for picture in section.pictures]
+        # A heading and its text stay with the first table or picture below them, as far as a page has room for all.
+        heights = [each.wrap(WIDTH, HEIGHT)[1] + each.style.spaceBefore + each.style.spaceAfter for each in text]
+        story.append(CondPageBreak(min(sum(heights) + (shown[0][0] if shown else 0.0), PAGE)))
+        story += text
+        for room, flowables in shown:
+            story += [CondPageBreak(min(room, PAGE)), *flowables]
     document.build(story, canvasmaker=_numbered(title))
     return stream.getvalue()
 
@@ -83,15 +95,16 @@ def _paragraph(text: str, style: ParagraphStyle) -> Paragraph:
     return Paragraph(escape(text), style)
 
 
-def _picture(picture: Picture) -> Flowable:
+def _picture(picture: Picture) -> Room:
     """A picture as wide as the text, or as high as a page, with its caption below it on the same page."""
     width, height = (72.0 * length for length in picture.figure.get_size_inches())
     scale = min(WIDTH / width, HEIGHT / height)
     image = Image(io.BytesIO(picture.png), width * scale, height * scale)
-    return KeepTogether([image, _paragraph(picture.caption, CAPTION)])
+    caption = _paragraph(picture.caption, CAPTION)
+    return Room(height * scale + caption.wrap(WIDTH, HEIGHT)[1], [KeepTogether([image, caption])])
 
 
-def _table(table: Table) -> list[Flowable]:
+def _table(table: Table) -> Room:
     """A table whose columns are as wide as their longest cell, in a smaller type where they need more than the page."""
     widths = _column_widths(table)
     scale = min(1.0, WIDTH / sum(widths))
@@ -125,9 +138,8 @@ def _table(table: Table) -> list[Flowable]:
     made = LongTable(rows, colWidths=[scale * width for width in widths], repeatRows=1, style=style, hAlign="LEFT")
     # A table that fits on a page is not torn, another begins with a dozen rows at least; its caption stays above it.
     height = made.wrap(WIDTH, HEIGHT)[1] + 20.0
-    whole = height < A4[1] - 2 * MARGIN
-    room = CondPageBreak(height if whole else min(height, 12 * 2.0 * TABLE_SIZE))
-    return [room, _paragraph(table.caption, TABLE_TITLE), made, Spacer(0, 10)]
+    room = height if height < PAGE else 12 * 2.0 * TABLE_SIZE
+    return Room(room, [_paragraph(table.caption, TABLE_TITLE), made, Spacer(0, 10)])
 
 
 def _column_widths(table: Table) -> list[float]:

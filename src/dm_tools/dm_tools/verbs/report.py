@@ -69,6 +69,10 @@ def report(
     store: Annotated[
         Path | None, typer.Option(help="Folder of the calibration files; none = the running suite's, else the usual.")
     ] = None,
+    operator: Annotated[
+        str, typer.Option(help="Who answers for the calibration; on the first page, kept for later.")
+    ] = "",
+    instrument: Annotated[str, typer.Option(help="What measures; on the first page, kept for later.")] = "",
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
@@ -76,6 +80,7 @@ def report(
 
     Reads the stored file; needs no running nodes, but takes the calibration of those that run.
     """
+    from dm_calibration.report.certificate import keep_people
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
 
@@ -86,6 +91,7 @@ def report(
     if store is None:
         store = running_store(namespace) or newest_store(STORES)
     found, file = find_calibration(calibration, CalibrationStore(store))
+    keep_people(operator=operator, instrument=instrument)
     written = write_report(found, folder, file)
     console.print(
         f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "

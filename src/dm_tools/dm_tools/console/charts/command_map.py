@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection
 
-from dm_calibration.report.colours import VERMILION
+from dm_calibration.report.document import VERMILION
 from dm_tools.console.charts.plots import INK, Drawing, chart
 from dm_tools.console.view_models import SIGNAL_COLOURS, Cell
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from dm_calibration.report.colours import BLUE, GREY, ORANGE, VERMILION
+from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION
 from dm_tools.console.loops import Loop
 from dm_tools.console.view_models import Bar
 
@@ -65,7 +65,7 @@ def zernike_chart(bars: Sequence[Bar], title: str) -> Drawing:
     terms["axisLabel"] = {"color": INK, "rotate": 90, "interval": 0, "fontSize": 10}
     return chart(
         f"{title} beyond tilt, largest {largest.name}: {largest.value_nm:.2f} nm",
-        grid={"left": 60, "right": 12, "top": 12, "bottom": 62},
+        grid={"left": 60, "right": 12, "top": 12, "bottom": 150},
         xAxis=terms,
         yAxis=axis(f"{title}, nm", nameGap=42),
         series=[

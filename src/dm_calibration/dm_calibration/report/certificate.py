@@ -1,0 +1,130 @@
+"""The first page of the report: what the calibration promises, of which mirror, until when, and who says so."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_parameters import PARAMETERS
+from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
+from dm_calibration.influence.surfaces import solve_shape
+from dm_calibration.report import figures
+from dm_calibration.report.content import length, utc
+from dm_calibration.report.document import Picture, Section, Table
+from dm_calibration.store.atomic_write import write_whole
+from dm_common.geometry import neighbour_pairs
+from dm_common.limits import Limits
+from dm_common.mirror import Mirror
+from dm_common.optics.conic import conic_coefficients, conic_sag
+from dm_common.optics.zernike import PISTON_TILT
+
+#: Who calibrates with what, asked for once: by `./dm report --operator NAME --instrument NAME`.
+PEOPLE = Path("~/.ros/dm_report.json")
+#: A curvature is in the range while no coefficient is further off than this, m; it is found to this, 1/m.
+TOLERANCE, STEP = 20e-9, 1e-4
+DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
+
+
+def people(file: Path = PEOPLE) -> dict[str, str]:
+    """Names of `operator` and `instrument`, as far as they were given."""
+    try:
+        content = json.loads(file.expanduser().read_text())
+    except (OSError, ValueError):
+        return {}
+    return {str(name): str(value) for name, value in content.items()} if isinstance(content, dict) else {}
+
+
+def keep_people(file: Path = PEOPLE, **names: str) -> None:
+    """Keep the names that are given for this report and those to come.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if given := {name: value for name, value in names.items() if value}:
+        write_whole(file.expanduser(), json.dumps(people(file) | given).encode())
+
+
+def promise(calibration: Calibration) -> float:
+    """m, 95 % bound on the largest coefficient error of an open-loop move, from maps that had no part in the fit."""
+    found = calibration.hysteresis
+    return float(found.held_out_max_zernike if found is not None else calibration.fit.held_out_max_zernike)
+
+
+def doubts(calibration: Calibration) -> list[str]:
+    """The reasons why a calibration is approximate only; empty = it is not."""
+    reasons = []
+    for grade, name in enumerate(GRADE_NAMES):
+        numbers = np.flatnonzero(calibration.fit.grades == grade) + 1
+        if grade != GRADE_GOOD and numbers.size:
+            reasons.append(f"actuators {', '.join(map(str, numbers))} are {name}")
+    if calibration.hysteresis is None:
+        reasons.append("hysteresis was not identified")
+    if promise(calibration) > DEFAULTS["calibrated_error_max"]:
+        reasons.append(f"the promise is above {length(DEFAULTS['calibrated_error_max'], 0.0)}")
+    return reasons
+
+
+def curvatures(calibration: Calibration) -> tuple[float, float]:
+    """Smallest and largest curvature (1/m) of a sphere within the signals of the maps; (nan, nan) = not even 0."""
+    fit, maps, radius = calibration.fit, calibration.maps, calibration.aperture_radius
+    x, y = calibration.actuator_x, calibration.actuator_y
+    pairs = neighbour_pairs(x, y)
+    apart = float(np.abs(maps.applied[:, pairs[:, 0]] - maps.applied[:, pairs[:, 1]]).max(initial=1e-6))
+    limits = Limits(fit.signal_min, fit.signal_max, pairs, apart)
+    mirror = Mirror(calibration.mirror_name, calibration.mirror_serial, x, y, radius, limits)
+
+    def reached(curvature: float) -> bool:
+        signals, _left = solve_shape(conic_sag(radius * fit.points.x, radius * fit.points.y, curvature), fit, mirror)
+        error = fit.influence_zernike @ signals + fit.zernike_offset - conic_coefficients(curvature, 0.0, radius)
+        return bool(np.abs(error[PISTON_TILT:]).max() <= TOLERANCE) and limits.allow_neighbours(signals)
+
+    def edge(far: float) -> float:
+        near = 0.0
+        while abs(far - near) > STEP:
+            middle = 0.5 * (near + far)
+            near, far = (middle, far) if reached(middle) else (near, middle)
+        return near
+
+    if not reached(0.0):
+        return (np.nan, np.nan)
+    stroke = 4.0 * (limits.high - limits.low) * float(np.abs(fit.influence_zernike[PISTON_TILT]).sum()) / radius**2
+    return edge(-stroke), edge(stroke)
+
+
+def certificate(calibration: Calibration, names: Mapping[str, str]) -> Section:
+    """Verdict, range, promise, term and names.
+
+    Args:
+        names: of `operator` and `instrument`.
+    """
+    reasons, bound = doubts(calibration), length(promise(calibration), calibration.wavelength)
+    low, high = curvatures(calibration)
+    until = calibration.created_ns + round(1e9 * DEFAULTS["updates.stale_after"])
+    verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
+    reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
+    rows = [
+        ("verdict", verdict),
+        ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
+        ("range of curvatures", reach if np.isfinite(low) else "flat is out of reach"),
+        ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move"),
+        ("measured", utc(calibration.stamp_ns)),
+        ("valid until", f"{utc(until)}, longer when ./dm check agrees"),
+        ("operator", names.get("operator") or "not given (./dm report --operator)"),
+        ("instrument", names.get("instrument") or "not given (./dm report --instrument)"),
+        ("calibration", calibration.id),
+    ]
+    sentence = (
+        f"This mirror is {'approximately ' if reasons else ''}calibrated: without a sensor in the loop, 95 % of its "
+        f"moves to a sphere in the range below are promised to end within {bound} of it in every Zernike coefficient "
+        "beyond tilt."
+    )
+    picture = Picture(
+        "responses",
+        "Responses with their standard errors, and where the actuators stand; dashed: calibrated aperture.",
+        figures.response_figure(calibration),
+    )
+    return Section("Certificate", [sentence], [Table("Certificate", ("item", "value"), rows, textual=True)], [picture])
