@@ -14,6 +14,8 @@ from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode, MirrorInfo
 from dm_msgs.srv import HoldMirror, SetSignals
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 
 from dm_common.ros import qos
 from drive_unit_servers import Edac40TcpUnit, Frame
@@ -98,6 +100,12 @@ class Driver:
     def change(self, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=transition))
         return bool(self.observer.call(ChangeState, "pdm_driver/change_state", request).success)
+
+    def set_parameter(self, name: str, value: str) -> str:
+        """Set a parameter; the reason why it was refused, "" = it was not."""
+        change = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[change])
+        return str(self.observer.call(SetParameters, "pdm_driver/set_parameters", request).results[0].reason)
 
     def set_signals(self, signals: Any, **fields: Any) -> Any:
         request = SetSignals.Request(signals=[float(value) for value in signals], **fields)
@@ -349,6 +357,7 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
     assert driver.change(Transition.TRANSITION_ACTIVATE)
     driver.wait_active()
     assert driver.set_signals(np.full(37, 0.4), wait=True).error_code == ErrorCode.OK
+    assert "cleanup" in driver.set_parameter("mirror.serial", "another")
     assert driver.change(Transition.TRANSITION_DEACTIVATE)
     state = driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_INACTIVE, "inactive")
     assert list(state.applied) == pytest.approx([-1.0] * 37, abs=CODE)
@@ -358,7 +367,9 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
     assert driver.change(Transition.TRANSITION_CLEANUP)
     driver.wait_for_state(lambda state: state.driver_state == ActuatorState.STATE_UNCONFIGURED, "unconfigured")
+    assert driver.set_parameter("mirror.serial", "another") == ""
     assert driver.change(Transition.TRANSITION_CONFIGURE)
+    wait_until(lambda: driver.infos[-1].serial == "another", what="the new serial number")
     assert driver.change(Transition.TRANSITION_ACTIVATE)
     assert driver.set_signals(np.full(37, -0.5), wait=True).error_code == ErrorCode.OK
     # Straight from active to finalized: the safe shape again.
@@ -377,7 +388,7 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
         ({"volts__max": 500.0}, ["volts.max = 500 V needs 6.25 V"]),
         ({"safe_signals": [0.0] * 36}, ["safe_signals has 36 values: must have 37"]),
         ({"limits__step": 5.0}, ["limits.step", "5.0"]),
-        ({"volts__max": 300}, ["volts.max"]),
+        ({"limits__neighbour_differnce": 2.0}, ["limits.neighbour_differnce", "did you mean limits.neighbour_diff"]),
         ({"electronics__address": ""}, ["electronics.address is empty"]),
     ],
 )

@@ -16,7 +16,8 @@ def as_markdown(table: Sequence[Parameter]) -> str:
     lines = ["| parameter | default | allowed | what it is |", "|---|---|---|---|"]
     for parameter in table:
         default = "**required**" if parameter.default is REQUIRED else f"`{parameter.default!r}`"
-        lines.append(f"| `{parameter.name}` | {default} | {parameter.allowed()} | {parameter.describe()} |")
+        live = " *live*" if parameter.live else ""
+        lines.append(f"| `{parameter.name}` | {default} | {parameter.allowed()} | {parameter.describe()}{live} |")
     return "\n".join(lines) + "\n"
 
 
@@ -26,7 +27,9 @@ def parameters_page() -> str:
         "# Parameters",
         "",
         "Written from the code by `./dm exec python -m studies.documentation.parameters`; a test keeps it true.",
-        "Numbers of type double need a point in YAML (`300.0`, not `300`): ROS 2 does not convert integers.",
+        "A whole number will do for a float (`300` for `300.0`). A parameter that is misspelt, wrong or missing stops",
+        "the start; a lifecycle node stays unconfigured instead, says so, and takes it by `ros2 param set`. What is",
+        "marked *live* changes at any time; the rest at the start, of a lifecycle node until it is configured.",
         "",
     ]
     for node, table in TABLES.items():

@@ -11,7 +11,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from dm_bringup.nodes import NAMES, nodes_of
-from dm_bringup.suite import load_config
+from dm_bringup.suite import ConfigError, load_config
 
 SHARE = Path(__file__).resolve().parents[1]
 
@@ -51,3 +51,5 @@ def test_launch_files_start_what_up_starts(
     assert tuple(action.keywords["executable"] for action in actions) == nodes
     assert tuple(node.name for node in nodes_of(load_config(path))) == nodes
     assert {action.keywords["parameters"][0] for action in actions} == {str(path)}
+    with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
+        start_nodes({"config": str(tmp_path / "none.yaml"), "namespace": ""})

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from dm_msgs.msg import SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.msg import MirrorInfo, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import IngestFile, Measure
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -25,7 +25,7 @@ from std_msgs.msg import Header
 
 from dm_calibration.acquisition import interferometer_messages as messages
 from dm_calibration.acquisition.acquisition import Acquisition
-from dm_calibration.acquisition.ingest import Ingest
+from dm_calibration.acquisition.ingest import Ingest, too_large
 from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
 from dm_calibration.map_files import MapFileError, SurfaceMap
 from dm_common.errors import CodedError, ErrorCode, Refusal
@@ -43,16 +43,20 @@ class InterferometerNode(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__("interferometer")
-        self._values = parameters.declare(self, PARAMETERS)
+        self._configured = self._active = False
+        self._mirror_radius = 0.0  # m; 0 = not known
+        self._values = parameters.declare(
+            self, PARAMETERS, unlocked=lambda: not self._configured, check=self._fits_mirror
+        )
         self._ingest = Ingest()
         self._acquisition: Acquisition | None = None
-        self._configured = self._active = False
         self._publishing = threading.Lock()  # the four messages of one map stay together
         self._taken = self._bad = 0
         self._last_file = self._last_refusal = ""
         self._warned_of_pitch = False
         self._published: dict[str, str] = {}  # sha256 by path of what came from the watched folder
         self._diagnostics = diagnostics.Diagnostics(self, "interferometer", self._health)
+        self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self._worker_services = [
             WorkerService(self, IngestFile, "ingest_file", self._on_ingest_file),
             WorkerService(self, Measure, "measure", self._on_measure),
@@ -61,6 +65,14 @@ class InterferometerNode(LifecycleNode):
             steady = Clock(clock_type=ClockType.STEADY_TIME)
             self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
 
+    def _on_mirror_info(self, message: MirrorInfo) -> None:
+        self._mirror_radius = 0.5 * message.full_aperture_diameter
+
+    def _fits_mirror(self, changes: Mapping[str, Any]) -> None:
+        """Raise ParameterError for an aperture that is larger than the mirror: a slip of the decimal point."""
+        if wrong := too_large(changes.get("aperture.radius", 0.0), self._mirror_radius):
+            raise parameters.ParameterError(wrong)
+
     def _autostart(self) -> None:
         self._autostart_timer.cancel()
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
@@ -68,6 +80,7 @@ class InterferometerNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
+            self._values.check()
             self._acquisition = Acquisition(
                 acquisition_settings(self._values), self._read, self._now_ns, self._on_new_file, self._warn_of_file
             )
@@ -172,7 +185,7 @@ class InterferometerNode(LifecycleNode):
             self._published.pop(next(iter(self._published)))
 
     def _read(self, path: Path) -> tuple[SurfaceMap, Measurement]:
-        return self._ingest.read(path, ingest_settings(self._values))
+        return self._ingest.read(path, ingest_settings(self._values, self._mirror_radius))
 
     def _accept(self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str) -> Any:
         if self._active:
@@ -225,7 +238,9 @@ class InterferometerNode(LifecycleNode):
         return int(self.get_clock().now().nanoseconds)
 
     def _header(self, stamp_ns: int) -> Header:
-        return Header(stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=self._values["frame_id"])
+        return Header(
+            stamp=Time(nanoseconds=stamp_ns).to_msg(), frame_id=parameters.frame_id(self, self._values["frame_id"])
+        )
 
     def _file_time(self, surface: SurfaceMap, believe_header: bool) -> int:
         now = self._now_ns()
@@ -251,6 +266,7 @@ class InterferometerNode(LifecycleNode):
             "last_file": self._last_file,
             "last_refusal": self._last_refusal,
         }
+        trouble = trouble or too_large(self._values["aperture.radius"], self._mirror_radius)
         if trouble:
             return diagnostics.Health(diagnostics.ERROR, trouble, values)
         if self._last_refusal:

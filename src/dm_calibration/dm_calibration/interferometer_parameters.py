@@ -14,7 +14,11 @@ from dm_common.ros.parameters import Parameter, real, switch, text, texts
 
 PARAMETERS = (
     Parameter("autostart", switch(True), "Configure and activate by itself after the start."),
-    Parameter("frame_id", text("mirror"), "Name of the mirror surface frame (x right, y up)."),
+    Parameter(
+        "frame_id",
+        text(""),
+        "Mirror surface frame (x right, y up); empty = mirror, behind the namespace where there is one.",
+    ),
     Parameter("watch_folder", text(""), "Folder in which the instrument saves its maps; empty = watch nothing."),
     Parameter(
         "file_pattern",
@@ -89,8 +93,8 @@ PARAMETERS = (
 )
 
 
-def ingest_settings(values: Mapping[str, Any]) -> IngestSettings:
-    """What maps are read with."""
+def ingest_settings(values: Mapping[str, Any], mirror_radius: float = 0.0) -> IngestSettings:
+    """What maps are read with, of a mirror of `mirror_radius`, m; 0 = not known."""
     return IngestSettings(
         xyz_unit=values["xyz_unit"],
         pitch=values["pitch"],
@@ -100,6 +104,7 @@ def ingest_settings(values: Mapping[str, Any]) -> IngestSettings:
             values["orientation.flip_x"], values["orientation.flip_y"], values["orientation.rotate_deg"]
         ),
         aperture_radius=values["aperture.radius"],
+        mirror_radius=mirror_radius,
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
         minimum_valid_fraction=values["aperture.minimum_valid_fraction"],
         remove_piston_tilt=values["remove_piston_tilt"],

@@ -55,6 +55,12 @@ def test_configured_aperture_gives_the_coefficients_exactly(surface: Path) -> No
     np.testing.assert_allclose(found.sag, expected, atol=4e-8)  # half a pixel of slope at the rim
 
 
+def test_an_aperture_larger_than_the_mirror_is_refused(surface: Path) -> None:
+    with pytest.raises(MapRejectedError, match=r"aperture.radius = 0.05 m: the mirror has a radius of 0.015 m"):
+        Ingest().read(surface, IngestSettings(aperture_radius=0.05, mirror_radius=0.015))
+    Ingest().read(surface, IngestSettings(aperture_radius=0.01, mirror_radius=0.015))
+
+
 def test_orientation_turns_the_coefficients(surface: Path) -> None:
     def fitted(orientation: Orientation, x: float, y: float) -> np.ndarray:
         settings = IngestSettings(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import Applied
 from dm_common.limits import Limits
-from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import Recipe, RecipeBook
+
+if TYPE_CHECKING:
+    from dm_common.measurement import Measurement
 
 Floats = NDArray[np.float64]
 
@@ -82,6 +84,8 @@ def measurement_from(response: Any) -> Measurement:
     Raises:
         ValueError: the answer holds no samples, or coefficients of another convention.
     """
+    from dm_common.measurement import Measurement  # only those who measure ask
+
     zernike, samples = response.zernike, response.samples
     if zernike.convention != ZernikeCoefficients.BORN_WOLF:
         raise ValueError(f"zernike.convention = {zernike.convention}: must be {ZernikeCoefficients.BORN_WOLF}")

@@ -6,10 +6,11 @@ import math
 from typing import Any
 
 import pytest
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, declare, real, reals, text, whole
+from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, declare, frame_id, real, reals, text, whole
 from ros_fixtures import Observer
 
 TABLE = (
@@ -70,4 +71,83 @@ def test_live_parameters_are_checked_and_applied_on_set(observer: Observer) -> N
     assert values["gain"] == 5.0
     assert changes == [{"gain": 5.0}]
     assert not node.set_parameters([RosParameter("serial", value="S2")])[0].successful
+    node.destroy_node()
+
+
+def get_all(node: Node) -> dict[str, Any]:
+    """What `ros2 param dump` asks for: all parameters at once, which fails when one of them has no value."""
+    return {item.name: item.value for item in node.get_parameters(node.list_parameters([], 0).names)}
+
+
+def test_every_parameter_has_a_value_empty_lists_too(observer: Observer) -> None:
+    node = node_with(observer, "dumped", serial="S1")
+    declare(node, TABLE)
+    dumped = get_all(node)
+    assert dumped["positions"] == [] and dumped["serial"] == "S1" and dumped["gain"] == 2.0
+    node.destroy_node()
+
+
+def test_a_whole_number_counts_as_a_float_and_an_empty_list_is_one(observer: Observer) -> None:
+    node = node_with(observer, "converted", serial="S1", gain=3, positions=[0, 1])
+    values = declare(node, TABLE)
+    assert (values["gain"], values["positions"]) == (3.0, [0.0, 1.0])
+    assert get_all(node)["gain"] == 3.0
+    assert node.set_parameters([RosParameter("gain", value=7)])[0].successful
+    assert isinstance(values["gain"], float) and values["gain"] == 7.0
+    node.destroy_node()
+    empty = Node(
+        "empty", parameter_overrides=[RosParameter("serial", value="S1"), RosParameter("positions", value=None)]
+    )
+    assert declare(empty, TABLE)["positions"] == []
+    empty.destroy_node()
+
+
+@pytest.mark.parametrize("name", ["limits.stepp", "gian"])
+def test_a_misspelt_parameter_is_refused_with_the_right_spelling(observer: Observer, name: str) -> None:
+    table = (*TABLE, Parameter("limits.step", real(0.1, 0.0, 2.0), "step"))
+    node = node_with(observer, "misspelt", serial="S1", **{name: 0.1})
+    with pytest.raises(ParameterError, match=r"did you mean (limits\.step|gain)"):
+        declare(node, table)
+    node.destroy_node()
+
+
+def test_parameters_of_other_nodes_are_no_misspelling(observer: Observer) -> None:
+    node = node_with(observer, "shared", serial="S1", **{"camera.rate": 5.0, "use_sim_time": False})
+    declare(node, TABLE)
+    node.destroy_node()
+
+
+def test_setting_an_unknown_parameter_names_the_near_one(observer: Observer) -> None:
+    node = node_with(observer, "set_unknown", serial="S1")
+    declare(node, TABLE)
+    with pytest.raises(ParameterNotDeclaredException, match="did you mean gain"):
+        node.set_parameters([RosParameter("gian", value=1.0)])
+    node.destroy_node()
+
+
+def test_a_lifecycle_node_is_put_right_before_it_is_configured(observer: Observer) -> None:
+    configured = False
+    node = node_with(observer, "lifecycle", count=9)
+    values = declare(node, TABLE, unlocked=lambda: not configured)
+    with pytest.raises(ParameterError, match=r"serial is required.*count = 9"):
+        values.check()
+    assert get_all(node)["count"] == 3
+    assert node.set_parameters([RosParameter("serial", value="S1")])[0].successful
+    assert node.set_parameters([RosParameter("count", value=4)])[0].successful
+    values.check()
+    assert (values["serial"], values["count"]) == ("S1", 4)
+    configured = True
+    refused = node.set_parameters([RosParameter("serial", value="S2")])[0]
+    assert "not configured" in refused.reason and values["serial"] == "S1"
+    assert node.set_parameters([RosParameter("gain", value=5.0)])[0].successful
+    node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ("namespace", "frame"), [("", "mirror"), ("left", "left/mirror"), ("lab/left", "lab/left/mirror")]
+)
+def test_every_mirror_has_a_frame_of_its_own(observer: Observer, namespace: str, frame: str) -> None:
+    node = Node("framed", namespace=namespace)
+    assert frame_id(node, "") == frame
+    assert frame_id(node, "bench_2") == "bench_2"
     node.destroy_node()

@@ -16,7 +16,6 @@ from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.hysteresis.model import HysteresisState
-from dm_common.measurement import Measurement
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.parameters import Parameter, real, whole
 from dm_common.ros.worker import WorkerActionServer, sleep
@@ -25,6 +24,7 @@ from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget, Request
 
 if TYPE_CHECKING:
+    from dm_common.measurement import Measurement
     from dm_controller.focus_controller_node import FocusControllerNode
 
 #: Parameters that the hosting node declares beside its own.

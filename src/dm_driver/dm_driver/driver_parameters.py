@@ -16,7 +16,11 @@ _FRAME: Final = FrameFormat()
 
 PARAMETERS: Final = (
     Parameter("autostart", switch(True), "Configure and activate by itself after the start."),
-    Parameter("frame_id", text("mirror"), "Name of the mirror surface frame (x right, y up)."),
+    Parameter(
+        "frame_id",
+        text(""),
+        "Mirror surface frame (x right, y up); empty = mirror, behind the namespace where there is one.",
+    ),
     Parameter("state_period", real(0.5, 0.02, 60.0, "s"), "Time between periodic actuator_state messages."),
     Parameter("mirror.name", text("PDM30-37"), "Model of the mirror."),
     Parameter("mirror.serial", text(REQUIRED), "Serial number; calibrations belong to one."),

@@ -19,7 +19,6 @@ from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
 from dm_msgs.srv import Degauss as DegaussService
 from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.time import Time
 
@@ -49,15 +48,10 @@ class PdmDriverNode(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__("pdm_driver")
-        self._values: dict[str, Any] = {}
-        self._problem = ""  # what is wrong with the parameters
-        try:
-            self._values = parameters.declare(self, PARAMETERS)
-        except (parameters.ParameterError, ParameterException) as error:
-            self._problem = str(error)
-        self._frame_id: str = self._values.get("frame_id", "mirror")
         self._hold = MirrorHold(time.monotonic)
         self._gate = CommandGate(self._hold, self._on_gate)
+        self._values = parameters.declare(self, PARAMETERS, unlocked=lambda: self._gate.writer is None)
+        self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         # Guards publishing: state leaves the executor's, the writer's and the services' threads.
         self._state_lock = threading.Lock()
         self._published_at = 0.0
@@ -70,12 +64,10 @@ class PdmDriverNode(LifecycleNode):
         DegaussAction(self, self._begin_degauss)
         answer = never_silent(self, "hold_mirror", self._on_hold_mirror)
         self.create_service(HoldMirror, "hold_mirror", answer, qos_profile=qos.SERVICE)
-        self._diagnostics = diagnostics.Diagnostics(
-            self, f"{self._values.get('mirror.name', '?')} {self._values.get('mirror.serial', '?')}", self._health
-        )
+        self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(self._values.get("state_period", 0.5), self._publish_state, clock=steady)
-        if self._values.get("autostart", True):
+        self._timer = self.create_timer(self._values["state_period"], self._publish_state, clock=steady)
+        if self._values["autostart"]:
             self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
 
     # Lifecycle
@@ -89,14 +81,16 @@ class PdmDriverNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            if self._problem:
-                raise ValueError(self._problem)
+            self._values.check()
             configuration = build_configuration(self._values)
         except ValueError as error:
             self.get_logger().error(f"configuration refused: {error}")
             self._gate.refusal = Refusal(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {error}")
             self._publish_state()
             return TransitionCallbackReturn.FAILURE
+        self._frame_id = parameters.frame_id(self, self._values["frame_id"])
+        self._diagnostics.hardware_id = f"{self._values['mirror.name']} {self._values['mirror.serial']}"
+        self._timer.timer_period_ns = round(self._values["state_period"] * 1e9)
         self._gate.configuration = configuration
         self._gate.refusal = None
         self._gate.writer = ActuatorWriter(

@@ -36,6 +36,7 @@ class IngestSettings:
         wavelength_tolerance: m.
         orientation: from the instrument's picture to the mirror frame.
         aperture_radius: m; 0 = find the aperture from the valid pixels.
+        mirror_radius: m; no aperture_radius is larger. 0 = not known.
         aperture_centre: (x, y) in m from the oriented map's centre, used with aperture_radius.
         minimum_valid_fraction: valid pixels / pixels inside the aperture.
         remove_piston_tilt: subtract the map's plane from the map that is handed on; the fit keeps piston and tilt.
@@ -47,9 +48,17 @@ class IngestSettings:
     wavelength_tolerance: float = 1e-9
     orientation: Orientation = field(default_factory=Orientation)
     aperture_radius: float = 0.0
+    mirror_radius: float = 0.0
     aperture_centre: tuple[float, float] = (0.0, 0.0)
     minimum_valid_fraction: float = 0.7
     remove_piston_tilt: bool = False
+
+
+def too_large(radius: float, mirror_radius: float) -> str:
+    """That a configured aperture does not fit on the mirror, as a sentence; radii in m, of the mirror 0 = not known."""
+    if not radius > mirror_radius > 0.0:
+        return ""
+    return f"aperture.radius = {radius:g} m: the mirror has a radius of {mirror_radius:g} m (mirror_info)"
 
 
 class Ingest:
@@ -69,7 +78,8 @@ class Ingest:
         Raises:
             MapFileError: the file is not a whole, readable map.
             InsufficientDataError, NoValidPixelsError: too few valid pixels.
-            MapRejectedError: another wavelength than expected, or an aperture in m for a map without a pitch.
+            MapRejectedError: another wavelength than expected, an aperture in m for a map without a pitch, or one that
+                is larger than the mirror.
         """
         with self._turn:
             source = read_map(path, xyz_unit=settings.xyz_unit or None)
@@ -129,6 +139,8 @@ class Ingest:
     def _aperture(valid: NDArray[np.bool_], pitch: float | None, settings: IngestSettings) -> Aperture:
         if settings.aperture_radius == 0:
             return find_aperture(valid)
+        if wrong := too_large(settings.aperture_radius, settings.mirror_radius):
+            raise MapRejectedError(wrong)
         if pitch is None:
             raise MapRejectedError(
                 f"aperture.radius = {settings.aperture_radius:g} m, but the file does not tell its lateral resolution: "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rclpy
@@ -18,10 +18,12 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
-from dm_common.measurement import Measurement
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.worker import ServiceCallError, call, sleep
+
+if TYPE_CHECKING:
+    from dm_common.measurement import Measurement
 
 Floats = NDArray[np.float64]
 

@@ -6,17 +6,36 @@ parameter pages of the documentation.
 
 from __future__ import annotations
 
+import difflib
 import math
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
+from dm_common.errors import Refusal
 from dm_common.mirror import APERTURE_TOLERANCE
+from dm_common.values import Value, real, reals, switch, text, texts, whole, wholes
+
+__all__ = [
+    "REQUIRED",
+    "Parameter",
+    "ParameterError",
+    "Values",
+    "declare",
+    "real",
+    "reals",
+    "switch",
+    "text",
+    "texts",
+    "whole",
+    "wholes",
+]
 
 _TYPES: dict[type | str, RosParameter.Type] = {
     bool: RosParameter.Type.BOOL,
@@ -30,34 +49,12 @@ _TYPES: dict[type | str, RosParameter.Type] = {
 
 #: Marks a parameter that the configuration must give.
 REQUIRED = object()
+#: A name this near to one that is known is a misspelling of it, 0 to 1.
+NEAR = 0.75
 
 
 class ParameterError(ValueError):
     """A parameter is missing or out of its range; the message names it, its value and what is allowed."""
-
-
-@dataclass(frozen=True)
-class Value:
-    """What a parameter may be; made by `real`, `whole`, `text`, `switch`, and for arrays `reals`, `wholes`, `texts`.
-
-    Attributes:
-        kind: bool, int, float, str, "float[]", "int[]" or "str[]".
-        default: the value when none is given; REQUIRED when the configuration must give it; an empty list for arrays.
-        low, high: allowed range of numbers (of each element for arrays), inclusive.
-        unit: SI unit, "" when it has none.
-        choices: allowed strings.
-    """
-
-    kind: type | str
-    default: Any
-    low: float = -math.inf
-    high: float = math.inf
-    unit: str = ""
-    choices: tuple[str, ...] = ()
-
-
-real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, bool))
-reals, wholes, texts = (partial(Value, kind) for kind in ("float[]", "int[]", "str[]"))
 
 
 @dataclass(frozen=True)
@@ -93,42 +90,51 @@ class Parameter:
 
     def allowed(self) -> str:
         """The allowed values as text."""
-        value = self.value
-        if value.choices:
-            return "one of " + ", ".join(value.choices)
-        kind = value.kind if isinstance(value.kind, str) else value.kind.__name__
-        if math.isinf(value.low) and math.isinf(value.high):
-            return f"a {kind}"
-        return f"{kind}, {value.low:g} to {value.high:g}{' ' + value.unit if value.unit else ''}"
+        return self.value.allowed()
 
-    def check(self, given: Any) -> None:
-        """Raise ParameterError when the value `given` is not allowed."""
+    def check(self, given: Any) -> Any:
+        """The value that `given` stands for: where a float is wanted, a whole number counts as one.
+
+        Raises:
+            ParameterError: it is not allowed.
+        """
         value = self.value
-        if value.choices and given not in value.choices:
+        many = isinstance(given, list | tuple | array)
+        items = [
+            float(item) if value.item is float and type(item) is int else item for item in (given if many else [given])
+        ]
+        if many != value.many or any(type(item) is not value.item for item in items):
             raise ParameterError(f"{self.name} = {given!r}: must be {self.allowed()}")
-        numbers = given if value.kind in ("float[]", "int[]") else [given] if value.kind in (int, float) else []
-        for number in numbers:
-            if not (math.isfinite(number) and value.low <= number <= value.high):
-                raise ParameterError(f"{self.name} = {given!r}: must be {self.allowed()}")
+        checked = items if many else items[0]
+        try:
+            value.check(self.name, checked)
+        except Refusal as refusal:
+            raise ParameterError(str(refusal)) from refusal
+        return checked
 
-    def descriptor(self) -> ParameterDescriptor:
+    @property
+    def blank(self) -> Any:
+        """What stands for a value that is missing or wrong: the default, or nothing."""
+        return ("" if self.kind is str else math.nan) if self.default is REQUIRED else self.default
+
+    def as_ros(self, value: Any) -> RosParameter:
+        """The parameter with a value that `check` returned."""
+        return RosParameter(self.name, _TYPES[self.kind], value)
+
+    def descriptor(self, read_only: bool = False) -> ParameterDescriptor:
         value = self.value
         descriptor = ParameterDescriptor(
             name=self.name,
             type=_TYPES[value.kind].value,
             description=self.describe(),
             additional_constraints=self.allowed(),
-            read_only=not self.live,
+            read_only=read_only,
         )
         bounded = not (math.isinf(value.low) and math.isinf(value.high))
         if value.kind is float and bounded:
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=max(value.low, -1e308), to_value=min(value.high, 1e308))
-            ]
+            descriptor.floating_point_range = [FloatingPointRange(from_value=value.low, to_value=value.high)]
         if value.kind is int and bounded:
-            descriptor.integer_range = [
-                IntegerRange(from_value=int(max(value.low, -(2**62))), to_value=int(min(value.high, 2**62)))
-            ]
+            descriptor.integer_range = [IntegerRange(from_value=int(value.low), to_value=int(value.high))]
         return descriptor
 
 
@@ -141,58 +147,150 @@ APERTURE_PARAMETER = Parameter(
 )
 
 
+class Values(dict[str, Any]):
+    """Values of a node's parameters by name, as they are now.
+
+    Attributes:
+        problems: what is wrong by name, unknown names included; the value of such a one is its default.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.problems: dict[str, str] = {}
+
+    def check(self) -> None:
+        """Raise ParameterError naming every parameter that is missing, wrong or unknown."""
+        if self.problems:
+            raise ParameterError("; ".join(self.problems.values()))
+
+
+class _UnknownParameterError(ParameterNotDeclaredException):
+    """Answered by rclpy with its text, which is to name the parameter."""
+
+    def __init__(self, text: str) -> None:
+        Exception.__init__(self, text)
+
+
 def declare(
     node: Node,
     table: Sequence[Parameter],
     on_change: Callable[[Mapping[str, Any]], None] | None = None,
-) -> dict[str, Any]:
+    unlocked: Callable[[], bool] | None = None,
+    check: Callable[[Mapping[str, Any]], None] = lambda changes: None,
+) -> Values:
     """Declare every parameter of `table` on `node` and return their values by name.
 
-    Live parameters are checked on every set; accepted changes are put into the returned dictionary, then given to
-    `on_change`.
+    Every set is checked; accepted changes are put into what is returned, then given to `on_change`.
+
+    Args:
+        unlocked: of a lifecycle node: whether parameters that are not live may change now. With it nothing is raised
+            here: the node calls `Values.check` when it is configured, and may be put right before.
+        check: raises ParameterError for changes that what the node has learnt since denies.
 
     Raises:
-        ParameterError: naming every required parameter that is missing, or the first value out of range.
+        ParameterError: naming every parameter that is missing, wrong or unknown.
     """
-    values: dict[str, Any] = {}
-    missing: list[Parameter] = []
-    for parameter in table:
-        default = _TYPES[parameter.kind] if parameter.default is REQUIRED else parameter.default
-        if isinstance(default, list):  # rclpy cannot tell the type of an empty list
-            default = default or _TYPES[parameter.kind]
-        descriptor = parameter.descriptor()
-        node.declare_parameter(parameter.name, default, descriptor)
-        value = node.get_parameter_or(parameter.name).value
-        if value is None:
-            if parameter.default is REQUIRED:
-                missing.append(parameter)
-                continue
-            value = list(parameter.default)
-        elif isinstance(parameter.kind, str):
-            value = list(value)
-        parameter.check(value)
-        values[parameter.name] = value
-    if missing:
-        names = "; ".join(f"{parameter.name} ({parameter.describe()})" for parameter in missing)
-        raise ParameterError(f"{node.get_name()}: required parameters are missing from the configuration: {names}")
-
     by_name = {parameter.name: parameter for parameter in table}
+    values = _declared(node, by_name)
+    if unlocked is None:
+        values.check()
+        for parameter in table:
+            if not parameter.live:
+                node.set_descriptor(parameter.name, parameter.descriptor(read_only=True))
+
+    def convert(changes: list[RosParameter]) -> list[RosParameter]:
+        """As `Parameter.check` does; what is wrong stays as it is, to be refused."""
+        for change in changes:
+            if not node.has_parameter(change.name):
+                raise _UnknownParameterError(_unknown(change.name, by_name))
+        return [_converted(by_name.get(change.name), change) for change in changes]
 
     def validate(changes: list[RosParameter]) -> SetParametersResult:
         try:
             for change in changes:
-                if change.name in by_name:
-                    by_name[change.name].check(change.value)
+                if (parameter := by_name.get(change.name)) is None:
+                    continue
+                if not (parameter.live or unlocked is None or unlocked()):
+                    raise ParameterError(
+                        f"{change.name} changes only while the node is not configured: `ros2 lifecycle set "
+                        f"{node.get_fully_qualified_name()} cleanup` first"
+                    )
+                check({change.name: parameter.check(change.value)})
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def apply(changes: list[RosParameter]) -> None:
-        accepted = {change.name: change.value for change in changes if change.name in by_name}
+        accepted = {
+            change.name: by_name[change.name].check(change.value) for change in changes if change.name in by_name
+        }
         values.update(accepted)
+        for name in accepted:
+            values.problems.pop(name, None)
         if on_change is not None and accepted:
             on_change(accepted)
 
+    node.add_pre_set_parameters_callback(convert)
     node.add_on_set_parameters_callback(validate)
     node.add_post_set_parameters_callback(apply)
     return values
+
+
+def _declared(node: Node, known: Mapping[str, Parameter]) -> Values:
+    """Declare the parameters of the table with what the configuration gives."""
+    values = Values()
+    # The one place where rclpy keeps what the configuration gives, the names that nobody declares included.
+    given: Mapping[str, RosParameter] = node._parameter_overrides
+    for name, parameter in known.items():
+        value = parameter.default
+        if name in given:
+            value = given[name].value
+            if parameter.value.many and not value:
+                value = []  # ROS makes nothing of an empty list
+        try:
+            if value is REQUIRED:
+                raise ParameterError(f"{name} is required but missing: {parameter.describe().rstrip('.')}")
+            values[name] = parameter.check(value)
+        except ParameterError as error:
+            values[name], values.problems[name] = parameter.blank, str(error)
+        # An array by its type alone would be without a value, which hides all others from `ros2 param dump`.
+        node.declare_parameter(name, _TYPES[parameter.kind], parameter.descriptor(), ignore_override=True)
+        node.set_parameters([parameter.as_ros(values[name])])
+    for name in given:
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            _judge_unknown(node, name, known, values)
+    return values
+
+
+def frame_id(node: Node, configured: str) -> str:
+    """The frame of the mirror: as configured, else `mirror` within the namespace of `node`."""
+    return configured or f"{node.get_namespace()}/mirror".lstrip("/")
+
+
+def _converted(parameter: Parameter | None, change: RosParameter) -> RosParameter:
+    if parameter is None:
+        return change
+    empty = parameter.value.many and change.type_ != RosParameter.Type.NOT_SET and not change.value
+    try:
+        return parameter.as_ros(parameter.check([] if empty else change.value))
+    except ParameterError:
+        return change
+
+
+def _unknown(name: str, known: Mapping[str, Parameter]) -> str:
+    from dm_common.names import unknown_name  # few ever ask
+
+    return str(unknown_name("parameter", name, known))
+
+
+def _judge_unknown(node: Node, name: str, known: Mapping[str, Parameter], values: Values) -> None:
+    """A parameter that is given but not declared: refused where it can only be meant for this node, else a warning.
+
+    A file for all nodes (`/**:`) may well hold what is meant for others.
+    """
+    groups = {parameter.partition(".")[0] for parameter in known if "." in parameter}
+    text = f"{node.get_name()}: {_unknown(name, known)}"
+    if ("." in name and name.partition(".")[0] in groups) or difflib.get_close_matches(name, known, 1, NEAR):
+        values.problems[name] = text
+    else:
+        node.get_logger().warning(text)

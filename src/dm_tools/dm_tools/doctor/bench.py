@@ -108,13 +108,7 @@ def parameters(config: Config) -> Finding | None:
 
 
 def _wrong(parameter: Parameter, value: Any) -> str:
-    """What is wrong with one value, in words; "" = nothing. ROS 2 converts no types, so an integer is no float."""
-    many = isinstance(parameter.kind, str)
-    kind = {"float[]": float, "int[]": int, "str[]": str}[parameter.kind] if many else parameter.kind  # type: ignore[index]
-    items = value if many and isinstance(value, list) else [value]
-    if many != isinstance(value, list) or any(type(item) is not kind for item in items):
-        hint = f"; write {float(value)}" if kind is float and type(value) is int else ""
-        return f"{parameter.name} = {value!r}: must be {parameter.allowed()}{hint}"
+    """What is wrong with one value, as a sentence; "" = nothing."""
     try:
         parameter.check(value)
     except ParameterError as error:

@@ -76,6 +76,7 @@ _DECLARED = (
         "interferometer",
         "interferometer",
         publish=(*_HEALTH, "surface_map", "surface_map_info", "surface_samples", "zernike"),
+        subscribe=("mirror_info",),
         reply=("ingest_file", "measure"),
     ),
     NodeInterface(

@@ -1,0 +1,162 @@
+"""What a parameter, or a field of a request, may be: declared in tables, checked in one place. Knows no ROS."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_common.errors import ErrorCode, Refusal
+
+#: Most characters of a text that may name or describe anything.
+TEXT_MAX = 1000
+
+
+@dataclass(frozen=True)
+class Value:
+    """What a value may be; made by `real`, `whole`, `text`, `switch`, and for arrays `reals`, `wholes`, `texts`.
+
+    Attributes:
+        kind: bool, int, float, str, "float[]", "int[]" or "str[]".
+        default: the value when none is given.
+        low, high: allowed range of numbers (of each element for arrays), inclusive.
+        unit: SI unit, "" when it has none.
+        choices: allowed strings; of numbers, the names of those allowed.
+        zero: what 0 stands for, be it outside the range; "" = nothing in particular.
+        infinite: whether infinity is a value like others; NaN never is.
+        sizes: numbers of elements that an array may have; empty = any up to `size_max`.
+        size_max: most elements of an array.
+    """
+
+    kind: type | str
+    default: Any
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    choices: tuple[str, ...] | Mapping[int, str] = ()
+    zero: str = ""
+    infinite: bool = False
+    sizes: tuple[int, ...] = ()
+    size_max: int = 100_000
+
+    @property
+    def many(self) -> bool:
+        """Whether it is an array."""
+        return isinstance(self.kind, str)
+
+    @property
+    def item(self) -> type:
+        """The type of the value, of an array that of its elements."""
+        return {"float[]": float, "int[]": int, "str[]": str}[self.kind] if isinstance(self.kind, str) else self.kind
+
+    def allowed(self) -> str:
+        """The allowed values as text, the type first."""
+        if isinstance(self.choices, Mapping):
+            return ", ".join(f"{number} ({name})" for number, name in self.choices.items())
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        kind = self.item.__name__ + ("[]" if self.many else "")
+        if math.isinf(self.low) and math.isinf(self.high):
+            return f"a finite {kind}" if self.item is float else f"a {kind}"
+        zero = f", or 0 ({self.zero})" if self.zero else ""
+        return f"{kind}, {self.low:g} to {self.high:g}{' ' + self.unit if self.unit else ''}{zero}"
+
+    def check(self, name: str, given: Any) -> None:
+        """Raise unless `given` may be the value of `name`; the sentence names both, and what is allowed.
+
+        Raises:
+            Refusal: NOT_FINITE, OUT_OF_RANGE (numbers and their choices), INVALID_LENGTH (arrays and texts),
+                UNKNOWN_NAME (choices of texts).
+        """
+        if self.many:
+            self._check_array(name, given)
+        elif self.kind is str:
+            self._check_text(name, given)
+        elif self.kind is not bool:
+            self._check_numbers(name, np.array([given], dtype=float), f"{name} = {given}")
+
+    def _check_array(self, name: str, given: Any) -> None:
+        size = len(given)
+        if size > self.size_max or (self.sizes and size not in self.sizes):
+            sizes = " or ".join(map(str, self.sizes)) or f"at most {self.size_max}"
+            raise Refusal(ErrorCode.INVALID_LENGTH, f"{name} has {size} values: must have {sizes}")
+        if self.item is str:
+            for place, item in enumerate(given):
+                self._check_text(f"{name}[{place}]", item)
+        elif size:
+            self._check_numbers(name, np.asarray(given, dtype=float), "")
+
+    def _check_numbers(self, name: str, given: NDArray[np.float64], subject: str) -> None:
+        """`subject`: name and value as they were given; "" = of an array, the first that is wrong."""
+        if isinstance(self.choices, Mapping):
+            right = np.isin(given, list(self.choices))
+        else:
+            right = (given >= self.low) & (given <= self.high) & (self.infinite | ~np.isinf(given))
+            if self.zero:
+                right |= given == 0.0
+        if right.all():
+            return
+        # NaN and infinity are named before what is merely too large.
+        not_finite = ~right & ~np.isfinite(given)
+        wrong = not_finite if not_finite.any() else ~right
+        first, others = int(wrong.argmax()), int(wrong.sum()) - 1
+        subject = subject or f"{name}[{first}] = {given[first]:g}"
+        raise Refusal(
+            ErrorCode.NOT_FINITE if not_finite.any() else ErrorCode.OUT_OF_RANGE,
+            f"{subject}: must be {self.allowed()}" + (f"; {others} more likewise" if others else ""),
+        )
+
+    def _check_text(self, name: str, given: str) -> None:
+        if len(given) > TEXT_MAX:
+            text = f"{name} has {len(given)} characters: must have at most {TEXT_MAX}"
+            raise Refusal(ErrorCode.INVALID_LENGTH, text)
+        if self.choices and given not in self.choices:
+            raise Refusal(ErrorCode.UNKNOWN_NAME, f"{name} = {given!r}: must be {self.allowed()}")
+
+
+real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, bool))
+reals, wholes, texts = (partial(Value, kind) for kind in ("float[]", "int[]", "str[]"))
+
+
+class Fields:
+    """The fields of a request or goal: a table that all of them are checked by.
+
+    Args:
+        table: {name: what it may be}; dots lead into messages within the message.
+    """
+
+    def __init__(self, table: Mapping[str, Value]) -> None:
+        self._table = dict(table)
+        self._rules = [(name, attrgetter(name), value, *_quick(value)) for name, value in table.items()]
+
+    def within(self, name: str) -> dict[str, Value]:
+        """The table for a message that holds this one as its field `name`."""
+        return {f"{name}.{field}": value for field, value in self._table.items()}
+
+    def check(self, message: Any) -> None:
+        """Raise Refusal naming the first field that may not be as it is, its value and what is allowed."""
+        for name, get, value, low, high in self._rules:
+            given = get(message)
+            # A request on its way to the mirror waits for this.
+            if low <= high:
+                if low <= given <= high:
+                    continue
+            elif value.many and not len(given) and (not value.sizes or 0 in value.sizes):
+                continue
+            value.check(name, given)
+
+
+def _quick(value: Value) -> tuple[float, float]:
+    """Between these a value is right without another look; nothing is where the first is above the second."""
+    if value.kind not in (int, float) or value.choices:
+        return 1.0, 0.0
+    if value.infinite:
+        return value.low, value.high
+    return max(value.low, -sys.float_info.max), min(value.high, sys.float_info.max)
