@@ -18,7 +18,6 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
 
 from calibration_stand_in import StandIn, doubles
-from dm_calibration.procedure.plan import PlanKind
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import ErrorCode
 from dm_common.optics.piston_tilt import remove_piston_tilt
@@ -225,9 +224,9 @@ def test_failures_are_told_and_leave_things_as_they_were(
         assert received[-1].id == kept.id
         return result
 
-    run(pokes(poke_amplitude=float("nan")), ErrorCode.OUT_OF_RANGE, "poke_amplitude = nan: must be 0 to 1")
+    run(pokes(poke_amplitude=float("nan")), ErrorCode.NOT_FINITE, "poke_amplitude = nan: must be float, 0.01 to 1")
     run(pokes(settle_time=-1.0), ErrorCode.OUT_OF_RANGE, "settle_time = -1.0")
-    run(Calibrate.Goal(plan=9), ErrorCode.OUT_OF_RANGE, f"plan = 9: must be 0 to {max(PlanKind)}")
+    run(Calibrate.Goal(plan=9), ErrorCode.OUT_OF_RANGE, "plan = 9: must be 0 (FULL), 1 (POKES)")
     unknown = Calibrate.Goal(plan=Calibrate.Goal.PLAN_SURFACES, surfaces=["p60"])
     run(unknown, ErrorCode.UNKNOWN_NAME, "surface 'p60' is unknown; did you mean")
     all_pokes = {f"poke{mark}{k:02d}" for mark in "+-" for k in range(1, 20)}

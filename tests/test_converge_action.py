@@ -107,10 +107,10 @@ def test_cancelling_leaves_the_last_command(observer: Observer, host: Host, benc
     ("fields", "code", "words"),
     [
         ({"method": "SVD"}, ErrorCode.UNKNOWN_NAME, "method = 'SVD': unknown; must be one of pseudo_inverse"),
-        ({"tolerance": -1.0}, ErrorCode.INVALID_ARGUMENT, "tolerance = -1.0 m: must be 0"),
-        ({"tolerance": float("nan")}, ErrorCode.INVALID_ARGUMENT, "tolerance = nan"),
-        ({"max_maps": 1000}, ErrorCode.INVALID_ARGUMENT, "max_maps = 1000: must be 0"),
-        ({"curvature": 200.0}, ErrorCode.INVALID_ARGUMENT, "must be below 1"),
+        ({"tolerance": -1.0}, ErrorCode.OUT_OF_RANGE, "tolerance = -1.0: must be float, 0 to 0.001 m"),
+        ({"tolerance": float("nan")}, ErrorCode.NOT_FINITE, "tolerance = nan"),
+        ({"max_maps": 1000}, ErrorCode.OUT_OF_RANGE, "max_maps = 1000: must be"),
+        ({"curvature": 200.0}, ErrorCode.OUT_OF_RANGE, "must be below 1"),
     ],
 )
 def test_bad_goals_are_refused_and_nothing_moves(

@@ -141,14 +141,14 @@ def test_recipes_beyond_the_tolerance_are_stored_and_named(
 @pytest.mark.parametrize(
     ("fields", "code", "words"),
     [
-        ({"curvatures": [0.01, float("nan")]}, ErrorCode.NOT_FINITE, "curvatures[1] = nan: must be a finite number"),
+        ({"curvatures": [0.01, float("nan")]}, ErrorCode.NOT_FINITE, "curvatures[1] = nan: must be a finite float"),
         ({"curvatures": [0.01, 0.01]}, ErrorCode.INVALID_ARGUMENT, "+0.0100 1/m is there twice"),
         ({"curvatures": [0.0, 5.0]}, ErrorCode.UNREACHABLE, "curvature = +5.0000 1/m"),
-        ({"curvatures": []}, ErrorCode.INVALID_ARGUMENT, "curvatures: empty"),
-        ({"curvatures": [0.0], "max_maps": 3}, ErrorCode.INVALID_ARGUMENT, "maps_max = 3: must be at least 4"),
-        ({"curvatures": [0.0], "tolerance": -1.0}, ErrorCode.INVALID_ARGUMENT, "tolerance = -1.0 m"),
-        ({"curvatures": [0.0], "max_maps": 101}, ErrorCode.INVALID_ARGUMENT, "max_maps = 101"),
-        ({"curvatures": [0.0], "conic_constant": float("inf")}, ErrorCode.INVALID_ARGUMENT, "conic_constant = inf"),
+        ({"curvatures": []}, ErrorCode.INVALID_LENGTH, "curvatures has 0 values: must have 1 to 1000"),
+        ({"curvatures": [0.0], "max_maps": 3}, ErrorCode.OUT_OF_RANGE, "max_maps = 3: must be int, 4 to 100"),
+        ({"curvatures": [0.0], "tolerance": -1.0}, ErrorCode.OUT_OF_RANGE, "tolerance = -1.0: must be"),
+        ({"curvatures": [0.0], "max_maps": 101}, ErrorCode.OUT_OF_RANGE, "max_maps = 101"),
+        ({"curvatures": [0.0], "conic_constant": float("inf")}, ErrorCode.NOT_FINITE, "conic_constant = inf"),
     ],
 )
 def test_bad_goals_are_refused_and_nothing_moves(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
-from dm_common.errors import Cancelled
+from dm_common.errors import Cancelled, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.limits import Limits
@@ -211,7 +211,7 @@ def test_cancelling_stops_between_two_maps() -> None:
 @pytest.mark.parametrize(
     ("curvatures", "error", "words"),
     [
-        ((0.0, float("nan")), RecipeError, r"curvatures\[1\] = nan: must be a finite number"),
+        ((0.0, float("nan")), Refusal, "curvature = nan: must be a finite float"),
         ((0.01, 0.02, 0.01), RecipeError, r"curvatures: \+0\.0100 1/m is there twice"),
         ((0.0, 5.0), UnreachableError, r"curvature = \+5\.0000 1/m: the limits .* reachable: -0"),
     ],

@@ -138,9 +138,9 @@ def test_fit_and_predict(node: NodeProcess, observer: Observer) -> None:
     for fields, code, words in (
         ({"method": "AZx"}, ErrorCode.UNKNOWN_NAME, "AZreg"),
         ({"calibration": "nothing"}, ErrorCode.UNKNOWN_NAME, "nothing"),
-        ({"p_enter": 0.2, "p_remove": 0.1}, ErrorCode.INVALID_ARGUMENT, "p_remove = 0.1: must be at least p_enter"),
-        ({"p_enter": float("nan")}, ErrorCode.INVALID_ARGUMENT, "p_enter = nan"),
-        ({"p_remove": -0.1}, ErrorCode.INVALID_ARGUMENT, "p_remove = -0.1: must be at least p_enter"),
+        ({"p_enter": 0.2, "p_remove": 0.1}, ErrorCode.OUT_OF_RANGE, "p_remove = 0.1: must be at least p_enter"),
+        ({"p_enter": float("nan")}, ErrorCode.NOT_FINITE, "p_enter = nan"),
+        ({"p_remove": -0.1}, ErrorCode.OUT_OF_RANGE, "p_remove = -0.1: must be float, 0 to 1"),
     ):
         wrong = fit(**fields)
         assert wrong.error_code == code and words in wrong.message, wrong.message
@@ -149,9 +149,9 @@ def test_fit_and_predict(node: NodeProcess, observer: Observer) -> None:
     outside = signals.copy()
     outside[4] = 1.01
     for bad, code, words in (
-        (signals[:-1], ErrorCode.INVALID_LENGTH, "36 values, the calibrated mirror needs 37"),
-        (np.where(np.arange(37) == 2, np.nan, signals), ErrorCode.NOT_FINITE, "number 3"),
-        (outside, ErrorCode.OUT_OF_RANGE, "number 5 is 1.01, must be within -1 to 1"),
+        (signals[:-1], ErrorCode.INVALID_LENGTH, "signals has 36 values: must have 37"),
+        (np.where(np.arange(37) == 2, np.nan, signals), ErrorCode.NOT_FINITE, "signals[2] = nan"),
+        (outside, ErrorCode.OUT_OF_RANGE, "signals[4] = 1.01: must be float[], -1 to 1"),
     ):
         wrong = predict(bad)
         assert wrong.error_code == code and words in wrong.message, wrong.message

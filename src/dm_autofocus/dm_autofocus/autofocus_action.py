@@ -19,6 +19,7 @@ from dm_autofocus.sharpness import Region, check_region
 from dm_autofocus.tracking import TrackConfig, Tracker
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import WorkerActionServer
+from dm_common.values import Fields, real, reals
 
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
 MARGIN = 0.002
@@ -38,6 +39,11 @@ def tolerance_of(values: Mapping[str, Any], capabilities: Capabilities) -> float
     """Finest step of curvature [1/m]: as configured, else the depth of focus of the calibrated aperture."""
     configured = float(values["search.tolerance"])
     return configured or depth_of_focus(capabilities.aperture_radius, values["optics.wavelength"])
+
+
+AUTOFOCUS = Fields(
+    {"region": reals([], 0.0, 1.0, sizes=(0, 4)), "curvature_min": real(0.0), "curvature_max": real(0.0)}
+)
 
 
 class AutofocusAction:
@@ -63,7 +69,9 @@ class AutofocusAction:
         self._values = values
         self._optics = optics
         self._publish = publish
-        self._server = WorkerActionServer(node, Autofocus, "autofocus", self._run, exclusive="preempt")
+        self._server = WorkerActionServer(
+            node, Autofocus, "autofocus", self._run, exclusive="preempt", fields=AUTOFOCUS
+        )
 
     @property
     def busy(self) -> bool:
@@ -121,7 +129,7 @@ class AutofocusAction:
                 values["search.least_contrast"],
             ), region
         except ValueError as error:
-            raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
+            raise Refusal(ErrorCode.OUT_OF_RANGE, str(error)) from error
 
     def _search(self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region) -> tuple[Peak, SearchConfig]:
         """Search from beginning to end and stand on the peak; without one, where the mirror stood before.

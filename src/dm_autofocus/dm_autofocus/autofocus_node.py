@@ -22,6 +22,11 @@ from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import ServiceCallError, WorkerService, call, never_silent
+from dm_common.values import Fields, real, without_figures
+
+SET_FOCUS_DISTANCE = Fields(
+    {"distance": real(0.0, 0.0, math.inf, "m", infinite=True), "dioptre": real(0.0, unit="1/m")}
+)
 
 
 class AutofocusNode(Node):
@@ -35,7 +40,7 @@ class AutofocusNode(Node):
         self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.STATE)
         self._set_focus = self.create_client(SetFocus, "set_focus")
         self._action = AutofocusAction(self, self._probe, self._values, self._optics, self._publish)
-        WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance)
+        WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance, SET_FOCUS_DISTANCE)
         answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
         self.create_service(GetFocusRange, "get_focus_range", answer)
         self._watched: Any = None
@@ -50,6 +55,7 @@ class AutofocusNode(Node):
     def _on_set_focus_distance(
         self, request: SetFocusDistance.Request, response: SetFocusDistance.Response
     ) -> SetFocusDistance.Response:
+        without_figures(response)  # until they are known
         if request.distance != 0 and request.dioptre != 0:
             raise Refusal(
                 ErrorCode.INVALID_ARGUMENT,

@@ -139,15 +139,7 @@ class CalibrateAction:
         return run
 
     def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> tuple[Plan, PlanOptions]:
-        """The plan of a goal and what it follows from, after its fields were checked."""
-        for name, value, high, unit in (
-            ("plan", goal.plan, max(PlanKind), ""),
-            ("poke_amplitude", goal.poke_amplitude, 1, ", 0 = configured"),
-            ("settle_time", goal.settle_time, 600, " s"),
-            ("maps_per_state", goal.maps_per_state, 100, ""),
-        ):
-            if not 0 <= value <= high:  # also refuses NaN
-                raise Refusal(ErrorCode.OUT_OF_RANGE, f"{name} = {value}: must be 0 to {high}{unit}")
+        """The plan of a goal and what it follows from."""
         options = PlanOptions(
             poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],
             reference_every=goal.reference_every or self._values["reference_every"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable
@@ -156,17 +155,12 @@ class CalibrationManager:
         """Keep recipes with the calibration in use, which they were built on; those of the same shape are replaced.
 
         Raises:
-            Refusal: another calibration is in use, recipes of a mirror with another number of actuators, or
-                numbers that are not finite.
+            Refusal: another calibration is in use, or recipes of a mirror with another number of actuators.
             RecipeError: no recipes, or made from another condition.
             StoreError: see :meth:`change`.
         """
         if not book.recipes:
             raise RecipeError("recipes: must hold at least one")
-        for recipe in book.recipes:
-            for name in ("curvature", "conic_constant", "max_zernike", "rms"):
-                if not math.isfinite(value := getattr(recipe, name)):
-                    raise Refusal(ErrorCode.NOT_FINITE, f"recipes: {name} = {value}: must be a finite number")
 
         def changed(calibration: Calibration) -> Calibration:
             count, has = len(book.recipes[0].effective), calibration.fit.actuators

@@ -22,6 +22,7 @@ from dm_msgs.srv import (
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from dm_calibration import requests
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_action import CalibrateAction
 from dm_calibration.calibration_manager import CalibrationManager
@@ -61,14 +62,17 @@ class CalibrationNode(Node):
         self._bench_services = BenchServices(self, self._values)
         self._driver_facts: dict[str, Any] = {}
         action = CalibrateAction(self, self._values, self._bench_services, self._manager, lambda: self._driver_facts)
-        self._server = WorkerActionServer(self, Calibrate, "calibrate", action.run, exclusive="refuse")
+        self._server = WorkerActionServer(
+            self, Calibrate, "calibrate", action.run, exclusive="refuse", fields=requests.CALIBRATE
+        )
         self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
-        WorkerService(self, LoadCalibration, "load_calibration", self._on_load)
-        WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit)
-        WorkerService(self, StoreRecipes, "store_recipes", self._on_store_recipes)
+        WorkerService(self, LoadCalibration, "load_calibration", self._on_load, requests.LOAD_CALIBRATION)
+        fields = requests.FIT_INFLUENCE_FUNCTION
+        WorkerService(self, FitInfluenceFunction, "fit_influence_function", self._on_fit, fields)
+        WorkerService(self, StoreRecipes, "store_recipes", self._on_store_recipes, requests.STORE_RECIPES)
         prediction = ErrorPrediction(self._manager, self._values)
-        WorkerService(self, FitRegression, "fit_regression", prediction.fit)
+        WorkerService(self, FitRegression, "fit_regression", prediction.fit, requests.FIT_REGRESSION)
         WorkerService(self, PredictError, "predict_error", prediction.predict)
         self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -140,6 +144,7 @@ class CalibrationNode(Node):
             response.stamps.append(time_message(calibration.created_ns if calibration else 0))
             response.held_out_rms.append(calibration.fit.held_out_rms if calibration else float("nan"))
             response.remarks.append(remark)
+        response.message = f"{len(response.ids)} calibrations in {self._manager.store.folder}"
         return response
 
     def _on_load(self, request: Any, response: Any) -> Any:
@@ -167,6 +172,8 @@ class CalibrationNode(Node):
         return response
 
     def _on_store_recipes(self, request: Any, response: Any) -> Any:
+        for recipe in request.recipes.recipes:
+            requests.RECIPE.check(recipe)
         book = recipe_book_from(request.recipes)
         calibration = self._manager.add_recipes(request.calibration_id, book)
         response.message = (

@@ -28,6 +28,7 @@ from dm_calibration.acquisition.acquisition import Acquisition
 from dm_calibration.acquisition.ingest import Ingest, too_large
 from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
 from dm_calibration.map_files import MapFileError, SurfaceMap
+from dm_calibration.requests import INGEST_FILE, MEASURE
 from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.ros import diagnostics, parameters, qos
@@ -58,8 +59,8 @@ class InterferometerNode(LifecycleNode):
         self._diagnostics = diagnostics.Diagnostics(self, "interferometer", self._health)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self._worker_services = [
-            WorkerService(self, IngestFile, "ingest_file", self._on_ingest_file),
-            WorkerService(self, Measure, "measure", self._on_measure),
+            WorkerService(self, IngestFile, "ingest_file", self._on_ingest_file, INGEST_FILE),
+            WorkerService(self, Measure, "measure", self._on_measure, MEASURE),
         ]
         if self._values["autostart"]:
             steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -155,8 +156,6 @@ class InterferometerNode(LifecycleNode):
         if not self._active or acquisition is None:
             raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not active: activate it first")
         timeout_s = request.timeout or self._values["measure_timeout"]
-        if not 0 < timeout_s < 86400:
-            raise Refusal(ErrorCode.OUT_OF_RANGE, f"timeout = {request.timeout} s: must be 0 (configured) to 86400 s")
         with self._counting_refusals():
             acquired = acquisition.acquire(timeout_s)
         taken = acquired.taken_ns
@@ -192,6 +191,9 @@ class InterferometerNode(LifecycleNode):
             self._publish(surface, measured, header)
         self._log_taken(surface, measured, what)
         response.error_code = ErrorCode.OK
+        response.message = (
+            f"{what}: {Path(surface.file).name}, rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
+        )
         response.info = messages.info_message(surface, measured, header)
         response.zernike = messages.zernike_message(measured, header)
         response.samples = messages.samples_message(measured, header)

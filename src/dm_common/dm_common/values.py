@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
@@ -31,8 +31,7 @@ class Value:
         choices: allowed strings; of numbers, the names of those allowed.
         zero: what 0 stands for, be it outside the range; "" = nothing in particular.
         infinite: whether infinity is a value like others; NaN never is.
-        sizes: numbers of elements that an array may have; empty = any up to `size_max`.
-        size_max: most elements of an array.
+        sizes: numbers of elements that an array may have.
     """
 
     kind: type | str
@@ -43,8 +42,7 @@ class Value:
     choices: tuple[str, ...] | Mapping[int, str] = ()
     zero: str = ""
     infinite: bool = False
-    sizes: tuple[int, ...] = ()
-    size_max: int = 100_000
+    sizes: Sequence[int] = range(100_001)
 
     @property
     def many(self) -> bool:
@@ -84,8 +82,10 @@ class Value:
 
     def _check_array(self, name: str, given: Any) -> None:
         size = len(given)
-        if size > self.size_max or (self.sizes and size not in self.sizes):
-            sizes = " or ".join(map(str, self.sizes)) or f"at most {self.size_max}"
+        if size not in self.sizes:
+            between = " to " if isinstance(self.sizes, range) else " or "
+            ends = (self.sizes[0], self.sizes[-1]) if isinstance(self.sizes, range) else self.sizes
+            sizes = between.join(map(str, ends))
             raise Refusal(ErrorCode.INVALID_LENGTH, f"{name} has {size} values: must have {sizes}")
         if self.item is str:
             for place, item in enumerate(given):
@@ -134,6 +134,7 @@ class Fields:
 
     def __init__(self, table: Mapping[str, Value]) -> None:
         self._table = dict(table)
+        # Each with the range in which a number is right without another look.
         self._rules = [(name, attrgetter(name), value, *_quick(value)) for name, value in table.items()]
 
     def within(self, name: str) -> dict[str, Value]:
@@ -148,7 +149,7 @@ class Fields:
             if low <= high:
                 if low <= given <= high:
                     continue
-            elif value.many and not len(given) and (not value.sizes or 0 in value.sizes):
+            elif value.many and not len(given) and 0 in value.sizes:
                 continue
             value.check(name, given)
 
@@ -160,3 +161,13 @@ def _quick(value: Value) -> tuple[float, float]:
     if value.infinite:
         return value.low, value.high
     return max(value.low, -sys.float_info.max), min(value.high, sys.float_info.max)
+
+
+def without_figures(message: Any) -> Any:
+    """`message` with NaN for all its numbers, also within: of what was refused nothing is known, and 0 is a value."""
+    for name, kind in message.get_fields_and_field_types().items():
+        if kind == "double":
+            setattr(message, name, math.nan)
+        elif "/" in kind and not kind.startswith("sequence"):
+            without_figures(getattr(message, name))
+    return message

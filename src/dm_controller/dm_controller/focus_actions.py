@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from dm_msgs.action import BuildRecipes, Converge, MoveFocus
@@ -17,8 +18,9 @@ from rclpy.node import Node
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.parameters import Parameter, real, whole
+from dm_common.ros.parameters import Parameter
 from dm_common.ros.worker import WorkerActionServer, sleep
+from dm_common.values import Fields, real, reals, text, whole
 from dm_controller.focus_types import Order
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget, Request
@@ -56,6 +58,25 @@ LOOP_PARAMETERS = (
     Parameter("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed", live=True),
     Parameter("recipes.degauss_steps", whole(100, 1, 10000), "half-swings of the degauss that recipes begin with"),
     Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
+)
+
+
+#: What the fields of goals may be; what they request of the mirror is judged with the mirror at hand.
+_TOLERANCE, _MAPS = real(0.0, 0.0, 1e-3, "m", zero="as configured"), whole(0, 1, 100, zero="as configured")
+CONVERGE = Fields({"method": text(""), "tolerance": _TOLERANCE, "max_maps": _MAPS})
+BUILD_RECIPES = Fields(
+    {
+        "curvatures": reals([], sizes=range(1, 1001)),
+        "conic_constant": real(0.0),
+        "tolerance": _TOLERANCE,
+        "max_maps": whole(0, 4, 100, zero="as configured"),
+    }
+)
+MOVE_FOCUS = Fields(
+    {
+        "tolerance": replace(_TOLERANCE, zero="any inside the reachable range"),
+        "settle_time": real(0.0, 0.0, 3600.0, "s", zero="as configured"),
+    }
 )
 
 
@@ -164,8 +185,8 @@ def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[
         return RecipeRun(node, values, bench, store).run(handle)
 
     return (
-        WorkerActionServer(node, Converge, "converge", converge),
-        WorkerActionServer(node, BuildRecipes, "build_recipes", build_recipes),
+        WorkerActionServer(node, Converge, "converge", converge, fields=CONVERGE),
+        WorkerActionServer(node, BuildRecipes, "build_recipes", build_recipes, fields=BUILD_RECIPES),
     )
 
 
@@ -183,7 +204,9 @@ class MoveFocusAction:
 
     def __init__(self, node: FocusControllerNode, settle_time: float) -> None:
         self._node, self._settle_time = node, settle_time
-        self._server = WorkerActionServer(node, MoveFocus, "move_focus", self._run, exclusive="preempt")
+        self._server = WorkerActionServer(
+            node, MoveFocus, "move_focus", self._run, exclusive="preempt", fields=MOVE_FOCUS
+        )
 
     def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
         started, result = time.monotonic(), MoveFocus.Result()

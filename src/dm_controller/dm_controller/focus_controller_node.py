@@ -22,7 +22,7 @@ from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
-from dm_common.ros.parameters import declare
+from dm_common.ros.parameters import declare, frame_id
 from dm_common.ros.worker import never_silent
 from dm_controller.degauss_client import DegaussClient
 from dm_controller.focus_actions import LoopHost, MoveFocusAction, serve_loops
@@ -81,6 +81,10 @@ class FocusControllerNode(Node):
         for kind, name, answer in ((SetFocus, "set_focus", self._on_set_focus), (Flatten, "flatten", self._on_flatten)):
             self.create_service(kind, name, never_silent(self, name, answer), qos_profile=qos.SERVICE)
         self._publish_capabilities()
+
+    @property
+    def _frame_id(self) -> str:
+        return self._mirror.header.frame_id if self._mirror is not None else frame_id(self, "")
 
     @contextmanager
     def controller(self) -> Iterator[tuple[FocusController, Moment]]:
@@ -178,11 +182,15 @@ class FocusControllerNode(Node):
     def state(self, outcome: Outcome) -> FocusState:
         """What came of a request."""
         self._forecast.use(self._controller.active, self._values["reachable_tolerance"])
-        return state_message(outcome, self._values, self._forecast.share)
+        state = state_message(outcome, self._values, self._forecast.share)
+        state.header.frame_id = self._frame_id
+        return state
 
     def _publish_capabilities(self) -> None:
         now_ns = int(self.get_clock().now().nanoseconds)
-        self._capabilities.publish(capabilities_message(self._controller, self._mirror, self._values, now_ns))
+        message = capabilities_message(self._controller, self._mirror, self._values, now_ns)
+        message.header.frame_id = self._frame_id
+        self._capabilities.publish(message)
 
     def _health(self) -> diagnostics.Health:
         with self.controller() as (controller, now):

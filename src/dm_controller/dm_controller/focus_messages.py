@@ -12,6 +12,7 @@ from dm_msgs.msg import ActuatorState, Capabilities, FocusState, MirrorInfo
 from dm_common.errors import Refusal
 from dm_common.messages import applied_from, doubles, stamp_ns, time_message
 from dm_common.ros import diagnostics
+from dm_common.values import without_figures
 from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_types import DriverReport, Moment, Outcome
@@ -46,13 +47,13 @@ def state_message(outcome: Outcome, values: Mapping[str, Any], share: Hysteresis
         share: knows of the actuators' hysteresis where the calibration does not; None = nothing does.
     """
     request, move, active, refusal = outcome.request, outcome.move, outcome.active, outcome.refusal
-    state = FocusState(
-        curvature=request.curvature,
-        power=2 * request.curvature,
-        conic_constant=request.conic_constant,
-        mode=request.mode,
-        applied=outcome.applied,
+    state = without_figures(FocusState()) if move is None else FocusState()
+    state.curvature, state.power, state.conic_constant = (
+        request.curvature,
+        2 * request.curvature,
+        request.conic_constant,
     )
+    state.mode, state.applied = request.mode, outcome.applied
     state.header.stamp = time_message(outcome.stamp_ns)
     if move is not None and active is not None:
         plan = move.plan
@@ -73,10 +74,12 @@ def state_message(outcome: Outcome, values: Mapping[str, Any], share: Hysteresis
         state.history_known = move.known
         state.mode = move.mode
         state.creep_held = outcome.creep_held
-        state.message = remarks(active, outcome.unknown, values, outcome.stamp_ns)
-        if outcome.pending:
-            first = f"the mirror is degaussed first; the shape stands in about {move.duration:.1f} s"
-            state.message = "; ".join(filter(None, (first, state.message)))
+        first = "the mirror is degaussed first; " if outcome.pending else ""
+        text = (
+            f"{first}{request.curvature:+.4f} 1/m stands in about {move.duration:.2g} s, right to "
+            f"{plan.max_zernike_upper * 1e9:.1f} nm (largest coefficient, 95 %)"
+        )
+        state.message = "; ".join(filter(None, (text, remarks(active, outcome.unknown, values, outcome.stamp_ns))))
     if refusal is not None:
         state.error_code, state.message = refusal.error_code, str(refusal)
     return state

@@ -252,10 +252,10 @@ def test_a_dry_run_changes_nothing(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("fields", "code", "text"),
     [
-        ({"curvature": float("nan")}, ErrorCode.INVALID_ARGUMENT, "curvature = nan"),
+        ({"curvature": float("nan")}, ErrorCode.NOT_FINITE, "curvature = nan"),
         ({"curvature": 9.0}, ErrorCode.UNREACHABLE, "reachable:"),
-        ({"mode": 7}, ErrorCode.INVALID_ARGUMENT, "mode = 7"),
-        ({"time_budget": -1.0}, ErrorCode.INVALID_ARGUMENT, "time_budget = -1.0 s"),
+        ({"mode": 7}, ErrorCode.OUT_OF_RANGE, "mode = 7: must be 0 (AUTO), 1 (DIRECT)"),
+        ({"time_budget": -1.0}, ErrorCode.OUT_OF_RANGE, "time_budget = -1.0: must be"),
         ({"stamp_ns": 1}, ErrorCode.STALE, "header.stamp"),
         ({"mode": CONDITIONED}, ErrorCode.NOT_SUPPORTED, "no recipes"),
     ],

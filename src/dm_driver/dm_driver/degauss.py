@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.values import real, whole
 from dm_driver.moves import Kind, Move
 from dm_driver.safety_limiter import DriverLimits, Shape
 
@@ -49,14 +50,12 @@ def degauss_move(
         duration_max: s, longest time that it may take.
 
     Raises:
-        Refusal: OUT_OF_RANGE.
+        Refusal: NOT_FINITE or OUT_OF_RANGE.
     """
     middle = limits.middle
     largest = limits.half_range
-    if not 0.0 <= amplitude <= largest:
-        raise Refusal(ErrorCode.OUT_OF_RANGE, f"amplitude = {amplitude:g}: must be 0 to {largest:g}")
-    if not 1 <= steps <= STEPS_MAX:
-        raise Refusal(ErrorCode.OUT_OF_RANGE, f"steps = {steps}: must be 1 to {STEPS_MAX}")
+    real(0.0, 0.0, largest).check("amplitude", amplitude)
+    whole(0, 1, STEPS_MAX).check("steps", steps)
     swing = amplitude or largest
     # The swings add up to steps * swing; the ways there and to the end are no longer than the whole range each.
     duration = (steps * swing + 4.0 * largest) / limits.slew_rate

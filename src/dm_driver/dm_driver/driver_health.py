@@ -40,5 +40,5 @@ def driver_health(writer: ActuatorWriter | None, refusal: Refusal | None, refuse
     if not state.enabled:
         return Health(WARN, "inactive: commands are refused", values)
     if not state.history_known:
-        return Health(OK, "active; hysteresis history unknown (a degauss makes it known)", values)
+        return Health(WARN, "active; the actuators' history is not known: a degauss makes it known", values)
     return Health(OK, "active", values)

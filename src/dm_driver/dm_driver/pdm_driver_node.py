@@ -197,6 +197,8 @@ class PdmDriverNode(LifecycleNode):
             return None if request.dry_run else writer.command(target)
 
         result = self._gate.attempt("set_signals", request, carry_out, dry_run=request.dry_run)
+        will = "would take" if request.dry_run else "took" if request.wait else "takes"
+        response.message = f"the signals keep every limit; the ramp {will} {response.ramp_time:.3f} s"
         self._answer(response, result, wait=request.wait)
         writer = self._gate.writer
         if writer is not None and (applied := writer.state().applied) is not None:
@@ -223,8 +225,12 @@ class PdmDriverNode(LifecycleNode):
         begun = time.monotonic()
         goal = Degauss.Goal(amplitude=request.amplitude, steps=request.steps, end_signals=request.end_signals)
         move = self._begin_degauss(goal)
-        self._answer(response, move if isinstance(move, Refusal) else move[1], wait=True)
+        result = move if isinstance(move, Refusal) else move[1]
+        if isinstance(result, Move):
+            result.wait()
         response.duration = time.monotonic() - begun
+        response.message = f"degaussed in {response.duration:.1f} s"
+        self._answer(response, result, wait=True)
         return response
 
     def _on_hold_mirror(self, request: Any, response: Any) -> Any:

@@ -16,6 +16,7 @@ from dm_calibration.regression.predictor import ErrorPredictor, fit_predictor
 from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions
 from dm_common.errors import ErrorCode, Refusal, error_code
 from dm_common.messages import doubles
+from dm_common.values import reals
 
 
 class ErrorPrediction:
@@ -61,7 +62,10 @@ class ErrorPrediction:
             Refusal, ValueError: see :mod:`~dm_common.errors`.
         """
         calibration = self._in_use()
-        signals = self._checked(np.array(request.signals, dtype=np.float64), calibration)
+        mirror = self._manager.mirror
+        low, high = (mirror.limits.low, mirror.limits.high) if mirror else (-1.0, 1.0)
+        signals = np.array(request.signals, dtype=np.float64)
+        reals([], low, high, sizes=(calibration.fit.actuators,)).check("signals", signals)
         with self._lock:
             if self._predictor is None or self._of != calibration.id:
                 self._predictor = self._fitted(calibration, calibration.fit.method, None)
@@ -88,31 +92,14 @@ class ErrorPrediction:
         except ValueError as error:
             raise Refusal(error_code(error), f"calibration {stored.id}: {error}") from error
 
-    def _checked(self, signals: np.ndarray, calibration: Calibration) -> np.ndarray:
-        actuators = calibration.fit.actuators
-        if signals.size != actuators:
-            raise Refusal(
-                ErrorCode.INVALID_LENGTH, f"signals: {signals.size} values, the calibrated mirror needs {actuators}"
-            )
-        if not np.isfinite(signals).all():
-            raise Refusal(
-                ErrorCode.NOT_FINITE, f"signals: number {int(np.argmin(np.isfinite(signals))) + 1} is not finite"
-            )
-        mirror = self._manager.mirror
-        low, high = (mirror.limits.low, mirror.limits.high) if mirror else (-1.0, 1.0)
-        worst = int(np.argmax(np.maximum(low - signals, signals - high)))
-        if not low <= signals[worst] <= high:
-            raise Refusal(
-                ErrorCode.OUT_OF_RANGE,
-                f"signals: number {worst + 1} is {signals[worst]:g}, must be within {low:g} to {high:g}",
-            )
-        return signals
-
 
 def _selection(p_enter: float, p_remove: float) -> SelectionOptions | None:
-    """Thresholds of a request, 0 = default; None when both are."""
+    """Thresholds of a request, 0 = default; None when both are. Raises Refusal when they contradict each other."""
     if p_enter == 0.0 and p_remove == 0.0:
         return None
     # A p_remove that is refused must be named itself, not as the default that follows from it.
     enter = p_enter or (min(P_ENTER, p_remove) if p_remove > 0.0 else P_ENTER)
-    return SelectionOptions(enter, p_remove or max(P_REMOVE, enter))
+    try:
+        return SelectionOptions(enter, p_remove or max(P_REMOVE, enter))
+    except ValueError as error:
+        raise Refusal(ErrorCode.OUT_OF_RANGE, str(error)) from error

@@ -85,7 +85,7 @@ class Parameter:
         """Description with unit and range, as `ros2 param describe` shows it."""
         described = self.description + (f" [{self.value.unit}]" if self.value.unit else "")
         if self.value.choices:
-            described += f" One of: {', '.join(self.value.choices)}."
+            described += f" One of: {', '.join(map(str, self.value.choices))}."
         return described
 
     def allowed(self) -> str:

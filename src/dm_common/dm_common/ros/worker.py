@@ -23,11 +23,15 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.service import Service
 
-from dm_common.errors import EXPECTED, ErrorCode, error_code
+from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.ros import qos
+from dm_common.values import Fields, without_figures
 
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
 RESULT_TIMEOUT_S = 10
+
+#: Of requests that hold nothing that could be wrong, or are checked by whoever takes them.
+NO_FIELDS = Fields({})
 
 #: Time that discovery may take on a busy machine from one side to the other.
 DISCOVERY_S = 0.5
@@ -46,11 +50,14 @@ def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
         answer.message = f"{type(error).__name__}: {error}"
 
 
-def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+def never_silent(
+    node: Node, name: str, callback: Callable[[Any, Any], Any], fields: Fields = NO_FIELDS
+) -> Callable[[Any, Any], Any]:
     """`callback(request, response) -> response` of service `name` that answers with an error code instead of raising.
 
     A service whose callback raises sends no answer: whoever called it waits until its patience ends. What is EXPECTED
-    is answered with its own code and logged as a warning, once however often it repeats.
+    is answered with its own code and logged as a warning, once however often it repeats; requests whose `fields` may
+    not be as they are never come to `callback`.
     """
     refused = ""
 
@@ -58,6 +65,11 @@ def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> 
         nonlocal refused
         before, refused = refused, ""
         try:
+            try:
+                fields.check(request)
+            except Refusal:
+                without_figures(response)
+                raise
             return callback(request, response)
         except EXPECTED as error:
             refused = str(error)
@@ -74,12 +86,20 @@ def never_silent(node: Node, name: str, callback: Callable[[Any, Any], Any]) -> 
 class WorkerService:
     """A service whose callback runs in a worker thread.
 
-    `callback(request, response) -> response` may block. Requests of one service are served one after another, in order.
+    `callback(request, response) -> response` may block. Requests of one service are served one after another, in order;
+    `fields` are checked first.
     """
 
-    def __init__(self, node: Node, srv_type: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        srv_type: Any,
+        name: str,
+        callback: Callable[[Any, Any], Any],
+        fields: Fields = NO_FIELDS,
+    ) -> None:
         self._node = node
-        self._callback = never_silent(node, name, callback)
+        self._callback = never_silent(node, name, callback, fields)
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name.replace("/", "_"))
         self._service: Service = node.create_service(
             srv_type, name, lambda request, response: (request, response), qos_profile=qos.SERVICE
@@ -112,6 +132,7 @@ class WorkerActionServer(ActionServer):
     Args:
         exclusive: "refuse" refuses a goal while another runs; "preempt" asks the running goal to stop and starts the
             newest one after it.
+        fields: of the goal; one that may not be as it is aborts the goal, and no other goal hears of it.
     """
 
     def __init__(
@@ -122,12 +143,13 @@ class WorkerActionServer(ActionServer):
         body: Callable[[ServerGoalHandle], tuple[str, Any]],
         *,
         exclusive: str = "refuse",
+        fields: Fields = NO_FIELDS,
     ) -> None:
         if exclusive not in ("refuse", "preempt"):
             raise ValueError(f"exclusive = {exclusive!r}: must be 'refuse' or 'preempt'")
         self._worker_node = node
         self._body = body
-        self._exclusive = exclusive
+        self._exclusive, self._fields = exclusive, fields
         self._turn = threading.Lock()  # held by the goal that runs
         self._bookkeeping = threading.Lock()
         self._newest: ServerGoalHandle | None = None
@@ -166,6 +188,16 @@ class WorkerActionServer(ActionServer):
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
         """Run the body in a thread; rclpy's own execution only publishes the outcome, when it is there."""
+        try:
+            self._fields.check(goal_handle.request)
+        except Refusal as refusal:
+            self._worker_node.get_logger().warning(f"goal refused: {refusal}")
+            with self._bookkeeping:
+                self._running -= 1
+            result = without_figures(self._action_type.Result())
+            result.error_code, result.message = refusal.error_code, str(refusal)
+            self._finish(goal_handle, "abort", result)
+            return
         with self._bookkeeping:
             self._newest = goal_handle
         threading.Thread(target=self._work, args=(goal_handle,), daemon=True).start()
@@ -180,6 +212,10 @@ class WorkerActionServer(ActionServer):
         finally:
             with self._bookkeeping:
                 self._running -= 1
+        self._finish(goal_handle, outcome, result)
+
+    def _finish(self, goal_handle: ServerGoalHandle, outcome: str, result: Any) -> None:
+        """Have the executor publish the outcome."""
 
         def finish(_goal_handle: ServerGoalHandle) -> Any:
             # Only a goal whose cancellation was requested may end as cancelled.

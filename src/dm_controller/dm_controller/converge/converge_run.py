@@ -19,7 +19,7 @@ from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.messages import doubles
 from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
-from dm_controller.converge.goals import check_figures, ending
+from dm_controller.converge.goals import ending
 from dm_controller.focus_actions import LoopBench
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import MirrorFacts, make_solver
@@ -93,8 +93,7 @@ class ConvergeRun:
         return Creep.of_rate(self._values["converge.creep"], np.asarray(report.applied, dtype=float), now)
 
     def _options(self, goal: Any) -> LoopOptions:
-        """What the goal asks for, 0 = configured. Raises ValueError naming the field."""
-        check_figures(goal)
+        """What the goal asks for, 0 = configured."""
         return LoopOptions(
             goal.tolerance or self._values["converge.tolerance"], goal.max_maps or self._values["converge.max_maps"]
         )

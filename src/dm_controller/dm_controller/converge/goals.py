@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.recipes import RecipeError
@@ -13,20 +11,11 @@ from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import SAME_CURVATURE
 from dm_controller.planning.target import FocusTarget
 
-#: Most maps that a goal may ask for.
-MAPS_MAX = 100
-
 
 class UnreachableError(RecipeError):
     """The limits of the actuators deny the shape."""
 
-
-def check_figures(goal: Any) -> None:
-    """Raise ValueError naming the field of a goal of either action that makes no sense."""
-    if not (math.isfinite(goal.tolerance) and goal.tolerance >= 0.0):
-        raise ValueError(f"tolerance = {goal.tolerance} m: must be 0 (= configured) or above, and finite")
-    if goal.max_maps > MAPS_MAX:
-        raise ValueError(f"max_maps = {goal.max_maps}: must be 0 (= configured) to {MAPS_MAX}")
+    error_code = ErrorCode.UNREACHABLE
 
 
 def recipe_targets(
@@ -38,13 +27,10 @@ def recipe_targets(
         error_max: largest coefficient error, m, that the model may leave.
 
     Raises:
-        RecipeError: a curvature that is not finite or asked for twice, naming it.
+        RecipeError: a curvature asked for twice, naming it.
         UnreachableError: one out of reach.
         TargetError: no such surface exists over the aperture.
     """
-    for place, curvature in enumerate(curvatures):
-        if not math.isfinite(curvature):
-            raise RecipeError(f"curvatures[{place}] = {curvature}: must be a finite number")
     ordered = sorted(float(curvature) for curvature in curvatures)
     for one, next_one in pairwise(ordered):
         if next_one - one <= SAME_CURVATURE:

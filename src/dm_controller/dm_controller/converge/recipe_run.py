@@ -17,16 +17,15 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.client import Client
 from rclpy.node import Node
 
-from dm_common.errors import Cancelled, ErrorCode, Refusal
+from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
-from dm_common.recipes import RecipeError
 from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
-from dm_controller.converge.goals import UnreachableError, check_figures, ending, recipe_targets
+from dm_controller.converge.goals import ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.focus_actions import LoopBench
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.target import FocusTarget, TargetError
+from dm_controller.planning.target import FocusTarget
 
 #: A model that leaves a larger coefficient error of a curvature, m, cannot reach it.
 UNREACHABLE_ERROR = 2e-8
@@ -143,17 +142,12 @@ class RecipeRun:
                 builder.build(target)
         except Cancelled as error:
             return ErrorCode.CANCELED, str(error)
-        except Refusal as error:
-            return error.error_code, str(error)
-        except UnreachableError as error:
-            return ErrorCode.UNREACHABLE, str(error)
-        except ValueError as error:
-            return ErrorCode.INVALID_ARGUMENT, str(error)
+        except EXPECTED as error:
+            return error_code(error), str(error)
         return ErrorCode.OK, ""
 
     def _options(self, goal: Any) -> BuildOptions:
-        """What the goal asks for, 0 = configured. Raises ValueError naming the field."""
-        check_figures(goal)
+        """What the goal asks for, 0 = configured. Raises ValueError naming what makes no sense."""
         values = self._values
         maps = goal.max_maps or values["recipes.max_maps"]
         # At least four rounds: without a model, hysteresis makes each correction miss by some share of itself.
@@ -162,15 +156,7 @@ class RecipeRun:
         return BuildOptions(tolerance, maps, average, float(values["converge.settle_time"]))
 
     def _targets(self, goal: Any, target: FocusTarget, planner: Planner) -> list[FocusTarget]:
-        if not goal.curvatures:
-            raise ValueError("curvatures: empty; name at least one, 1/m")
-        try:
-            return recipe_targets(list(goal.curvatures), target.conic_constant, planner, UNREACHABLE_ERROR)
-        except UnreachableError as error:
-            raise Refusal(ErrorCode.UNREACHABLE, str(error)) from error
-        except (RecipeError, TargetError) as error:
-            finite = all(math.isfinite(curvature) for curvature in goal.curvatures)
-            raise Refusal(ErrorCode.INVALID_ARGUMENT if finite else ErrorCode.NOT_FINITE, str(error)) from error
+        return recipe_targets(list(goal.curvatures), target.conic_constant, planner, UNREACHABLE_ERROR)
 
     def _guess(self, law: HysteresisModel, now: float, middle: float) -> HysteresisState | None:
         """The mirror long rested where the driver says it stands; None when it does not say."""

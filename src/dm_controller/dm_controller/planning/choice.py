@@ -14,11 +14,10 @@ from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
 from dm_controller.planning.recipes import FoundRecipe, find
-from dm_controller.planning.target import FocusTarget, Request, TargetError
+from dm_controller.planning.target import REQUEST, FocusTarget, Request
 
 #: A message's constants are properties of its class, which take longer to look up.
-_MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED)
-_AUTO, _DIRECT, _CONDITIONED = _MODES
+_DIRECT, _CONDITIONED = FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED
 
 
 class Degauss(NamedTuple):
@@ -59,24 +58,16 @@ def choose_move(request: Request, time_budget: float, context: PlanningContext) 
     Raises:
         Refusal: a field makes no sense, or no recipe serves the target in the mode CONDITIONED.
     """
+    REQUEST.check(request)
     mode, budget = request.mode, request.time_budget
-    if mode not in _MODES:
-        raise Refusal(ErrorCode.INVALID_ARGUMENT, f"mode = {mode}: must be AUTO (0), DIRECT (1) or CONDITIONED (2)")
-    if not (math.isfinite(budget) and budget >= 0.0):
-        raise Refusal(
-            ErrorCode.INVALID_ARGUMENT, f"time_budget = {budget} s: must be 0 (= as configured) or above, and finite"
-        )
-    try:
-        target = FocusTarget(request.curvature, request.conic_constant, request.zernike)
-        if context.degauss is None:
-            return _direct(target, context)
-        if mode == _CONDITIONED:
-            return _conditioned(target, context, context.degauss)
-        if mode == _DIRECT:
-            return _unconditioned(target, context, context.degauss)
-        return _best(target, budget or time_budget, context, context.degauss)
-    except TargetError as error:
-        raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
+    target = FocusTarget(request.curvature, request.conic_constant, request.zernike)
+    if context.degauss is None:
+        return _direct(target, context)
+    if mode == _CONDITIONED:
+        return _conditioned(target, context, context.degauss)
+    if mode == _DIRECT:
+        return _unconditioned(target, context, context.degauss)
+    return _best(target, budget or time_budget, context, context.degauss)
 
 
 def _direct(target: FocusTarget, context: PlanningContext) -> Move:

@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from dm_msgs.msg import FocusRequest
 from numpy.typing import NDArray
 
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
 from dm_common.optics.conic import conic_coefficients, conic_sag
 from dm_common.optics.zernike import TERMS, basis
+from dm_common.values import Fields, real, reals, whole
 
 
-class TargetError(ValueError):
-    """A request that no mirror could follow; the message names field, value and allowed range."""
+class TargetError(Refusal):
+    """A surface that does not exist; the message names field, value and allowed range."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(ErrorCode.OUT_OF_RANGE, message)
+
+
+#: What the fields of a target, and those of a request beside them, may be.
+TARGET = Fields({"curvature": real(0.0), "conic_constant": real(0.0), "zernike": reals([], sizes=(0, len(TERMS)))})
+REQUEST = Fields(
+    {
+        "mode": whole(0, choices={0: "AUTO", 1: "DIRECT", 2: "CONDITIONED"}),
+        "time_budget": real(0.0, 0.0, 1e9, "s", zero="as configured"),
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -26,6 +40,9 @@ class FocusTarget:
         curvature: of the surface at the vertex [1/m], positive = concave. Optical power = 2 x curvature.
         conic_constant: 0 = sphere, -1 = paraboloid (Eq. 2 in [1]).
         zernike: added sag [m], Born & Wolf terms in the order of [1] over the working aperture; empty = none.
+
+    Raises:
+        Refusal: NOT_FINITE, or INVALID_LENGTH of `zernike`.
     """
 
     curvature: float
@@ -33,13 +50,7 @@ class FocusTarget:
     zernike: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, value in (("curvature", self.curvature), ("conic_constant", self.conic_constant)):
-            if not math.isfinite(value):
-                raise TargetError(f"{name} = {value}: must be a finite number")
-        if len(self.zernike) not in (0, len(TERMS)):
-            raise TargetError(f"zernike has {len(self.zernike)} terms: must be empty or {len(TERMS)} (Born & Wolf, m)")
-        if not all(math.isfinite(value) for value in self.zernike):
-            raise TargetError(f"zernike = {list(self.zernike)}: every term must be finite")
+        TARGET.check(self)
 
     def check_aperture(self, radius: float) -> None:
         """Raise TargetError when a conic of this curvature does not reach the edge of the aperture."""

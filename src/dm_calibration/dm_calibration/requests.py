@@ -1,0 +1,53 @@
+"""What the fields of requests and goals to the nodes of this package may be."""
+
+from __future__ import annotations
+
+from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
+from dm_calibration.influence.fit import METHODS
+from dm_calibration.procedure.plan import PlanKind
+from dm_common.values import Fields, real, reals, text, texts, whole
+
+_CONFIGURED = "as configured"
+#: An id or a file of the store.
+_CALIBRATION = {"calibration": text("")}
+_METHOD = {"method": text("", choices=("", *METHODS))}
+
+CALIBRATE = Fields(
+    {
+        "plan": whole(0, choices={int(kind): kind.name for kind in PlanKind}),
+        "surfaces": texts([], sizes=range(1001)),
+        "poke_amplitude": real(0.0, 0.01, 1.0, zero=_CONFIGURED),
+        "reference_every": whole(0, 1, 1000, zero=_CONFIGURED),
+        "settle_time": real(0.0, 0.0, 600.0, "s", zero=_CONFIGURED),
+        "maps_per_state": whole(0, 1, 100, zero="1"),
+        "hysteresis_maps": whole(0, MAPS_MIN, MAPS_MAX, zero=_CONFIGURED),
+        "note": text(""),
+    }
+)
+LOAD_CALIBRATION = Fields(_CALIBRATION)
+FIT_INFLUENCE_FUNCTION = Fields(_CALIBRATION | _METHOD | {"exclude": texts([])})
+FIT_REGRESSION = Fields(
+    _CALIBRATION
+    | _METHOD
+    | {"p_enter": real(0.0, 0.0, 1.0, zero="the default"), "p_remove": real(0.0, 0.0, 1.0, zero="the default")}
+)
+STORE_RECIPES = Fields(
+    {
+        "calibration_id": text(""),
+        "recipes.degauss_steps": whole(0, 1, 10_000),
+        "recipes.interpolation_error": real(0.0, 0.0, 1.0, "m"),
+    }
+)
+#: Of each recipe; how many signals it has is for the calibration to say.
+RECIPE = Fields(
+    {
+        "curvature": real(0.0),
+        "conic_constant": real(0.0),
+        "effective": reals([]),
+        "signals": reals([], -1.0, 1.0),
+        "max_zernike": real(0.0, 0.0, 1.0, "m"),
+        "rms": real(0.0, 0.0, 1.0, "m"),
+    }
+)
+MEASURE = Fields({"label": text(""), "timeout": real(0.0, 1e-3, 86400.0, "s", zero=_CONFIGURED)})
+INGEST_FILE = Fields({"path": text("")})
