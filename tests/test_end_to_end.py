@@ -160,7 +160,7 @@ def test_unplugged_electronics_are_noticed_and_their_return_too(
     wait_until(lambda: mirror.actuator_state.driver_state == ActuatorState.STATE_LINK_LOST)
     with pytest.raises(DeformableMirrorError) as refused:
         mirror.focus(-0.02)
-    assert refused.value.error_code == ErrorCode.DRIVER_INACTIVE
+    assert refused.value.error_code == ErrorCode.ELECTRONICS_UNREACHABLE
     switch(True)
     wait_until(lambda: mirror.actuator_state.driver_state == ActuatorState.STATE_ACTIVE)
     assert list(mirror.actuator_state.applied) == before

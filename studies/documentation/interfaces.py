@@ -29,6 +29,15 @@ Written from the code by `./dm exec python -m studies.documentation.interfaces`;
 on [a page of their own](parameters.md). Names are relative: with a namespace they lie in it. Units are SI where a
 comment names none; signals are normalised, −1 to +1; sag is that of the surface, positive curvature is concave.
 
+A latched topic keeps its last message for those who come late. To see it, ask for both
+`ros2 topic echo --qos-durability transient_local --qos-reliability reliable /capabilities`: durability alone leaves
+best effort, which shows nothing before the next message.
+
+Every field of a request or goal is checked before anything is done: NaN and infinity are answered with NOT_FINITE,
+numbers out of range and unknown modes with OUT_OF_RANGE, arrays of another length and texts of over 1000 characters
+with INVALID_LENGTH, unknown names with UNKNOWN_NAME; the sentence names field, value and what is allowed. Figures of
+a refused request are NaN.
+
 A program asks by the topic `focus_request` or the service `set_focus` (`dry_run` predicts only), moves with the action
 `move_focus`, and finds what the mirror can do on the latched topic `capabilities`. `actuator_command`, `set_signals`
 and `degauss` go below the controller; `calibrate`, `converge` and `build_recipes` are actions with an interferometer,

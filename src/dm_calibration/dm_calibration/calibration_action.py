@@ -18,7 +18,7 @@ from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import forecast
+from dm_calibration.procedure.forecast import TYPICAL_MAP_S, forecast
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
@@ -151,7 +151,8 @@ class CalibrateAction:
 
     def _forecast(self, goal: Calibrate.Goal, plan: Plan, result: Calibrate.Result) -> None:
         """Fill in what is to be expected; the message of a dry run."""
-        expected = forecast(plan, goal.settle_time or self._values["settle_time"], self._manager.in_use)
+        in_use, map_time = self._manager.in_use, self._services.map_time
+        expected = forecast(plan, goal.settle_time or self._values["settle_time"], in_use, map_time)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
@@ -160,7 +161,10 @@ class CalibrateAction:
                 accuracy = f", moves then right to {expected.max_zernike * 1e9:.1f} nm (largest coefficient, 95 %)"
             elif plan.kind is PlanKind.HYSTERESIS:
                 accuracy = ", accuracy not known without an earlier calibration in use"
-            result.message = f"{maps} maps in about {expected.duration:.0f} s{accuracy}; nothing was moved"
+            guess = (
+                "" if map_time or in_use is not None else f" if a map takes {TYPICAL_MAP_S:g} s (none was taken yet)"
+            )
+            result.message = f"{maps} maps in about {expected.duration:.0f} s{guess}{accuracy}; nothing was moved"
 
     def _procedure(
         self, handle: ServerGoalHandle, plan: Plan, mirror: Mirror, run: OpenRun

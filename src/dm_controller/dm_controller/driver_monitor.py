@@ -37,6 +37,15 @@ def same_signals(one: Floats, other: Floats) -> bool:
     return one.shape == other.shape and float(np.abs(one - other).max(initial=0.0)) <= SAME_SIGNAL
 
 
+def _not_active(report: DriverReport) -> Refusal:
+    """That the driver takes no commands, by the code that it answers them with itself."""
+    reason = f": {report.message}" if report.message else ""
+    if report.driver_state == ActuatorState.STATE_LINK_LOST:
+        text = f"pdm_driver has lost the link to the electronics{reason}"
+        return Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, text)
+    return Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
+
+
 class DriverMonitor:
     """Steady times, s, are given with each call.
 
@@ -98,8 +107,7 @@ class DriverMonitor:
         if report is None:
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no actuator_state from pdm_driver yet: is the driver running?")
         if report.driver_state != _ACTIVE:
-            reason = f": {report.message}" if report.message else ""
-            raise Refusal(ErrorCode.DRIVER_INACTIVE, f"pdm_driver is not active{reason}")
+            raise _not_active(report)
         if silent := self.silent(now):
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
 
@@ -130,8 +138,7 @@ class DriverMonitor:
         signals = order.outcome.move.signals
         report = self.latest
         if report is not None and report.driver_state != _ACTIVE:
-            text = f"the driver left its active state: {report.message}"
-            return Progress(failed=Refusal(ErrorCode.ELECTRONICS_UNREACHABLE, text))
+            return Progress(failed=_not_active(report))
         if silent := self.silent(now):
             return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent))
         gap = share = 0.0

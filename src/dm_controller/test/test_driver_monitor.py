@@ -74,6 +74,7 @@ def test_a_command_that_is_confirmed_is_not_told_of() -> None:
         (report(), ErrorCode.PREEMPTED, "follows another one"),
         (report(error_code=ErrorCode.STALE, message="too old"), ErrorCode.STALE, "too old"),
         (report(driver_state=ActuatorState.STATE_INACTIVE), ErrorCode.DRIVER_INACTIVE, "not active"),
+        (report(driver_state=ActuatorState.STATE_LINK_LOST), ErrorCode.ELECTRONICS_UNREACHABLE, "lost the link"),
         (None, ErrorCode.DRIVER_UNAVAILABLE, "has not reported"),
     ],
 )

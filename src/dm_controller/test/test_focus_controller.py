@@ -460,7 +460,9 @@ def test_a_driver_that_is_not_active(bench: Bench) -> None:
     bench.report(message="the link is lost")
     assert not bench.controller.hold.active
     bench.ask(0.02)
-    assert bench.refusal().error_code == ErrorCode.DRIVER_INACTIVE and "the link is lost" in str(bench.refusal())
+    assert bench.refusal().error_code == ErrorCode.ELECTRONICS_UNREACHABLE and "the link is lost" in str(
+        bench.refusal()
+    )
 
 
 def test_a_driver_that_does_not_take_the_command(bench: Bench) -> None:

@@ -15,7 +15,7 @@ from dm_common.optics.zernike import PISTON_TILT
 
 Floats = NDArray[np.float64]
 
-#: Time that one map takes, s, where no calibration tells it.
+#: Time that one map takes, s, where neither a map nor a calibration says so.
 TYPICAL_MAP_S = 1.0
 #: Fewest pairs of maps of the same command that tell the noise.
 PAIRS_MIN = 4
@@ -29,16 +29,17 @@ class Forecast:
     max_zernike: float
 
 
-def forecast(plan: Plan, settle_time: float, earlier: Calibration | None) -> Forecast:
+def forecast(plan: Plan, settle_time: float, earlier: Calibration | None, map_time: float = 0.0) -> Forecast:
     """Duration and accuracy to expect of `plan`; accuracy only of hysteresis plans.
 
     Args:
         settle_time: s between command and map.
-        earlier: calibration of the same mirror that tells gains, noise and the time of a map; None = there is none.
+        earlier: calibration of the same mirror that tells gains and noise; None = there is none.
+        map_time: s that the last map took; 0 = none was taken: then as in `earlier`, or TYPICAL_MAP_S.
     """
     steps = [step for step in plan.steps if step.kind is not StepKind.DEGAUSS]
-    per_map = settle_time + TYPICAL_MAP_S
-    if earlier is not None and len(earlier.maps) > 1:
+    per_map = settle_time + (map_time or TYPICAL_MAP_S)
+    if not map_time and earlier is not None and len(earlier.maps) > 1:
         gap = np.diff(np.sort(earlier.maps.stamp_ns)) * 1e-9
         per_map = max(float(np.median(gap)), settle_time)
     time = np.cumsum([per_map - (1.0 - step.settle_share) * settle_time + step.dwell for step in steps])

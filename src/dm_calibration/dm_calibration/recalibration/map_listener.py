@@ -33,9 +33,9 @@ from dm_common.ros.worker import WorkerService
 REPORT_WAIT_S = 3.0
 #: Least wall time between two messages on `calibration` that updates cause, s.
 PUBLISH_PERIOD_S = 1.0
-#: Halves of maps that wait for the other half, and stamps of maps remembered so that none counts twice.
+#: Halves of maps that wait for the other half, and maps remembered so that none counts twice.
 HALVES_KEPT = 8
-STAMPS_KEPT = 64
+MAPS_KEPT = 64
 
 
 class MapListener:
@@ -64,7 +64,7 @@ class MapListener:
         self._law: HysteresisModel | None = None
         self._turn = threading.Lock()  # one map at a time; held over measuring and judging
         self._halves: dict[int, dict[str, Any]] = {}
-        self._judged: deque[int] = deque(maxlen=STAMPS_KEPT)
+        self._judged: deque[Measurement] = deque(maxlen=MAPS_KEPT)
         self._taken = self._refused = 0
         self._last_refusal = ""
         self._dirty = False
@@ -177,7 +177,7 @@ class MapListener:
         try:
             with self._turn:
                 measured = measurement_from(halves)
-                if measured.stamp_ns not in self._judged:
+                if not any(measured.same_map(before) for before in self._judged):
                     self._judge(measured, dry_run=False)
         except EXPECTED as error:
             self._refuse(str(error))
@@ -193,7 +193,7 @@ class MapListener:
             Refusal: a calibration is running, or the driver is silent.
             MapNotUsableError, StoreError: see :class:`RecalibrationManager`.
         """
-        self._judged.append(measured.stamp_ns)
+        self._judged.append(measured)
         still = self._values["updates.still_time"]
         at = 1e-9 * measured.stamp_ns
         deadline = time.monotonic() + REPORT_WAIT_S

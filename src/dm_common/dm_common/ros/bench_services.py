@@ -50,6 +50,7 @@ class BenchServices:
         state: the driver's last state message; None before the first.
         settle_time: s of ROS time between command and map.
         cancelled: asked while waiting.
+        map_time: s of ROS time that the last map took; 0 = none was taken yet.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
@@ -61,6 +62,7 @@ class BenchServices:
         self.state: ActuatorState | None = None
         self.settle_time = float(values["settle_time"])
         self.cancelled: Callable[[], bool] = _never
+        self.map_time = 0.0
         self._commanded: Floats | None = None
         self._history_known = False
         node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
@@ -119,6 +121,7 @@ class BenchServices:
     def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
         request = Measure.Request(label=label, timeout=timeout)
+        began = self._node.get_clock().now()
         # The interferometer keeps the time itself; the call waits a little longer for its answer, which says why.
         try:
             response = self._call(self._measure, request, timeout + 5.0, ErrorCode.INTERFEROMETER_UNAVAILABLE)
@@ -126,6 +129,7 @@ class BenchServices:
             if error.error_code in _FATAL:
                 raise
             raise MeasurementError(error.error_code, str(error)) from error
+        self.map_time = (self._node.get_clock().now() - began).nanoseconds * 1e-9
         check()
         try:
             # The state was read after the map, so its stamp is of the write that the map shows.
