@@ -75,9 +75,10 @@ def inline_commands() -> Iterator[tuple[str, str]]:
 #: Blocks that are nothing to type, by their first line.
 TEXTS = {
     "header | one word per channel | check sum | terminator": "layout of a frame",
-    "poke check the maps show the mirror mirrored left to right, then turned by 35.01 +- 0.02 degrees counter-clockwise": (
-        "what a poke check prints"
-    ),
+    (
+        "poke check the maps show the mirror mirrored left to right, "
+        "then turned by 35.01 +- 0.02 degrees counter-clockwise"
+    ): "what a poke check prints",
 }
 
 #: Run to their end on the scene, in this order; they must succeed.

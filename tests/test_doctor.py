@@ -157,7 +157,7 @@ def _raising(error: BaseException) -> list[tuple[str, int]]:
 
 
 def test_every_reason_to_refuse_a_configuration_is_gone_through() -> None:
-    """Each `raise ValueError` of the modules that configure is reached by a case above, or by no values of the table."""
+    """Each `raise ValueError` of the modules that configure is reached by a case above, or by no values at all."""
     reached = set()
     for name, values, _words in CONTRADICTIONS:
         node = next(node for node in NODES if node.name == name)
