@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from functools import partial
@@ -24,6 +25,7 @@ from dm_common.ros.worker import (
     never_silent,
     sleep,
 )
+from dm_common.values import Fields, real
 from ros_fixtures import Observer
 from waiting import wait_until
 
@@ -106,7 +108,10 @@ class Mover:
     def __init__(self, observer: Observer, exclusive: str) -> None:
         self.release = threading.Event()
         self.started: list[float] = []
-        self.server = WorkerActionServer(observer.node, MoveFocus, "move", self.body, exclusive=exclusive)
+        fields = Fields({"settle_time": real(0.0, 0.0, 60.0, "s")})
+        self.server = WorkerActionServer(
+            observer.node, MoveFocus, "move", self.body, exclusive=exclusive, fields=fields
+        )
 
     def body(self, goal_handle: Any) -> tuple[str, Any]:
         self.started.append(goal_handle.request.tolerance)
@@ -195,6 +200,19 @@ def test_the_newest_goal_preempts(observer: Observer) -> None:
     wait_until(second.done)
     assert second.result().status == GoalStatus.STATUS_SUCCEEDED
     assert mover.started == [1.0, 2.0]
+
+
+def test_a_goal_that_makes_no_sense_is_refused_and_leaves_the_one_that_runs(observer: Observer) -> None:
+    mover = Mover(observer, "preempt")
+    _, first = observer.send_goal(MoveFocus, "move", MoveFocus.Goal(tolerance=1.0))
+    wait_until(lambda: mover.started == [1.0])
+    refused = observer.run_goal(MoveFocus, "move", MoveFocus.Goal(tolerance=1.0, settle_time=math.nan)).result
+    assert refused.error_code == ErrorCode.NOT_FINITE and "settle_time = nan" in refused.message
+    assert math.isnan(refused.duration) and math.isnan(refused.state.predicted_rms)
+    mover.release.set()
+    wait_until(first.done)
+    assert first.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert mover.started == [1.0]
 
 
 def test_call_names_the_service_that_is_missing(observer: Observer) -> None:

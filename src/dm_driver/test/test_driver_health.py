@@ -1,0 +1,28 @@
+"""The driver's health on /diagnostics."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dm_common.ros.diagnostics import ERROR, OK, WARN
+from dm_driver.driver_health import driver_health
+
+
+@pytest.mark.parametrize(
+    ("changed", "level", "words"),
+    [
+        ({}, OK, "active"),
+        ({"history_known": False}, WARN, "history is not known"),
+        ({"enabled": False}, WARN, "inactive"),
+        ({"link_up": False, "fault": "no route"}, ERROR, "no route"),
+    ],
+)
+def test_health_is_good_only_where_nothing_is_missing(changed: dict[str, Any], level: bytes, words: str) -> None:
+    state = {"link_up": True, "enabled": True, "history_known": True, "moving": None, "fault": ""} | changed
+    counters = SimpleNamespace(frames=0, link_losses=0, reconnects=0, overtaken=0, overruns=0)
+    writer: Any = SimpleNamespace(state=lambda: SimpleNamespace(**state), counters=counters)
+    health = driver_health(writer, None, {})
+    assert health.level == level and words in health.message
