@@ -67,6 +67,23 @@ def simulation() -> AgeingSimulation:
     return AgeingSimulation()
 
 
+def test_a_mirror_that_does_not_drift_is_not_made_worse(simulation: AgeingSimulation, tmp_path: Path) -> None:
+    updates = RecalibrationManager(tmp_path, UpdateOptions)
+    assert updates.begin(simulation.calibration) == ""
+    rng = np.random.default_rng(43)
+    errors = []
+    for _ in range(12):
+        simulation.bench.time += 30 * 86400.0
+        simulation.night(rng)
+        measured = simulation.measurement(simulation.bench.take_map())
+        standing = simulation.history.settled(1e-9 * measured.stamp_ns, 0.1)
+        fits = (simulation.calibration.fit, updates.changed_fit())
+        errors.append([simulation.error(fit, standing.effective) for fit in fits if fit is not None])
+        assert updates.take(measured, standing).accepted
+    without, kept = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert kept < 1.02 * without
+
+
 def test_maps_of_the_nights_keep_the_calibration_true(simulation: AgeingSimulation, tmp_path: Path) -> None:
     updates = RecalibrationManager(tmp_path, UpdateOptions)
     assert updates.begin(simulation.calibration) == ""

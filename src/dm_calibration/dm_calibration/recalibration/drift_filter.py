@@ -6,6 +6,11 @@ shares g, the figure by d. Both walk at random, so what is known of them fades w
 Kalman filter, which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section
 11.3).
 
+An estimate of drift is noise as well, and on a mirror that stands still nothing else: taken over as it is, it makes the
+calibration worse. So each map is first a test of what the maps before it made out: the change that they foretell for it,
+against the change that it shows. Only the share of the former that this evidence carries is used (the positive-part
+estimate of a regression through the origin, less one standard error), none of it before a second shape was measured.
+
 A map that departs further from its prediction than chance allows is a bad map, or the mirror is another one: the caller
 must not take it in.
 """
@@ -36,6 +41,10 @@ NOISE_MIN = 1e-24
 #: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
 #: that fits noise best explains about 0.13.
 DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
+#: How far an actuator that stands elsewhere is from where it should be, normalised.
+DISPLACED_SIGMA = 0.5
+#: What evidence counts for after one more map: it is of the last thirty maps or so.
+EVIDENCE_KEPT = 0.97
 #: Gains of actuators that hardly show are not known worse than this.
 GAIN_SIGMA_MAX = 0.05
 
@@ -65,6 +74,8 @@ class Drift:
         revision: maps taken in.
         checked_ns: stamp of the last of them; 0 = none.
         surprising: maps in a row, the last ones, that disagreed.
+        foretold: sum of squares of the changes that were foretold to maps, in standard deviations.
+        borne_out: sum of their products with the changes that the maps showed.
     """
 
     gain: Floats
@@ -74,17 +85,26 @@ class Drift:
     revision: int = 0
     checked_ns: int = 0
     surprising: int = 0
+    foretold: float = 0.0
+    borne_out: float = 0.0
+
+    @property
+    def trust(self) -> float:
+        """The share of gain and offset that maps not used for them have borne out, 0 to 1."""
+        if self.foretold <= 0.0:
+            return 0.0
+        return float(np.clip((self.borne_out - np.sqrt(self.foretold)) / self.foretold, 0.0, 1.0))
 
     @property
     def largest_gain(self) -> tuple[float, int]:
-        """The largest relative change of a gain, and the index of its actuator."""
+        """The largest relative change of a gain as it is used, and the index of its actuator."""
         index = int(np.abs(self.gain).argmax())
-        return float(self.gain[index]), index
+        return self.trust * float(self.gain[index]), index
 
     @property
     def offset_rms(self) -> float:
-        """Change of the figure, m rms."""
-        return float(np.linalg.norm(self.offset))
+        """Change of the figure as it is used, m rms."""
+        return self.trust * float(np.linalg.norm(self.offset))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +112,14 @@ class Comparison:
     """A map against its prediction.
 
     Attributes:
-        max_zernike: m, largest difference of a coefficient beyond tilt.
+        max_zernike: m, largest difference of a coefficient beyond tilt from the calibration as it is used.
         rms: m rms of the difference in sag, piston and tilt removed.
         surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
             all values, and the largest single one over the largest to be expected of so many.
         updated: the drift with this map taken in.
         displaced: {index: effective signal more than there should be} of the actuators that the difference comes from,
             the worst first, where a few of them explain it: one that sticks, say.
+        probability: {index: of each of them, against any other actuator and against a map that is bad all over}.
     """
 
     max_zernike: float
@@ -106,6 +127,7 @@ class Comparison:
     surprise: float
     updated: Drift
     displaced: dict[int, float]
+    probability: dict[int, float]
 
 
 class DriftFilter:
@@ -166,7 +188,9 @@ class DriftFilter:
         predicted_sag = changed.sag_offset + changed.influence_sag @ effective
         predicted = changed.zernike_offset + changed.influence_zernike @ effective
         filled = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0]
-        innovation = self.reduction.reduce(coefficients - predicted, filled - predicted_sag)
+        foretold = design @ np.concatenate((drift.gain, drift.offset))
+        shown = self.reduction.reduce(coefficients - predicted, filled - predicted_sag) + drift.trust * foretold
+        innovation = shown - foretold
 
         shared = prior @ design.T
         # What the calibration itself does not know of its influence function, beyond gains.
@@ -179,6 +203,11 @@ class DriftFilter:
         left = np.eye(len(prior)) - kalman @ design
         noise = expected - design @ shared
         covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
+        evidence = (drift.foretold, drift.borne_out)
+        if not repeat:  # a repeat shares the error of the law with the map before it
+            weighed = cho_solve(factor, foretold)
+            new = (float(weighed @ foretold), float(weighed @ shown))
+            evidence = (EVIDENCE_KEPT * evidence[0] + new[0], EVIDENCE_KEPT * evidence[1] + new[1])
         departure = remove_piston_tilt((filled - predicted_sag)[None], self._fit.points)[0]
         updated = Drift(
             drift.gain + correction[:actuators],
@@ -187,23 +216,28 @@ class DriftFilter:
             max(stamp_ns, drift.stamp_ns),
             drift.revision + 1,
             stamp_ns,
+            0,
+            *evidence,
         )
+        displaced, probability = _displaced(innovation, self._gain, factor)
         return Comparison(
             max_zernike=float(np.abs(coefficients - predicted)[PISTON_TILT:].max()),
             rms=float(rms(departure, self._fit.points.weight)),
             surprise=_surprise(innovation, expected, factor),
             updated=updated,
-            displaced=_displaced(innovation, self._gain, factor),
+            displaced=displaced,
+            probability=probability,
         )
 
     def changed(self, drift: Drift) -> InfluenceFit:
-        """The influence function with gains and figure as `drift` has found them."""
+        """The influence function with gains and figure as far as what `drift` has found of them is borne out."""
         fit = self._fit
-        coefficients, sag = self.reduction.expand(drift.offset)
+        coefficients, sag = self.reduction.expand(drift.trust * drift.offset)
+        gain = 1.0 + drift.trust * drift.gain
         return replace(
             fit,
-            influence_zernike=fit.influence_zernike * (1.0 + drift.gain),
-            influence_sag=fit.influence_sag * (1.0 + drift.gain),
+            influence_zernike=fit.influence_zernike * gain,
+            influence_sag=fit.influence_sag * gain,
             zernike_offset=fit.zernike_offset + coefficients,
             sag_offset=fit.sag_offset + sag,
         )
@@ -243,8 +277,11 @@ def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool])
     return float(max(together, single))
 
 
-def _displaced(innovation: Floats, gain: Floats, factor: tuple[Floats, bool]) -> dict[int, float]:
-    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares.
+def _displaced(
+    innovation: Floats, gain: Floats, factor: tuple[Floats, bool]
+) -> tuple[dict[int, float], dict[int, float]]:
+    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares; and
+    the probability of each.
 
     Args:
         gain: (R, N) per unit of effective signal.
@@ -262,4 +299,23 @@ def _displaced(innovation: Floats, gain: Floats, factor: tuple[Floats, bool]) ->
         found.append(best)
         amounts = np.linalg.lstsq(columns[:, found], whole)[0]
         left = whole - columns[:, found] @ amounts
-    return {found[k]: float(amounts[k]) for k in np.argsort(-np.abs(amounts))}
+    order = [int(k) for k in np.argsort(-np.abs(amounts))]
+    probability = {}
+    for k in order:
+        of_this = left + columns[:, found[k]] * amounts[k]
+        probability[found[k]] = _probability(columns, power, of_this, found[k])
+    return {found[k]: float(amounts[k]) for k in order}, probability
+
+
+def _probability(columns: Floats, power: Floats, white: Floats, actuator: int) -> float:
+    """That `actuator` alone makes the difference `white` (R,), and neither another one nor something else.
+
+    An actuator may be anywhere in its range; something else differs everywhere, as much as `white` does. Half of the
+    prior is the actuators', the other half that of something else.
+    """
+    size, whole = len(white), float(white @ white)
+    precision = 1.0 / DISPLACED_SIGMA**2
+    evidence = 0.5 * np.square(columns.T @ white) / (power + precision) - 0.5 * np.log1p(power / precision)
+    something = 0.5 * (whole - size) - 0.5 * size * np.log(whole / size) if whole > size else 0.0
+    all_of_them = np.append(evidence - np.log(evidence.size), something)
+    return float(np.exp(all_of_them[actuator] - np.logaddexp.reduce(all_of_them)))

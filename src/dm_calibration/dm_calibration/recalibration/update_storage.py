@@ -18,6 +18,9 @@ SCHEMA_VERSION = 1
 
 _ARRAYS = ("gain", "offset", "covariance")
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
+#: Not in files of before there were such figures: what they hold was used, and is.
+_EVIDENCE = ("foretold", "borne_out")
+_BEFORE = 100.0
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
 
@@ -45,6 +48,7 @@ def write_updates(path: Path, identifier: str, basis: str, updates: Drift) -> No
         "calibration": identifier,
         "basis_sha256": basis,
         **{name: getattr(updates, name) for name in _NUMBERS},
+        **{name: float(getattr(updates, name)) for name in _EVIDENCE},
     }
     write_whole(path, write_image(columns, attributes))
 
@@ -79,5 +83,9 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         shape = getattr(like, name).shape
         if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
-    found: dict[str, Any] = {**arrays, **numbers}
+    evidence = {name: attributes.get(name, _BEFORE) for name in _EVIDENCE}
+    for name, number in evidence.items():
+        if not isinstance(number, float) or not np.isfinite(number):
+            raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")
+    found: dict[str, Any] = {**arrays, **numbers, **evidence}
     return Drift(**found)

@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 REPEAT_S = 3600.0
 #: Moves that are nearer to each other in time are one, s.
 SAME_MOVE_S = 0.2
+#: Smallest signal that tells a weak actuator from one that is displaced, and what is left of the move of a dead one.
+TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
 SUFFIX = ".updates.hdf5"
 
 
@@ -220,8 +222,19 @@ def _cause(comparison: Comparison, effective: Floats) -> str:
         return "bad map, or the mirror has changed"
     return ", ".join(
         f"actuator {actuator + 1} stands at {effective[actuator] + more:+.2f} instead of {effective[actuator]:+.2f}"
+        f"{_fault(effective[actuator], more)} ({comparison.probability[actuator]:.0%})"
         for actuator, more in comparison.displaced.items()
     )
+
+
+def _fault(signal: float, more: float) -> str:
+    """What an actuator does that stands `more` beyond its effective `signal`; "" = no single map tells."""
+    if abs(signal) < TELLING_SIGNAL:
+        return ""
+    share = 1.0 + more / signal
+    if abs(share) < DEAD_SHARE:
+        return ", as if it were dead"
+    return f", as if weakened to {share:.0%}" if DEAD_SHARE <= share < 1.0 - DEAD_SHARE else ""
 
 
 def check_map(measured: Measurement, calibration: Calibration, options: UpdateOptions) -> None:
