@@ -1,12 +1,16 @@
-"""What a memory plan promises before it runs, against what its held-out maps then show."""
+"""What a hysteresis plan promises before it runs, against what its held-out maps then show."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from dm_calibration.procedure.forecast import Forecast, forecast, map_noise
+from dm_calibration.procedure.forecast import Forecast, GoodEnough, forecast, map_noise
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure.procedure import Procedure
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = pytest.mark.slow
@@ -35,6 +39,38 @@ def test_without_an_earlier_calibration_only_the_duration_is_known() -> None:
     )
     assert short.max_zernike == long.max_zernike == 0.0
     assert long.duration > 3.0 * short.duration
+
+
+def test_the_data_sheet_lets_expect_something_of_a_mirror_never_calibrated() -> None:
+    mirror = SimulatedBench(SIMULATION).mirror
+    plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=300, until=2e-9))
+    found = forecast(plan, 0.5, None, mirror=mirror, until=2e-9)
+    assert 1e-10 < found.max_zernike < 2e-9 and found.maps < len(plan.steps)
+    whole = forecast(plan, 0.5, None, mirror=mirror, until=1e-12)
+    assert whole.maps == len(plan.steps) - 1 and whole.max_zernike < found.max_zernike * 1.01
+
+
+def test_a_run_ends_where_it_is_good_enough() -> None:
+    bench = SimulatedBench(SIMULATION)
+    plan = make_plan(PlanKind.HYSTERESIS, bench.mirror, PlanOptions(hysteresis_maps=240, until=200e-9))
+    enough = GoodEnough(200e-9)
+    outcome = Procedure(plan, bench.mirror, bench, enough=enough).run()
+    assert len(plan.ends) == 2 and len(enough.reached) == 1
+    assert len(outcome.records) == min(plan.ends) - 1
+    assert "2e+02 nm is reached" in enough.sentence(enough.reached[0])
+
+
+def test_a_run_that_stands_still_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Below what noise and law allow, more maps do not help: it says so instead of measuring on."""
+    reach = iter([9.0, 5.0, 4.9, 4.95, 4.9])
+    monkeypatch.setattr(
+        "dm_calibration.procedure.forecast.fit_hysteresis",
+        lambda _maps: SimpleNamespace(held_out_max_zernike=1e-9 * next(reach)),
+    )
+    enough = GoodEnough(1e-9)
+    outcome: Any = SimpleNamespace(maps=lambda: None)
+    assert [enough(outcome) for _ in range(4)] == [False, False, False, True]
+    assert "more maps did not help; part by part 9, 5, 4.9, 5 nm" in enough.sentence(4.9e-9)
 
 
 def test_plans_without_check_moves_promise_nothing() -> None:

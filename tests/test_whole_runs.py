@@ -37,6 +37,7 @@ def test_poke_check_finds_how_the_mirror_stands_and_writes_it(tmp_path: Path) ->
         "interferometer.mount_angle": 0.611,
         "interferometer.mount_mirrored": True,
         "interferometer.mount_x": 0.001,
+        "interferometer.field_diameter": 0.026,  # the aperture can follow the mirror
         "plate.start_angle": 1.0472,
     }
     wiring = list(next(parameter for parameter in PARAMETERS if parameter.name == "wiring").default)

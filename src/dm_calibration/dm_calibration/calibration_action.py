@@ -18,8 +18,8 @@ from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import TYPICAL_MAP_S, forecast
-from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure.forecast import TYPICAL_MAP_S, GoodEnough, forecast
+from dm_calibration.procedure.plan import LAST_PART_ENDS, Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
@@ -57,7 +57,7 @@ class CalibrateAction:
     ) -> None:
         """`driver_facts` tells of wiring and electronics, see :func:`~.calibration_messages.driver_facts`."""
         self._node, self._values, self._services, self._manager = node, values, services, manager
-        self._driver_facts = driver_facts
+        self._driver_facts, self._enough = driver_facts, GoodEnough(0.0)
 
     def run(self, handle: ServerGoalHandle) -> tuple[str, Calibrate.Result]:
         result = Calibrate.Result()
@@ -68,7 +68,7 @@ class CalibrateAction:
             wait_for_clock(clock)
             started = clock.now()
             plan, options = self._planned(handle.request, mirror)
-            self._forecast(handle.request, plan, result)
+            self._forecast(handle.request, plan, mirror, result)
             if handle.request.dry_run:
                 return "succeed", result
             self._services.check_ready()
@@ -140,27 +140,31 @@ class CalibrateAction:
 
     def _planned(self, goal: Calibrate.Goal, mirror: Mirror) -> tuple[Plan, PlanOptions]:
         """The plan of a goal and what it follows from."""
+        if goal.until and goal.plan != PlanKind.HYSTERESIS:
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"until = {goal.until:g} m: only the plan HYSTERESIS ends early")
         options = PlanOptions(
             poke_amplitude=goal.poke_amplitude or self._values["poke_amplitude"],
             reference_every=goal.reference_every or self._values["reference_every"],
             surfaces=tuple(goal.surfaces),
             degauss=not goal.skip_degauss,
-            hysteresis_maps=goal.hysteresis_maps or self._values["hysteresis_maps"],
+            hysteresis_maps=goal.hysteresis_maps or (LAST_PART_ENDS if goal.until else self._values["hysteresis_maps"]),
+            until=goal.until,
         )
         return make_plan(PlanKind(goal.plan), mirror, options), options
 
-    def _forecast(self, goal: Calibrate.Goal, plan: Plan, result: Calibrate.Result) -> None:
+    def _forecast(self, goal: Calibrate.Goal, plan: Plan, mirror: Mirror, result: Calibrate.Result) -> None:
         """Fill in what is to be expected; the message of a dry run."""
         in_use, map_time = self._manager.in_use, self._services.map_time
-        expected = forecast(plan, goal.settle_time or self._values["settle_time"], in_use, map_time)
+        settle_time = goal.settle_time or self._values["settle_time"]
+        expected = forecast(plan, settle_time, in_use, map_time, mirror, goal.until)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
-            maps = sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
+            maps = expected.maps or sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
             accuracy = ""
             if expected.max_zernike > 0.0:
-                accuracy = f", moves then right to {expected.max_zernike * 1e9:.1f} nm (largest coefficient, 95 %)"
-            elif plan.kind is PlanKind.HYSTERESIS:
-                accuracy = ", accuracy not known without an earlier calibration in use"
+                source = "" if in_use else ", by typical data sheets"
+                reach = f"{expected.max_zernike * 1e9:.1f} nm"
+                accuracy = f", moves then right to {reach} (largest coefficient, 95 %{source})"
             guess = (
                 "" if map_time or in_use is not None else f" if a map takes {TYPICAL_MAP_S:g} s (none was taken yet)"
             )
@@ -185,6 +189,11 @@ class CalibrateAction:
             # Reference frames belong to the phase around them.
             report(_PHASES.get(now.kind, feedback.phase), now.label, now.done)
 
+        def told(reached: float) -> None:
+            feedback.reached_max_zernike = reached
+            self._node.get_logger().info(f"{len(run.outcome.records)} maps: right to {reached * 1e9:.2f} nm")
+
+        enough = self._enough = GoodEnough(handle.request.until, told)
         in_use = self._manager.in_use
         # A full plan solves its shapes on the pokes of this very run.
         model = in_use.fit if in_use and plan.kind is PlanKind.SURFACES else None
@@ -210,6 +219,7 @@ class CalibrateAction:
             outcome=run.outcome,
             keep=run.journal.keep,
             guard=guard,
+            enough=enough,
         )
         return procedure, report
 
@@ -257,10 +267,9 @@ class CalibrateAction:
         result.in_sample_rms, result.held_out_rms = fit.in_sample_rms, fit.held_out_rms
         result.condition_number = fit.condition_number
         result.poke_check_passed, result.poke_findings = check.passed, list(check.findings)
-        channels = self._driver_facts().get("channels", ())
-        changes, beyond = poke_cure(check, mirror, outcome.records[-1], channels)
+        changes, beyond = poke_cure(check, mirror, outcome.records[-1], self._driver_facts().get("channels", ()))
         result.parameters = parameter_text(changes)
-        result.poke_findings += [beyond] if beyond else []
+        result.poke_findings += filter(None, [beyond])
         if calibration is None:
             run.journal.remove()
             if not check.passed:
@@ -284,3 +293,5 @@ class CalibrateAction:
             f"{result.maps} maps, residual {fit.in_sample_rms * 1e9:.2f} nm in sample, "
             f"{fit.held_out_rms * 1e9:.2f} nm held out{found}"
         )
+        if goal.until:
+            result.message += f"; {self._enough.sentence(result.hysteresis_held_out_max_zernike)}"

@@ -21,6 +21,7 @@ CALIBRATE = Fields(
         "settle_time": real(0.0, 0.0, 600.0, "s", zero=_CONFIGURED),
         "maps_per_state": whole(0, 1, 100, zero="1"),
         "hysteresis_maps": whole(0, MAPS_MIN, MAPS_MAX, zero=_CONFIGURED),
+        "until": real(0.0, 1e-12, 1e-3, "m", zero="the whole plan"),
         "note": text(""),
     }
 )

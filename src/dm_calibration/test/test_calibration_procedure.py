@@ -184,7 +184,7 @@ def test_checks_are_shapes_on_the_flat_surface() -> None:
     steps = make_plan(PlanKind.HYSTERESIS, mirror).steps
     planned = {step.label: step.signals for step in steps if step.signals is not None}
     checks = [record for record in outcome.records if record.kind == StepKind.CHECK.value]
-    assert len(checks) == 60
+    assert len(checks) == 40
     shapes = np.array([plant.influence @ planned[record.label] for record in checks])
     left = np.array([record.coefficients for record in checks]) - plant.fit_terms(shapes)
     size = np.median(np.abs(left[:, 3:]).max(axis=1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,17 @@ from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.accuracy import TYPICAL_NOISE, expected_accuracy
+from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.registration import bumps
+from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, StepKind
-from dm_common.optics.zernike import PISTON_TILT
+from dm_common.geometry import pitch
+from dm_common.mirror import Mirror
+from dm_common.optics.piston_tilt import weighted_fit
+from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.zernike import PISTON_TILT, basis
 
 Floats = NDArray[np.float64]
 
@@ -19,23 +28,39 @@ Floats = NDArray[np.float64]
 TYPICAL_MAP_S = 1.0
 #: Fewest pairs of maps of the same command that tell the noise.
 PAIRS_MIN = 4
+#: A run stands still when so many parts together better it by less than this share.
+STANDSTILL_PARTS, STANDSTILL = 2, 0.05
+#: What the data sheets of piezo mirrors say: rise of the surface over an actuator per unit signal, m, and the width of
+#: the bump, standard deviation in pitches.
+TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Attributes: s, and m as `HysteresisFit.held_out_max_zernike`; 0 = not known without an influence function."""
+    """Attributes: s; m as `HysteresisFit.held_out_max_zernike`, 0 = not known without an influence function; maps,
+    0 = all of the plan."""
 
     duration: float
     max_zernike: float
+    maps: int = 0
 
 
-def forecast(plan: Plan, settle_time: float, earlier: Calibration | None, map_time: float = 0.0) -> Forecast:
+def forecast(
+    plan: Plan,
+    settle_time: float,
+    earlier: Calibration | None,
+    map_time: float = 0.0,
+    mirror: Mirror | None = None,
+    until: float = 0.0,
+) -> Forecast:
     """Duration and accuracy to expect of `plan`; accuracy only of hysteresis plans.
 
     Args:
         settle_time: s between command and map.
         earlier: calibration of the same mirror that tells gains and noise; None = there is none.
         map_time: s that the last map took; 0 = none was taken: then as in `earlier`, or TYPICAL_MAP_S.
+        mirror: whose data sheet counts where there is no calibration; None = the accuracy is then not known.
+        until: m at which the run ends, where its plan may.
     """
     steps = [step for step in plan.steps if step.kind is not StepKind.DEGAUSS]
     per_map = settle_time + (map_time or TYPICAL_MAP_S)
@@ -46,10 +71,66 @@ def forecast(plan: Plan, settle_time: float, earlier: Calibration | None, map_ti
     duration = float(time[-1]) if len(time) else 0.0
     signals = [step.signals for step in steps if step.signals is not None]
     check = np.array([step.kind is StepKind.CHECK for step in steps], dtype=bool)
-    if earlier is None or len(signals) < len(steps) or not check.any():
+    if (earlier is None and mirror is None) or len(signals) < len(steps) or not check.any():
         return Forecast(duration, 0.0)
-    found = expected_accuracy(np.array(signals), time, check, map_noise(earlier.maps), earlier.fit.influence_zernike)
-    return Forecast(duration, found.max_zernike)
+    if earlier is not None:
+        noise, influence = map_noise(earlier.maps), earlier.fit.influence_zernike
+    else:
+        assert mirror is not None
+        noise, influence = TYPICAL_NOISE, typical_influence(mirror)
+    parts = [*(end - 1 for end in sorted(plan.ends)), len(steps)]  # the degauss is no step here
+    for part in parts:
+        found = expected_accuracy(np.array(signals[:part]), time[:part], check[:part], noise, influence)
+        if found.max_zernike <= until:
+            break
+    return Forecast(float(time[part - 1]), found.max_zernike, part)
+
+
+def typical_influence(mirror: Mirror) -> Floats:
+    """(21, N) m per unit signal, as the data sheet of a piezo mirror lets expect."""
+    points = edge_clustered_points()
+    places = np.asarray((mirror.x + 1j * mirror.y) / mirror.working_radius, dtype=np.complex128)
+    shape, size = bumps(places, TYPICAL_WIDTH * pitch(places.real, places.imag), points)
+    return weighted_fit(TYPICAL_RISE * size[:, None] * shape, basis(points.x, points.y), points.weight).T
+
+
+class GoodEnough:
+    """Whether a hysteresis run may end: it is accurate enough, or more maps do not help.
+
+    Args:
+        until: m, as `HysteresisFit.held_out_max_zernike`.
+        tell: called with what each part of the run reached, m.
+
+    Attributes:
+        reached: m, after each part.
+    """
+
+    def __init__(self, until: float, tell: Callable[[float], None] = lambda reached: None) -> None:
+        self._until, self._tell = until, tell
+        self.reached: list[float] = []
+
+    def __call__(self, outcome: Outcome) -> bool:
+        try:
+            found = fit_hysteresis(outcome.maps()).held_out_max_zernike
+        except TooFewMapsError:
+            return False
+        self.reached.append(found)
+        self._tell(found)
+        return found <= self._until or self._no_longer_better
+
+    @property
+    def _no_longer_better(self) -> bool:
+        """Whether the last parts have bettered the best of those before by too little."""
+        before, last = self.reached[:-STANDSTILL_PARTS], self.reached[-STANDSTILL_PARTS:]
+        return bool(before) and min(last) > (1.0 - STANDSTILL) * min(before)
+
+    def sentence(self, found: float) -> str:
+        """What a run that ended at `found` (m) has reached of what was asked."""
+        if found <= self._until:
+            return f"{self._until * 1e9:.2g} nm is reached: {found * 1e9:.2g} nm"
+        way = ", ".join(f"{value * 1e9:.2g}" for value in self.reached)
+        why = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
+        return f"{self._until * 1e9:.2g} nm is not reached, {found * 1e9:.2g} nm is: {why}; part by part {way} nm"
 
 
 def map_noise(maps: MapSet) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,10 @@ Floats = NDArray[np.float64]
 
 #: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
 HYSTERESIS_REFERENCE_EVERY = 100
+#: Commands after which a run may first end when it is accurate enough, and after which again; each part has its checks.
+FIRST_PART, NEXT_PART = 120, 60
+#: Commands after which it ends in any case, where the goal gives no other number.
+LAST_PART_ENDS = 420
 #: Share of the neighbour limit that checks may use: rounding must not break it.
 CHECK_ROOM = 0.999
 
@@ -78,7 +83,8 @@ class PlanOptions:
         reference_every: steps between two reference frames.
         surfaces: names of Table 1; empty = all.
         degauss: whether to start with a degauss.
-        hysteresis_maps: commands of a hysteresis plan.
+        hysteresis_maps: commands of a hysteresis plan, at most.
+        until: accuracy at which a hysteresis plan may end, m; 0 = never before its end.
     """
 
     poke_amplitude: float = 0.5
@@ -86,6 +92,7 @@ class PlanOptions:
     surfaces: Sequence[str] = ()
     degauss: bool = True
     hysteresis_maps: int = 200
+    until: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.poke_amplitude <= 1.0:
@@ -96,11 +103,12 @@ class PlanOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps in order, and what differs from what was asked."""
+    """The steps in order, what differs from what was asked, and the steps before which the run may end."""
 
     kind: PlanKind
     steps: tuple[Step, ...]
     remarks: tuple[str, ...] = field(default=())
+    ends: frozenset[int] = frozenset()
 
     @property
     def needs_model(self) -> bool:
@@ -138,16 +146,36 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     """
     if not options.degauss:
         raise ValueError("skip_degauss = true: hysteresis can only be identified from a degauss on")
-    commands = excitation(mirror, options.hysteresis_maps)
+    parts = [excitation(mirror, count, seed) for seed, count in enumerate(_parts(options))]
     steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
     steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]
-    rows = zip(commands.signals, commands.dwell, commands.settle_share, commands.check, strict=True)
-    for k, (signals, dwell, share, check) in enumerate(rows):
+    ends = set[int]()
+    rows = (
+        zip(part.signals, part.dwell, part.settle_share, part.check, np.arange(len(part.check)) == 0, strict=True)
+        for part in parts
+    )
+    for k, (signals, dwell, share, check, first) in enumerate(chain.from_iterable(rows)):
+        if first and k:
+            ends.add(len(steps))
         kind = StepKind.CHECK if check else StepKind.EXCITATION
         steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell), settle_share=float(share)))
         if (k + 1) % HYSTERESIS_REFERENCE_EVERY == 0:
             steps.append(Step(f"reference {2 + k // HYSTERESIS_REFERENCE_EVERY}", StepKind.REFERENCE, mirror.rest))
-    return Plan(PlanKind.HYSTERESIS, tuple(steps))
+    return Plan(PlanKind.HYSTERESIS, tuple(steps), ends=frozenset(ends))
+
+
+def _parts(options: PlanOptions) -> list[int]:
+    """Commands of each part of a hysteresis plan: one, or where it may end early some."""
+    left = options.hysteresis_maps
+    if not options.until:
+        return [left]
+    parts = [min(FIRST_PART, left)]
+    while (left := options.hysteresis_maps - sum(parts)) > 0:
+        # A rest that is too short to be a part of its own joins the last.
+        parts.append(NEXT_PART if left >= 2 * NEXT_PART else left)
+    if parts[-1] < NEXT_PART and len(parts) > 1:
+        parts[-2:] = [parts[-2] + parts[-1]]
+    return parts
 
 
 def check_shape(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:

@@ -60,6 +60,7 @@ class Procedure:
         outcome: Outcome | None = None,
         keep: Callable[[Event], None] = lambda event: None,
         guard: Callable[[], None] = lambda: None,
+        enough: Callable[[Outcome], bool] = lambda outcome: False,
     ) -> None:
         """Prepare a run.
 
@@ -68,6 +69,7 @@ class Procedure:
             outcome: of a run of the same plan that was cut off; None = begin.
             keep: called with each event before it counts; what it raises ends the run.
             guard: asked before each step; what it raises ends the run.
+            enough: asked where the plan may end, whether it does.
         """
         self.outcome = outcome or Outcome(remarks=list(plan.remarks))
         self._plan, self._mirror, self._bench = plan, mirror, bench
@@ -75,6 +77,7 @@ class Procedure:
         self._model = model
         self._progress, self._cancelled, self._keep, self._guard = progress, cancelled, keep, guard
         self._failures = 0
+        self._enough = enough
         self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._checkpoint, guard)
 
     @property
@@ -97,8 +100,11 @@ class Procedure:
             if self.outcome.records:
                 self._go_on()
             for number, planned in enumerate(steps):
-                if not self._is_done(number, planned):
-                    self._do(planned, number)
+                if self._is_done(number, planned):
+                    continue
+                if number in self._plan.ends and self._enough(self.outcome):
+                    break
+                self._do(planned, number)
         self._report(steps[-1].label, steps[-1].kind, len(steps))
         return self.outcome
 

@@ -7,7 +7,7 @@ Kalman filter, which is recursive least squares with that forgetting (Ljung, Sys
 11.3).
 
 An estimate of drift is noise as well, and on a mirror that stands still nothing else: taken over as it is, it makes the
-calibration worse. So each map is first a test of what the maps before it made out: the change that they foretell for it,
+calibration worse. So each map is first a test of what the maps before it made out: the change that they foretell,
 against the change that it shows. Only the share of the former that this evidence carries is used (the positive-part
 estimate of a regression through the origin, less one standard error), none of it before a second shape was measured.
 
@@ -21,13 +21,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtri
 
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
 from dm_calibration.hysteresis.reduction import Reduction
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.recalibration.displaced import displaced_actuators
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
@@ -38,11 +39,6 @@ DAY_S = 86400.0
 NOISE_SHARE_MIN = 0.1
 #: The same in m^2, for maps without any noise.
 NOISE_MIN = 1e-24
-#: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
-#: that fits noise best explains about 0.13.
-DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
-#: How far an actuator that stands elsewhere is from where it should be, normalised.
-DISPLACED_SIGMA = 0.5
 #: What evidence counts for after one more map: it is of the last thirty maps or so.
 EVIDENCE_KEPT = 0.97
 #: Gains of actuators that hardly show are not known worse than this.
@@ -219,7 +215,7 @@ class DriftFilter:
             0,
             *evidence,
         )
-        displaced, probability = _displaced(innovation, self._gain, factor)
+        displaced, probability = displaced_actuators(innovation, self._gain, factor)
         return Comparison(
             max_zernike=float(np.abs(coefficients - predicted)[PISTON_TILT:].max()),
             rms=float(rms(departure, self._fit.points.weight)),
@@ -275,47 +271,3 @@ def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool])
     largest = -ndtri(0.5 * (1.0 - 0.5 ** (1.0 / size)))
     single = np.abs(innovation / np.sqrt(np.diag(expected))).max() / largest
     return float(max(together, single))
-
-
-def _displaced(
-    innovation: Floats, gain: Floats, factor: tuple[Floats, bool]
-) -> tuple[dict[int, float], dict[int, float]]:
-    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares; and
-    the probability of each.
-
-    Args:
-        gain: (R, N) per unit of effective signal.
-        factor: Cholesky factor of the expected covariance (R, R).
-    """
-    white = solve_triangular(factor[0], np.column_stack((gain, innovation)), trans="T")
-    columns, whole = white[:, :-1], white[:, -1]
-    power = np.maximum(np.square(columns).sum(axis=0), np.finfo(np.float64).tiny)
-    left, found, amounts = whole, list[int](), np.zeros(0)
-    while len(found) < DISPLACED_MAX and left @ left > len(left):
-        explained = np.square(columns.T @ left) / power
-        best = int(explained.argmax())
-        if explained[best] < DISPLACED_SHARE * (left @ left):
-            break
-        found.append(best)
-        amounts = np.linalg.lstsq(columns[:, found], whole)[0]
-        left = whole - columns[:, found] @ amounts
-    order = [int(k) for k in np.argsort(-np.abs(amounts))]
-    probability = {}
-    for k in order:
-        of_this = left + columns[:, found[k]] * amounts[k]
-        probability[found[k]] = _probability(columns, power, of_this, found[k])
-    return {found[k]: float(amounts[k]) for k in order}, probability
-
-
-def _probability(columns: Floats, power: Floats, white: Floats, actuator: int) -> float:
-    """That `actuator` alone makes the difference `white` (R,), and neither another one nor something else.
-
-    An actuator may be anywhere in its range; something else differs everywhere, as much as `white` does. Half of the
-    prior is the actuators', the other half that of something else.
-    """
-    size, whole = len(white), float(white @ white)
-    precision = 1.0 / DISPLACED_SIGMA**2
-    evidence = 0.5 * np.square(columns.T @ white) / (power + precision) - 0.5 * np.log1p(power / precision)
-    something = 0.5 * (whole - size) - 0.5 * size * np.log(whole / size) if whole > size else 0.0
-    all_of_them = np.append(evidence - np.log(evidence.size), something)
-    return float(np.exp(all_of_them[actuator] - np.logaddexp.reduce(all_of_them)))

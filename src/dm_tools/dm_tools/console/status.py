@@ -162,6 +162,8 @@ PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
 def calibration_step(feedback: Any) -> str:
     """Feedback of the action `calibrate`: phase, what is measured, what was dropped."""
     dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
+    if feedback.reached_max_zernike > 0.0:
+        dropped += f", right to {feedback.reached_max_zernike * 1e9:.2g} nm so far"
     phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
     return f"{phase} {feedback.label}{dropped}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,6 +49,18 @@ def run_calibration(client: Any, goal: Any) -> Any:
         result = client.calibrate(goal, show)
         progress.update(task, description="calibration: done", completed=progress.tasks[0].total or 0)
     return result
+
+
+def metres(text: str) -> float:
+    """A length with its unit, such as 2nm, in m.
+
+    Raises:
+        typer.BadParameter: another form, or a unit that is none of a surface.
+    """
+    found = re.fullmatch(r"\s*(\d+|\d*\.\d+)\s*(pm|nm|um)\s*", text)
+    if found is None:
+        raise typer.BadParameter(f"--until {text!r}: must be a number with pm, nm or um, such as 2nm")
+    return float(found[1]) * {"pm": 1e-12, "nm": 1e-9, "um": 1e-6}[found[2]]
 
 
 def start_fresh(client: Any) -> None:
@@ -165,6 +178,13 @@ def calibrate(
         int | None,
         typer.Option(min=60, max=2000, help="Maps of the hysteresis plan; none = as configured."),
     ] = None,
+    until: Annotated[
+        str,
+        typer.Option(
+            help="End a hysteresis run as soon as 95 % of moves are right to this, such as 2nm; --hysteresis is then "
+            "the most maps."
+        ),
+    ] = "",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict duration and accuracy, move nothing.")] = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Begin anew; an interrupted run of the same plan is set aside.")
@@ -193,11 +213,12 @@ def calibrate(
 
     from dm_client import DeformableMirrorError
 
-    if hysteresis is not None:
+    if hysteresis is not None or until:
         plan = CalibrationPlan.hysteresis
     goal = Calibrate.Goal(
         plan=list(CalibrationPlan).index(plan),
         hysteresis_maps=hysteresis or 0,
+        until=metres(until) if until else 0.0,
         dry_run=dry_run,
         surfaces=[name.strip() for name in surfaces.split(",") if name.strip()],
         poke_amplitude=amplitude,
@@ -225,6 +246,8 @@ def calibrate(
         if result.message.startswith("resumed run"):
             console.print(result.message.partition(";")[0])
         show_result(result)
+        if until:
+            console.print(next(part for part in result.message.split("; ") if "reached" in part))
     write_json(json, {"calibration": figures_of(result)})
     if dry_run:
         next_step("the same without --dry-run measures")

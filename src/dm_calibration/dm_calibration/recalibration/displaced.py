@@ -1,0 +1,59 @@
+"""Which single actuators a map that disagrees comes from, and how probable that is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+Floats = NDArray[np.float64]
+
+#: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
+#: that fits noise best explains about 0.13.
+DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
+#: How far an actuator that stands elsewhere is from where it should be, normalised.
+DISPLACED_SIGMA = 0.5
+
+
+def displaced_actuators(
+    innovation: Floats, gain: Floats, factor: tuple[Floats, bool]
+) -> tuple[dict[int, float], dict[int, float]]:
+    """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares; and
+    the probability of each.
+
+    Args:
+        gain: (R, N) per unit of effective signal.
+        factor: Cholesky factor of the expected covariance (R, R).
+    """
+    white = solve_triangular(factor[0], np.column_stack((gain, innovation)), trans="T")
+    columns, whole = white[:, :-1], white[:, -1]
+    power = np.maximum(np.square(columns).sum(axis=0), np.finfo(np.float64).tiny)
+    left, found, amounts = whole, list[int](), np.zeros(0)
+    while len(found) < DISPLACED_MAX and left @ left > len(left):
+        explained = np.square(columns.T @ left) / power
+        best = int(explained.argmax())
+        if explained[best] < DISPLACED_SHARE * (left @ left):
+            break
+        found.append(best)
+        amounts = np.linalg.lstsq(columns[:, found], whole)[0]
+        left = whole - columns[:, found] @ amounts
+    order = [int(k) for k in np.argsort(-np.abs(amounts))]
+    probability = {}
+    for k in order:
+        of_this = left + columns[:, found[k]] * amounts[k]
+        probability[found[k]] = _probability(columns, power, of_this, found[k])
+    return {found[k]: float(amounts[k]) for k in order}, probability
+
+
+def _probability(columns: Floats, power: Floats, white: Floats, actuator: int) -> float:
+    """That `actuator` alone makes the difference `white` (R,), and neither another one nor something else.
+
+    An actuator may be anywhere in its range; something else differs everywhere, as much as `white` does. Half of the
+    prior is the actuators', the other half that of something else.
+    """
+    size, whole = len(white), float(white @ white)
+    precision = 1.0 / DISPLACED_SIGMA**2
+    evidence = 0.5 * np.square(columns.T @ white) / (power + precision) - 0.5 * np.log1p(power / precision)
+    something = 0.5 * (whole - size) - 0.5 * size * np.log(whole / size) if whole > size else 0.0
+    all_of_them = np.append(evidence - np.log(evidence.size), something)
+    return float(np.exp(all_of_them[actuator] - np.logaddexp.reduce(all_of_them)))
