@@ -288,11 +288,13 @@ def build_workspace() -> None:
         return
     check_tools()
     cmake = ["-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={PYTHON}"] + ([] if sourced_jazzy() else ["-GNinja"])
+    # By itself colcon lets a build wait for as long as the machine is busy with anything else.
+    environment = {"MAKEFLAGS": f"-j{os.cpu_count() or 1}", **wheel_environment()}
     run_logged(
         [str(PYTHON), "-m", "colcon", "build", "--symlink-install", "--base-paths", "src", "--cmake-args", *cmake],
         ROOT / "log" / "colcon.log",
         "building the workspace",
-        wheel_environment(),
+        environment,
     )
     for link in (ROOT / "install").rglob("*"):  # of files that were moved or renamed
         if link.is_symlink() and not link.exists():
