@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import defocused_camera
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
@@ -21,9 +22,9 @@ from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, 
 from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
 from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 
-from dm_autofocus.optics import FocusOptics, distance_of
+from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
 from dm_common.ros import qos
 from support import NodeProcess, Observer, wait_until
 
@@ -48,12 +49,15 @@ class FilmedScene:
         self.object_curvature = object_curvature
         self.refuse_beyond = HIGH
         self.requests: list[FocusRequest] = []
+        self.history_known = False
+        self.render: Callable[[float], np.ndarray] | None = None  # a curvature's image, instead of the plane's
         self.texture = 100 + 40 * np.random.default_rng(5).standard_normal((48, 64))
         self._lock = threading.Lock()
         self._noise = np.random.default_rng(6)
         self._curvature = 0.0
         self._stands_at = 0.0
         self._pending: FocusState | None = None
+        self.info = self.node.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
         self._image = self.node.create_publisher(Image, "image_raw", qos_profile_sensor_data)
         self._state = self.node.create_publisher(FocusState, "focus_state", qos.STATE)
         self._driver = self.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
@@ -66,12 +70,16 @@ class FilmedScene:
         self._camera = threading.Thread(target=self._film, args=(1 / rate,), daemon=True)
 
     def __enter__(self) -> FilmedScene:
-        capabilities = Capabilities(
-            quality=Capabilities.CALIBRATED, curvature_min=LOW, curvature_max=HIGH, aperture_radius=RADIUS
-        )
-        self._capabilities.publish(capabilities)
+        self.aperture(RADIUS)
         self._camera.start()
         return self
+
+    def aperture(self, radius: float) -> None:
+        """Publish capabilities with an aperture of this radius, m."""
+        capabilities = Capabilities(
+            quality=Capabilities.CALIBRATED, curvature_min=LOW, curvature_max=HIGH, aperture_radius=radius
+        )
+        self._capabilities.publish(capabilities)
 
     def __exit__(self, *_exception: object) -> None:
         self._stop.set()
@@ -80,6 +88,7 @@ class FilmedScene:
     def _judge(self, request: FocusRequest) -> FocusState:
         state = FocusState(curvature=request.curvature, signals=[request.curvature] * 3)
         state.applied = abs(request.curvature) <= self.refuse_beyond
+        state.history_known = self.history_known
         state.header.stamp = self.node.get_clock().now().to_msg()
         if not state.applied:
             state.error_code, state.message = ErrorCode.UNREACHABLE, "curvature: beyond the played range"
@@ -109,6 +118,9 @@ class FilmedScene:
                     report = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE, requested=self._pending.signals)
                     report.header.stamp, self._pending = exposed, None
                     self._driver.publish(report)
+            if self.render is not None:
+                self._publish_image(self.render(self._curvature), exposed)
+                continue
             blurred = gaussian_filter(self.texture, 0.6 + 400 * off, mode="wrap") * (4.0 if moving else 1.0)
             blurred += self._noise.standard_normal(blurred.shape)
             self._publish_image(np.clip(blurred, 0, 255).astype(np.uint8), exposed)
@@ -144,6 +156,27 @@ def test_the_sharpest_focus_is_found_and_told_as_distance(scene: FilmedScene, ob
     assert found.images == len(feedback)
     assert scene.requests[-1].curvature == found.curvature
     assert {item.phase for item in feedback} == {AutofocusState.PHASE_COARSE, AutofocusState.PHASE_FINE}
+
+
+def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer: Observer) -> None:
+    lens, camera = defocused_camera.LENS, defocused_camera.DefocusedCamera(defocused_camera.clouds(), 0.0173)
+    scene.aperture(lens.aperture_radius)
+    scene.render = lambda curvature: camera.expose(curvature).astype(np.uint8)
+    scene.history_known = True
+
+    def known() -> bool:
+        scene.info.publish(CameraInfo(k=[lens.focal_length_px, *8 * [0.0]]))
+        return scene.node.count_subscribers("camera_info") > 0
+
+    wait_until(known, what="the node to listen")
+    time.sleep(0.3)
+    known()
+    wait_until(lambda: scene.states[-1].sharpness < 0.1, what="an image of the known camera")
+    scene.requests.clear()
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.OK, found.message
+    assert found.curvature == pytest.approx(0.0173, abs=depth_of_focus(lens.aperture_radius) / 2)
+    assert found.images <= 10 and len(scene.requests) <= found.images + 1, "nothing is passed without an image"
 
 
 def test_what_the_controller_refuses_is_left_out(scene: FilmedScene, observer: Observer) -> None:

@@ -104,6 +104,9 @@ def compare(
         int,
         typer.Option(min=0, help="So many mirrors drawn at random, one a seed, from --seed on: open loop, all told."),
     ] = 0,
+    autofocus: Annotated[
+        int, typer.Option(min=0, help="So many scenes drawn at random, from --seed on: searches of the sharpest focus.")
+    ] = 0,
     quick: Annotated[
         bool, typer.Option("--quick", help="With --hysteresis or --mirrors: fewer maps and requests.")
     ] = False,
@@ -115,11 +118,16 @@ def compare(
     With --hysteresis it is models that are compared, in open loop: any order, dwell times from 0.1 s to 10 min, tracked
     from the calibration on, after a degauss and after a power cycle.
     With --mirrors it is mirrors: each of another law and other parameters, at the shipped limits, with restarts.
+    With --autofocus it is searches of the sharpest focus: images and time that each takes, and how far off it ends.
     """
-    if mirrors:
+    if mirrors or autofocus:
         if seed and len(seed) > 1:
-            raise typer.BadParameter("with --mirrors it is the first of the seeds: give one", param_hint="--seed")
-        _compare_mirrors(seed[0] if seed else 1, mirrors, quick, json)
+            raise typer.BadParameter("here it is the first of the seeds: give one", param_hint="--seed")
+        first = seed[0] if seed else 1
+        if mirrors:
+            _compare_mirrors(first, mirrors, quick, json)
+        else:
+            _compare_autofocus(first, autofocus, json)
         return
     if hysteresis:
         _compare_hysteresis(plant, tuple(seed or (1,)), creep, pixels, quick, json)
@@ -191,4 +199,14 @@ def _compare_mirrors(first: int, count: int, quick: bool, json: Path | None) -> 
     compare_mirrors.show(rows)
     figures = {"seeds": [row["seed"] for row in rows], "population": compare_mirrors.figures_of(rows), "mirrors": rows}
     write_json(json, figures | {"seconds": time.monotonic() - started})
+    console.print(f"done in {time.monotonic() - started:.0f} s")
+
+
+def _compare_autofocus(first: int, count: int, json: Path | None) -> None:
+    from studies.verbs import compare_autofocus
+
+    started = time.monotonic()
+    figures, false = compare_autofocus.run(first, count)
+    compare_autofocus.show(figures, false)
+    write_json(json, {"first_seed": first, "scenes": count, "searches": figures, "without_texture": false})
     console.print(f"done in {time.monotonic() - started:.0f} s")

@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from dm_msgs.action import Autofocus
 from dm_msgs.msg import Capabilities
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
+from dm_autofocus.defocus_model import DefocusModel, FocusLens
+from dm_autofocus.defocus_search import BEYOND, FocusSearch
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
-from dm_autofocus.search import NOISE_POINTS, Peak, PeakSearch, Phase, SearchConfig
-from dm_autofocus.sharpness import Region, check_region
+from dm_autofocus.search import NOISE_POINTS, Peak, Phase, SearchConfig
+from dm_autofocus.sharpness import Region, check_region, cut
 from dm_autofocus.tracking import TrackConfig, Tracker
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import WorkerActionServer
@@ -23,6 +27,8 @@ from dm_common.values import Fields, real, reals
 
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
 MARGIN = 0.002
+#: Uncertainty of the mirror's curvature with which it stands where it is sent, in depths of focus.
+TRUSTED = 2.0
 
 
 def ready_capabilities(probe: FocusProbe) -> Capabilities:
@@ -125,7 +131,7 @@ class AutofocusAction:
                 tolerance,
                 max(NOISE_POINTS, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance))),
                 values["search.fine_points"],
-                values["search.approach"],
+                0.0,
                 values["search.least_contrast"],
             ), region
         except ValueError as error:
@@ -138,36 +144,65 @@ class AutofocusAction:
             The peak, and the search with the range that was possible: it depends on the actuators' history too.
         """
         before = self._probe.curvature
-        search = PeakSearch(config)
+        approach = self._values["search.approach"]
+        search = FocusSearch(replace(config, approach=0.0), self._model(config, region), before)
         while not search.done:
             step = search.step
             try:
-                sample = self._visit(goal_handle, step.curvature, region if step.measured else None)
+                self._go(goal_handle, step.curvature)
             except Refusal as error:
                 if error.error_code != ErrorCode.UNREACHABLE:
                     raise
                 self._draw_in(search, error)
                 continue
-            if sample is None:
+            if search.config.approach < approach and not self._stands_where_sent():
+                search.sweep("the mirror's hysteresis is not known", approach)
+                continue
+            if not step.measured:
                 search.feed(None)
                 continue
-            phase = search.phase
-            search.feed(sample.sharpness)
-            self._report(
-                goal_handle, phase, sample, step.curvature, search.measured, max(config.steps, search.measured)
-            )
+            phase, sample = search.phase, self._measure(goal_handle, region)
+            search.feed(sample.sharpness, sample.regions)
+            self._report(goal_handle, phase, sample, step.curvature, search.measured, search.steps)
         if search.peak is None:
             if math.isfinite(before):
-                self._visit(goal_handle, before, None)
+                self._go(goal_handle, before)
             raise Refusal(
                 ErrorCode.NOT_CONVERGED,
                 "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
                 "the range; the mirror is back where it was",
             )
-        self._visit(goal_handle, search.step.curvature, None)
+        self._go(goal_handle, search.step.curvature)
         return search.peak, search.config
 
-    def _draw_in(self, search: PeakSearch, error: Refusal) -> None:
+    def _model(self, config: SearchConfig, region: Region) -> DefocusModel | None:
+        """How images of the region are blurred; None = not known."""
+        values, capabilities = self._values, ready_capabilities(self._probe)
+        image, info = self._probe.newest, self._probe.camera_info
+        focal_length = values["optics.focal_length_px"]
+        if focal_length == 0 and info is not None:
+            focal_length = info.k[0] / max(info.binning_x, 1)
+        if not (values["search.few_images"] and focal_length > 0 and image is not None):
+            return None
+        # Behind a relay that widens the beam m times, angles are m times smaller.
+        focal_length *= values["optics.relay_magnification"]
+        lens = FocusLens(capabilities.aperture_radius, values["optics.wavelength"], focal_length)
+        try:
+            shape = cut(np.empty((image.height, image.width), np.uint8), region).shape
+            return DefocusModel(shape, lens, config.high - config.low + BEYOND * config.tolerance)
+        except ValueError:  # too small, and what measures the image says so where it matters
+            return None
+
+    def _stands_where_sent(self) -> bool:
+        """Whether the mirror has the curvature that was asked for, by what the controller answered last."""
+        answer, capabilities = self._probe.answer, ready_capabilities(self._probe)
+        if answer is None or not answer.history_known:
+            return False
+        # A coefficient z of defocus over the radius a, z (2 r^2 / a^2 - 1), is the curvature 4 z / a^2.
+        uncertainty = 4 * answer.predicted_max_zernike_upper / capabilities.aperture_radius**2
+        return uncertainty < TRUSTED * depth_of_focus(capabilities.aperture_radius, self._values["optics.wavelength"])
+
+    def _draw_in(self, search: FocusSearch, error: Refusal) -> None:
         try:
             search.refuse()
         except ValueError as reason:
@@ -184,7 +219,7 @@ class AutofocusAction:
         while True:
             wanted = tracker.step.curvature
             if wanted != position:
-                self._visit(goal_handle, wanted, None)
+                self._go(goal_handle, wanted)
                 position = wanted
             sample = self._measure(goal_handle, region)
             tracker.feed(sample.sharpness)
@@ -202,11 +237,9 @@ class AutofocusAction:
                 tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
             self._fill(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
 
-    def _visit(self, goal_handle: ServerGoalHandle, curvature: float, region: Region | None) -> SharpnessSample | None:
-        """Go to a curvature and, given a region, measure there."""
+    def _go(self, goal_handle: ServerGoalHandle, curvature: float) -> None:
         self._probe.move(curvature, lambda: self._stopping(goal_handle))
         self._check_stop(goal_handle)
-        return None if region is None else self._measure(goal_handle, region)
 
     def _measure(self, goal_handle: ServerGoalHandle, region: Region) -> SharpnessSample:
         sample = self._probe.measure(region, lambda: self._stopping(goal_handle))

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from dm_autofocus.optics import FocusOptics
 from dm_autofocus.sharpness import METRICS, check_region
-from dm_common.ros.parameters import Parameter, real, reals, text, whole
+from dm_common.ros.parameters import Parameter, real, reals, switch, text, whole
 
 PARAMETERS: Final = (
     Parameter(
@@ -28,6 +28,11 @@ PARAMETERS: Final = (
         "How far the entrance pupil lies behind the point that object distances count from.",
     ),
     Parameter("optics.wavelength", real(550e-9, 1e-7, 2e-5, "m"), "Mean wavelength of the images."),
+    Parameter(
+        "optics.focal_length_px",
+        real(0.0, 0.0, 1e7, "px"),
+        "Focal length of the camera over its pixel pitch; 0 = fx of camera_info. With it a search takes few images.",
+    ),
     Parameter("metric", text("tenengrad", choices=tuple(METRICS)), "Figure of sharpness.", live=True),
     Parameter(
         "region",
@@ -59,8 +64,13 @@ PARAMETERS: Final = (
     Parameter(
         "search.approach",
         real(1.0, 0.0, 1.0, "1/m"),
-        "Every sweep begins this far below its first position, but not below the range. The whole range puts all "
-        "sweeps on one branch of the hysteresis, less is quicker.",
+        "Where the controller does not know the mirror's hysteresis, every sweep begins this far below its first "
+        "position, but not below the range: the whole range puts all sweeps on one branch of it, less is quicker.",
+    ),
+    Parameter(
+        "search.few_images",
+        switch(True),
+        "Find the focus from how blurred a few images are, where the optics are known; false = always sweep the range.",
     ),
     Parameter(
         "search.least_contrast",

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.msg import ActuatorState, Capabilities, FocusRequest, FocusState
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 
-from dm_autofocus.gate import SettledGate
-from dm_autofocus.images import ImageError, grey
+from dm_autofocus.images import ImageError, SettledGate, grey
 from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
@@ -30,10 +30,11 @@ IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=Reliab
 
 @dataclass(frozen=True)
 class SharpnessSample:
-    """Sharpness of an image and the header it came with."""
+    """Sharpness of an image, the header it came with, and its region (H, W); of several, all regions."""
 
     sharpness: float
     header: Any
+    regions: tuple[NDArray, ...]
 
 
 class FocusProbe:
@@ -48,6 +49,8 @@ class FocusProbe:
         curvature: as taken last, whoever asked for it [1/m]; NaN before.
         target: as asked for by `move` last [1/m]; NaN after `release`.
         newest: the latest image; None before the first.
+        camera_info: the latest; None before the first.
+        answer: of the controller to the latest `move`; None before it.
         counted, dropped: images since `start`.
     """
 
@@ -58,9 +61,10 @@ class FocusProbe:
         self.capabilities: Capabilities | None = None
         self.curvature = math.nan
         self.newest: Image | None = None
+        self.camera_info: CameraInfo | None = None
         self.counted = self.dropped = 0
         self._driver: ActuatorState | None = None
-        self._answer: FocusState | None = None
+        self.answer: FocusState | None = None
         self.target = math.nan
         self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
         self._other_request: float | None = None  # of another node, since `start` [1/m]
@@ -69,6 +73,7 @@ class FocusProbe:
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self._topic = node.resolve_topic_name("image_raw")
         node.create_subscription(Image, "image_raw", self._on_image, IMAGES)
+        node.create_subscription(CameraInfo, "camera_info", self._on_camera_info, IMAGES)
         node.create_subscription(FocusState, "focus_state", self._on_focus_state, qos.STATE)
         node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         node.create_subscription(Capabilities, "capabilities", self._on_capabilities, qos.LATCHED)
@@ -77,6 +82,9 @@ class FocusProbe:
 
     def _on_capabilities(self, message: Capabilities) -> None:
         self.capabilities = message
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        self.camera_info = message
 
     def _on_image(self, message: Image) -> None:
         with self._changed:
@@ -95,7 +103,7 @@ class FocusProbe:
             if math.isnan(self.target):
                 return
             if message.curvature == self.target:
-                self._answer = self._answer or message
+                self.answer = self.answer or message
             elif message.applied and message.curvature not in self._asked:
                 self._other_request = message.curvature
             self._changed.notify_all()
@@ -107,7 +115,7 @@ class FocusProbe:
             self._changed.notify_all()
 
     def _update_gate(self) -> None:
-        answer, driver = self._answer, self._driver
+        answer, driver = self.answer, self._driver
         if answer is None or driver is None or not answer.applied:
             return
         wanted = np.asarray(answer.signals)
@@ -129,16 +137,16 @@ class FocusProbe:
         """
         with self._changed:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
-            self._answer = None
+            self.answer = None
             self.target = curvature
             self._asked.append(curvature)
         self._request.publish(FocusRequest(curvature=curvature, mode=FocusRequest.MODE_DIRECT))
         limit = self._values["move_timeout"]
-        if not self._wait(lambda: self._answer is not None, limit, stop):
+        if not self._wait(lambda: self.answer is not None, limit, stop):
             raise Refusal(
                 ErrorCode.TIMEOUT, f"no answer to a focus request within {limit:g} s: is focus_controller running?"
             )
-        answer = self._answer
+        answer = self.answer
         if answer is None:
             return
         if not answer.applied:
@@ -177,7 +185,8 @@ class FocusProbe:
                 self.counted += 1
         finally:
             self._measuring = False
-        return SharpnessSample(statistics.median(sample.sharpness for sample in samples), samples[-1].header)
+        sharpness = statistics.median(sample.sharpness for sample in samples)
+        return SharpnessSample(sharpness, samples[-1].header, tuple(sample.regions[0] for sample in samples))
 
     def sharpness_of(self, message: Image, region: Region) -> SharpnessSample:
         """Sharpness of an image in a region.
@@ -186,10 +195,11 @@ class FocusProbe:
             Refusal: the image cannot be used.
         """
         try:
-            sharpness = METRICS[self._values["metric"]](cut(grey(message), region))
+            part = cut(grey(message), region)
+            sharpness = METRICS[self._values["metric"]](part)
         except (ImageError, ValueError) as error:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self._topic}: {error}") from error
-        return SharpnessSample(sharpness, message.header)
+        return SharpnessSample(sharpness, message.header, (part,))
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
         """Wait for a condition or `stop()`; False when neither came in time. Raises Refusal on another's move."""

@@ -4,10 +4,13 @@ It knows nothing of cameras, mirrors or time. Whoever drives it goes to `step.cu
 `step.measured` says so, and calls `feed`.
 
 Coarse to fine [23, 25]: a sweep over the whole range finds the hill, sweeps over two steps of the one before climb it,
-a parabola through the best points of the last gives its top. Every sweep, and the final move to the top, first goes to
-the same turning point below: by default the low end of the range. Hysteresis forgets what lies between two turning
-points once it is passed again, so that all of them rise on the same branch. Without that the hill that a long sweep saw
-is not where a short one expects it. A sweep that sees the hill rise beyond its own end is repeated around that end.
+a parabola through the best points of the last gives its top. A sweep that sees the hill rise beyond its own end is
+repeated around that end.
+
+Where the mirror's hysteresis is not known (`approach` above 0), every sweep, and the final move to the top, first goes
+to the same turning point below. Hysteresis forgets what lies between two turning points once it is passed again, so
+that all of them rise on the same branch. Without that the hill that a long sweep saw is not where a short one expects
+it.
 """
 
 from __future__ import annotations
@@ -57,7 +60,8 @@ class SearchConfig:
         tolerance: depth of focus: steps are not made finer than this [1/m], above 0.
         coarse_points: positions of the first sweep, at least 4.
         fine_points: positions of each later sweep, at least 5.
-        approach: how far below its first position a sweep begins [1/m], 0 or more; never below `low`; inf = at `low`.
+        approach: how far below its first position a sweep begins [1/m], never below `low`; inf = at `low`; 0 = nowhere:
+            the mirror stands where it is sent, wherever it comes from.
         least_contrast: relative rise of the sharpest coarse image over the dullest below which there is no hill, 0..1.
 
     Raises:
@@ -192,7 +196,7 @@ class PeakSearch:
         self._positions = np.linspace(low, high, points)
         self._seen: list[float] = []
         self._run_up = max(low - self.config.approach, self.config.low)
-        self.step = Step(self._run_up, measured=False)
+        self.step = Step(low) if self.config.approach == 0 else Step(self._run_up, measured=False)
 
     def _judge(self, seen: np.ndarray) -> None:
         """A sweep is complete: end, or narrow down."""
@@ -214,7 +218,8 @@ class PeakSearch:
             top = _vertex(self._positions, seen)
             near_end = min(top - self.config.low, self.config.high - top) < spacing / 2
             self.peak = Peak(top, float(seen[best]), near_end)
-            self.step = Step(self._run_up, measured=False)
+            self.done = self.config.approach == 0
+            self.step = Step(top) if self.done else Step(self._run_up, measured=False)
         else:
             self.phase = Phase.FINE
             self._around(float(self._positions[best]), spacing)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dm_autofocus.gate import SettledGate
+from dm_autofocus.images import SettledGate
 from dm_autofocus.search import MOST_SHIFTS, PeakSearch, Phase, SearchConfig
 from dm_autofocus.tracking import TrackConfig, Tracker
 

@@ -54,6 +54,12 @@ class CameraConfig:
     photons: float = 5000.0
 
 
+def camera_matrix(config: CameraConfig) -> list[float]:
+    """The nine elements of K in sensor_msgs/CameraInfo, row by row: focal length and centre [px]."""
+    focal_length = config.focal_length / config.pixel_pitch / config.relay_magnification
+    return [focal_length, 0.0, (config.width - 1) / 2, 0.0, focal_length, (config.height - 1) / 2, 0.0, 0.0, 1.0]
+
+
 class SceneCamera:
     """Renders the scene for a surface.
 

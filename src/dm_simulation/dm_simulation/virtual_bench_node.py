@@ -2,7 +2,7 @@
 
 Other nodes meet it as they meet hardware: on the wire and in map files. ROS carries only what a person at the bench
 would do: pull the plug (`~/power`), press the instrument's button (`~/trigger`), read the labels (`~/endpoints`); and
-the images of the camera behind the mirror (`image_raw`), which a driver of a real camera would publish.
+the images of the camera behind the mirror (`image_raw`, `camera_info`), which a driver of a real camera would publish.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from builtin_interfaces.msg import Time
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -28,6 +28,7 @@ from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
+from dm_simulation.camera import camera_matrix
 from dm_simulation.parameters import PARAMETERS, bench_config
 
 
@@ -71,6 +72,8 @@ class VirtualBenchNode(Node):
         if self.bench.camera is not None:
             # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
             self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
+            self._info_publisher = self.create_publisher(CameraInfo, "camera_info", qos.MAP)
+            self._camera_matrix = camera_matrix(self.bench.config.camera)
             self._camera_thread = threading.Thread(target=self._film, args=(1 / values["camera.rate"],), daemon=True)
             self._camera_thread.start()
         places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
@@ -103,6 +106,8 @@ class VirtualBenchNode(Node):
             message.header.frame_id = "camera"
             message.data = array.array("B", picture.tobytes())
             self._image_publisher.publish(message)
+            info = CameraInfo(header=message.header, height=height, width=width, k=self._camera_matrix)
+            self._info_publisher.publish(info)
 
     def _on_event(self, severe: bool, text: str) -> None:
         logger = self.get_logger()

@@ -106,7 +106,7 @@ _DECLARED = (
         "autofocus",
         "autofocus",
         publish=(*_HEALTH, "autofocus_state", "focus_request"),
-        subscribe=("actuator_state", "capabilities", "focus_state", "image_raw"),
+        subscribe=("actuator_state", "capabilities", "focus_state", "camera_info", "image_raw"),
         reply=("get_focus_range", "set_focus_distance"),
         request=("set_focus",),
         execute=("autofocus",),
@@ -133,7 +133,7 @@ _DECLARED = (
 _SIMULATION = NodeInterface(
     "virtual_bench",
     "virtual_bench",
-    publish=(*_HEALTH, CLOCK, "image_raw", "~/endpoints"),
+    publish=(*_HEALTH, CLOCK, "camera_info", "image_raw", "~/endpoints"),
     reply=("~/power", "~/trigger"),
 )
 

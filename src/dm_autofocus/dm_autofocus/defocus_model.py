@@ -1,0 +1,168 @@
+"""How defocus changes the power that an image has at each spatial frequency, by the optics alone.
+
+Seen at the curvature c, an object that is sharp at the curvature b has the power S(u) T(u, c - b) + N at the spatial
+frequency u: S is the power of the object's texture, T the squared modulation transfer of a circular pupil that is out
+of focus, N that of white noise. The pixels, and whatever else does not change with the focus, multiply S and need not
+be known. The transfer of a pupil of radius a with w waves of defocus at its edge is the autocorrelation of the pupil
+([31]; Goodman, Introduction to Fourier Optics, section 6.4)
+
+    H(s, w) = 4/pi int_0^(1 - s/2) sqrt(1 - (x + s/2)^2) cos(4 pi w s x) dx,     s = u lambda f / a < 2,
+
+with the frequency u in cycles per pixel, f the focal length in pixels and w = (c - b) a^2 / lambda.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_autofocus.optics import depth_of_focus
+
+Floats = NDArray[np.float64]
+
+#: Sides of the tiles that power is found in [px]: at most, and at least; and tiles along a side at most.
+TILE_MAX, TILE_MIN, TILES = 256, 24, 3
+#: Bands at most, from the lowest frequency that a tile shows, in tiles' sides per cycle, up to half a cycle per pixel.
+BANDS, LOWEST = 20, 2.5
+#: Samples of the transfer in a band, nodes of its integral, and step of its table in depths of focus.
+SAMPLES, NODES, STEP = 5, 96, 0.25
+#: A real pupil's transfer lies anywhere below the largest of the ideal one over defocuses that differ by this share.
+SPREAD = 0.17
+
+
+@dataclass(frozen=True)
+class FocusLens:
+    """What defocus looks like in a camera.
+
+    Attributes:
+        aperture_radius: of the beam on the mirror [m].
+        wavelength: mean, of the images [m].
+        focal_length_px: of lens and relay as seen from the mirror, in pixels.
+    """
+
+    aperture_radius: float
+    wavelength: float
+    focal_length_px: float
+
+
+class DefocusModel:
+    """Powers of images in bands of spatial frequency, and their share that passes a defocused pupil.
+
+    Args:
+        shape: rows and columns of the images that `powers` will be given.
+        lens: of the camera.
+        reach: largest defocus that is asked for, as a difference of curvatures [1/m].
+
+    Attributes:
+        shape: as given.
+        modes: independent values that the power of each band is the mean of, (K,).
+
+    Raises:
+        ValueError: the images are too small.
+    """
+
+    def __init__(self, shape: tuple[int, int], lens: FocusLens, reach: float) -> None:
+        if min(shape) < TILE_MIN:
+            raise ValueError(
+                f"region = {shape[1]} x {shape[0]} px: at least {TILE_MIN} x {TILE_MIN} show how defocused they are"
+            )
+        self.shape = shape
+        rows, columns = (min(side, TILE_MAX) for side in shape)
+        self._starts = [
+            (int(top), int(left))
+            for top in np.linspace(0, shape[0] - rows, min(math.ceil(shape[0] / rows), TILES))
+            for left in np.linspace(0, shape[1] - columns, min(math.ceil(shape[1] / columns), TILES))
+        ]
+        window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(columns + 2)[1:-1])
+        self._window = window / math.sqrt(np.vdot(window, window))
+        self._smooth = [np.linalg.qr(np.vander(np.linspace(-1, 1, side), 3))[0] for side in (rows, columns)]
+        edges = _band_edges(min(rows, columns))
+        frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None])
+        band = np.digitize(frequency, edges) - 1
+        self._inside = (band >= 0) & (band < len(edges) - 1)
+        self._band = band[self._inside]
+        # Frequencies along the first column come twice, with their negatives.
+        self._share = np.where(np.arange(frequency.shape[1]) == 0, 0.5, 1.0)[None].repeat(rows, 0)[self._inside]
+        self._count = np.bincount(self._band, self._share, len(edges) - 1)
+        # The window makes neighbours alike: 1.5 along each side.
+        self.modes = self._count * len(self._starts) / 2.25
+        self._step = STEP * depth_of_focus(lens.aperture_radius, lens.wavelength)
+        self._transfer = _transfer_table(edges, lens, math.ceil(reach / self._step) + 2)
+        self._envelope = _envelope(self._transfer)
+
+    def powers(self, image: NDArray) -> Floats:
+        """Mean power in each band, (K,), of an image of the model's shape, relative to its brightness squared.
+
+        Illumination that varies slowly over a tile is divided out. White noise of the relative standard deviation s
+        has the power s^2 in every band.
+        """
+        rows, columns = self._window.shape
+        total = np.zeros(len(self._count))
+        across, along = self._smooth
+        for top, left in self._starts:
+            tile = np.nan_to_num(image[top : top + rows, left : left + columns].astype(float), posinf=0.0, neginf=0.0)
+            mean = tile.mean()
+            if mean <= 0:
+                continue
+            brightness = np.maximum(across @ (across.T @ tile @ along) @ along.T, 0.2 * mean)
+            spectrum = np.fft.rfft2((tile / brightness - 1) * self._window)
+            power = (spectrum.real**2 + spectrum.imag**2)[self._inside]
+            total += np.bincount(self._band, power * self._share, len(total))
+        return total / (self._count * len(self._starts))
+
+    def transfer(self, defocus: Floats) -> tuple[Floats, Floats]:
+        """Share of the power that passes, and the largest that it may be for a pupil that is not ideal.
+
+        Args:
+            defocus: difference of curvatures [1/m], (...).
+
+        Returns:
+            Two arrays (..., K).
+        """
+        place = np.minimum(np.abs(defocus) / self._step, len(self._transfer) - 1.001)
+        first = place.astype(int)
+        rest = (place - first)[..., None]
+        transfer, envelope = (
+            table[first] * (1 - rest) + table[first + 1] * rest for table in (self._transfer, self._envelope)
+        )
+        return transfer, envelope
+
+
+def _band_edges(side: int) -> Floats:
+    """Edges of the bands [cycles per px], rising in equal ratios, but not closer than a tile can tell apart."""
+    edges = [LOWEST / side]
+    ratio = (0.5 / edges[0]) ** (1 / BANDS)
+    while edges[-1] < 0.5:
+        edges.append(max(edges[-1] * ratio, edges[-1] + 1 / side))
+    edges[-1] = 0.5
+    if edges[-1] < 1.05 * edges[-2]:
+        edges.pop(-2)
+    return np.array(edges)
+
+
+def _transfer_table(edges: Floats, lens: FocusLens, length: int) -> Floats:
+    """Squared transfer at multiples of STEP depths of focus, (length, K), mean over each band's frequencies."""
+    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    frequency = edges[:-1, None] + np.diff(edges)[:, None] * share
+    shift = frequency * lens.focal_length_px * lens.wavelength / lens.aperture_radius
+    waves = STEP / 4 * np.arange(length)  # a depth of focus is a quarter wave
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    half = np.maximum(1 - shift / 2, 0)[..., None]
+    x = (nodes + 1) / 2 * half
+    chord = weights / 2 * half * np.sqrt(np.maximum(1 - (x + shift[..., None] / 2) ** 2, 0))
+    table = np.empty((length, len(frequency)))
+    for number, wave in enumerate(waves):
+        amplitude = 4 / np.pi * np.sum(chord * np.cos(4 * np.pi * wave * shift[..., None] * x), axis=-1)
+        table[number] = np.average(amplitude**2, axis=1, weights=frequency)
+    return table
+
+
+def _envelope(table: Floats) -> Floats:
+    """Largest value around each place of a table, (length, K)."""
+    place = np.arange(len(table))
+    low = np.maximum(np.floor(place * (1 - SPREAD)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(place * (1 + SPREAD)).astype(int) + 2, len(table) - 1)
+    return np.maximum([table[a : b + 1].max(0) for a, b in zip(low, high, strict=True)], 1e-5)

@@ -1,0 +1,293 @@
+"""Where the focus is, by a few images: how their power has changed with the focus, against the optics.
+
+A state machine as `search.PeakSearch`, for a mirror that stands where it is sent. Each image adds what it says about
+every possible place of the object (`DefocusModel`): the texture's own power in each band is taken as whatever explains
+the images best, so only ratios between images count (depth from defocus [31, 32]). The next image is taken at the most
+probable place, or in the widest gap while nothing was seen that changes with focus. An image on either side then
+confirms it: the top must stand above both, and the parabola through them gives the place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_autofocus.defocus_model import DefocusModel, Floats
+from dm_autofocus.search import RETREAT, Peak, PeakSearch, Phase, SearchConfig, Step
+
+#: Relative error of the transfer; of the noise, between images; leakage of power from lower bands.
+TRANSFER_ERROR, NOISE_ERROR, LEAKAGE = 0.25, 0.05, 0.002
+#: The same between images that are nearly alike, on either side of the focus.
+TRANSFER_ERROR_NEAR = 0.1
+#: Images differ in their noise by this factor at most, as their brightness flickers.
+NOISE_RATIO = 1.1
+#: How much better than a scene that does not change with focus a place must explain the images (twice a log ratio).
+EVIDENCE = 25.0
+#: Power that is none.
+TINY = 1e-18
+#: Images at most, and in most searches.
+MOST_IMAGES, EXPECTED_IMAGES = 15, 6
+#: Step to either side of the focus, and how far beyond the range objects are thought of, in depths of focus.
+SIDE, BEYOND = 4.5, 10.0
+#: Standard deviation [depths of focus] above which another image is taken.
+PRECISION = 0.25
+
+
+class DefocusSearch:
+    """One search from beginning to end, or to where it gives up.
+
+    Args:
+        config: range and tolerance.
+        model: of the camera.
+        start: where the mirror stands [1/m]; NaN = not known.
+
+    Attributes:
+        step: where to measure next; after the end, the curvature to stand at.
+        config: as given, the range as far as it was not refused.
+        phase: COARSE, or FINE from where a place is being confirmed.
+        done: nothing more is to be fed.
+        peak: what was found; None while it runs, when it gave up, and when there is nothing to see.
+        gave_up: the reason why the images cannot be explained; "" = they can.
+    """
+
+    def __init__(self, config: SearchConfig, model: DefocusModel, start: float) -> None:
+        self.config = config
+        self.phase = Phase.COARSE
+        self.done = False
+        self.peak: Peak | None = None
+        self.gave_up = ""
+        self._model = model
+        tolerance = config.tolerance
+        self._grid = np.arange(config.low - BEYOND * tolerance, config.high + BEYOND * tolerance, tolerance / 4)
+        self._places: list[float] = []
+        self._powers: list[Floats] = []
+        self._sharpness: list[float] = []
+        self._refusals = 0
+        quarter = (config.high - config.low) / 4
+        below, above = config.low + quarter, config.high - quarter
+        self._first = (above, below) if abs(start - above) < abs(start - below) else (below, above)
+        self.step = Step(self._first[0])
+
+    @property
+    def measured(self) -> int:
+        """Images so far."""
+        return len(self._places)
+
+    def feed(self, sharpness: float, images: Sequence[NDArray]) -> None:
+        """Report sharpness and images (H, W) at `step`."""
+        if any(image.shape != self._model.shape for image in images):
+            self._give_up("the images changed their size")
+            return
+        self._places.append(self.step.curvature)
+        self._sharpness.append(sharpness)
+        self._powers.append(np.mean([self._model.powers(image) for image in images], axis=0))
+        if self.measured < 2:
+            self.step = Step(self._first[1])
+            return
+        self._aim(*self._judge(self._grid, np.full(self.measured, True), TRANSFER_ERROR))
+
+    def refuse(self) -> None:
+        """Report that the mirror cannot take `step`: the range ends before it."""
+        self._refusals += 1
+        config, here = self.config, self.step.curvature
+        step = RETREAT * (config.high - config.low)
+        if here < (config.low + config.high) / 2:
+            self.config = replace(config, low=here + step)
+        else:
+            self.config = replace(config, high=here - step)
+        self.step = Step(float(np.clip(here, self.config.low, self.config.high)))
+        if self._refusals > MOST_IMAGES:
+            self._give_up("the mirror refuses too much of the range")
+
+    def _aim(self, misfit: Floats, evidence: float) -> None:
+        """Choose the next step, or end.
+
+        Args:
+            misfit: of each place of the grid: twice the negative logarithm of its likelihood.
+            evidence: by how much the best place explains the images better than a scene that focus does not change.
+        """
+        config, tolerance = self.config, self.config.tolerance
+        places, sharpness = np.array(self._places), np.array(self._sharpness)
+        if evidence < EVIDENCE:
+            self._fill_gap(places)
+            return
+        _place, spread = _mean_and_spread(self._grid, misfit)
+        best = float(np.clip(self._grid[misfit.argmin()], config.low, config.high))
+        side = float(np.clip(2 * spread, SIDE * tolerance, 2 * SIDE * tolerance))
+        near = np.abs(places - best) < 2 * side
+        if np.abs(places - best).min() > 0.4 * side:
+            self._go(best)
+        else:
+            self.phase = Phase.FINE
+            self._confirm(places, sharpness, int(np.where(near, sharpness, -np.inf).argmax()), side)
+
+    def _confirm(self, places: Floats, sharpness: Floats, top: int, side: float) -> None:
+        """Take what is missing of an image on either side of the sharpest; with both, end."""
+        tolerance, offset = self.config.tolerance, places - places[top]
+        three = [top]
+        for sign in (-1, 1):
+            within = (sign * offset > 0.4 * side) & (sign * offset < 2 * side)
+            if within.any():
+                three.append(int(np.where(within, np.abs(np.abs(offset) - side), np.inf).argmin()))
+                continue
+            wanted = float(np.clip(places[top] + sign * side, self.config.low, self.config.high))
+            if abs(wanted - places[top]) > 0.4 * side:
+                self._go(wanted)
+                return
+        if sharpness[top] < sharpness.max():
+            # What else is in the picture leads the model astray, not the sharpness.
+            self._confirm(places, sharpness, int(sharpness.argmax()), side)
+            return
+        near = np.abs(offset) < 2 * side
+        grid = places[top] + tolerance * np.arange(-SIDE, SIDE, 0.125)
+        grid = grid[(grid >= self.config.low) & (grid <= self.config.high)]
+        misfit, _evidence = self._judge(grid, near, TRANSFER_ERROR_NEAR)
+        place, spread = _mean_and_spread(grid, misfit)
+        if spread > PRECISION * tolerance and self.measured < MOST_IMAGES:
+            for wanted in (place - side, place + side, place):
+                if self.config.low <= wanted <= self.config.high and np.abs(places - wanted).min() > 0.3 * side:
+                    self.step = Step(wanted)
+                    return
+        at_limit = len(three) < 3 and min(place - self.config.low, self.config.high - place) < tolerance
+        self.peak = Peak(place, float(sharpness[top]), at_limit)
+        self.step = Step(place)
+        self.done = True
+
+    def _fill_gap(self, places: Floats) -> None:
+        """Next the middle of the widest gap; the end where none is wide enough to hide a focus."""
+        ends = np.sort([self.config.low, *places, self.config.high])
+        gap = int(np.diff(ends).argmax())
+        if np.diff(ends)[gap] <= (self.config.high - self.config.low) / (self.config.coarse_points - 1):
+            self.done = True
+            self.step = Step(float(places[-1]))
+        else:
+            self.step = Step(float(ends[gap : gap + 2].mean()))
+
+    def _go(self, place: float) -> None:
+        if self.measured < MOST_IMAGES:
+            self.step = Step(place)
+        else:
+            self._give_up("the optics do not explain how the images change with focus")
+
+    def _give_up(self, reason: str) -> None:
+        self.gave_up, self.done = reason, True
+
+    def _judge(self, grid: Floats, taken: NDArray[np.bool_], error: float) -> tuple[Floats, float]:
+        """Misfit of each place of a grid (G,), and the evidence that focus changes anything, by the images `taken`."""
+        powers = np.array(self._powers)[taken]
+        lowest = powers[:, -3:].min(1)
+        noise = np.minimum(lowest, NOISE_RATIO * lowest.min())[:, None]
+        signal = powers - noise
+        leaked = np.maximum.accumulate(np.maximum(signal, 0), axis=1)
+        leaked = LEAKAGE * np.pad(leaked, ((0, 0), (1, 0)))[:, :-1]
+        floor = noise**2 * (1 / self._model.modes + NOISE_ERROR**2) + leaked**2 + TINY
+        shares, envelopes = self._model.transfer(grid[:, None] - np.array(self._places)[taken])
+        misfit = self._misfit(signal, noise, floor, shares, envelopes, error)
+        flat = np.ones((1, *powers.shape))
+        return misfit, float(self._misfit(signal, noise, floor, flat, flat, error)[0] - misfit.min())
+
+    def _misfit(
+        self, signal: Floats, noise: Floats, floor: Floats, shares: Floats, envelopes: Floats, error: float
+    ) -> Floats:
+        """Twice the negative log likelihood (G,) of the signals (I, K) where shares (G, I, K) of the texture pass.
+
+        The texture's power in each band is the one that fits best. Its variance follows from itself: a few rounds.
+        """
+        modes = self._model.modes
+        guess = np.maximum(signal, 0)
+        variance = floor + 2 * noise * guess / modes + (error * guess) ** 2
+        for _round in range(4):
+            weight = shares / variance
+            texture = np.sum(weight * signal, 1) / np.maximum(np.sum(weight * shares, 1), 1e-300)
+            texture = np.maximum(texture, 0)[:, None]
+            expected = texture * shares
+            variance = floor + (2 * noise + expected) * expected / modes + (error * texture * envelopes) ** 2
+        return np.sum((signal - expected) ** 2 / variance + np.log(variance), axis=(1, 2))
+
+
+class FocusSearch:
+    """A search from a few images where that is possible, and else, or when it gives up, a `PeakSearch`.
+
+    Args:
+        config: of both.
+        model: of the camera; None = it is not known.
+        start: where the mirror stands [1/m]; NaN = not known.
+
+    Attributes:
+        reason: why the range is swept; "" = it is not.
+    """
+
+    def __init__(self, config: SearchConfig, model: DefocusModel | None, start: float) -> None:
+        self.reason = ""
+        self._before = 0
+        self._search: DefocusSearch | PeakSearch
+        if model is None:
+            self._search, self.reason = PeakSearch(config), "optics.focal_length_px is not known"
+        else:
+            self._search = DefocusSearch(config, model, start)
+
+    @property
+    def config(self) -> SearchConfig:
+        """As given, the range as far as it was not refused."""
+        return self._search.config
+
+    @property
+    def step(self) -> Step:
+        """Where to go next; after the end, where to stand."""
+        return self._search.step
+
+    @property
+    def phase(self) -> Phase:
+        """COARSE or FINE."""
+        return self._search.phase
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing more is to be fed."""
+        return self._search.done
+
+    @property
+    def peak(self) -> Peak | None:
+        """What was found."""
+        return self._search.peak
+
+    @property
+    def measured(self) -> int:
+        """Positions measured so far."""
+        return self._before + self._search.measured
+
+    @property
+    def steps(self) -> int:
+        """Positions to be measured, about."""
+        expected = EXPECTED_IMAGES if isinstance(self._search, DefocusSearch) else self._before + self.config.steps
+        return max(expected, self.measured)
+
+    def feed(self, sharpness: float | None, images: Sequence[NDArray] = ()) -> None:
+        """Report sharpness and images (H, W) at `step`; None when it was not to be measured."""
+        if isinstance(self._search, PeakSearch):
+            self._search.feed(sharpness)
+            return
+        assert sharpness is not None
+        self._search.feed(sharpness, images)
+        if self._search.gave_up:
+            self.sweep(self._search.gave_up, 0.0)
+
+    def refuse(self) -> None:
+        """Report that the mirror cannot take `step`. Raises ValueError when hardly anything of the range is left."""
+        self._search.refuse()
+
+    def sweep(self, reason: str, approach: float) -> None:
+        """Sweep the range instead, each sweep from `approach` [1/m] below it."""
+        self.reason, self._before = reason, self.measured
+        self._search = PeakSearch(replace(self.config, approach=approach))
+
+
+def _mean_and_spread(grid: Floats, misfit: Floats) -> tuple[float, float]:
+    """Mean and standard deviation of the place, from twice its negative log likelihood."""
+    weights = np.exp((misfit.min() - misfit) / 2)
+    weights /= weights.sum()
+    mean = float(weights @ grid)
+    return mean, float(np.sqrt(weights @ (grid - mean) ** 2))

@@ -1,0 +1,129 @@
+"""Model of the blur, and the search from few images, on cameras that share no code with them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from defocused_camera import DEPTH, LENS, SIDE, DefocusedCamera, clouds
+
+from dm_autofocus import defocus_search
+from dm_autofocus.defocus_model import DefocusModel
+from dm_autofocus.defocus_search import FocusSearch
+from dm_autofocus.search import Phase, SearchConfig
+from dm_autofocus.sharpness import tenengrad
+
+LOW, HIGH = -0.04, 0.04
+CONFIG = SearchConfig(LOW, HIGH, DEPTH, coarse_points=11, approach=0.0)
+
+
+@pytest.fixture(scope="module")
+def model() -> DefocusModel:
+    return DefocusModel((SIDE, SIDE), LENS, HIGH - LOW + 10 * DEPTH)
+
+
+def run(search: FocusSearch, camera: DefocusedCamera, reach: float = math.inf) -> list[float]:
+    """Feed a search to its end; returns where images were taken."""
+    visited = []
+    while not search.done:
+        if abs(search.step.curvature) > reach:
+            search.refuse()
+            continue
+        visited.append(search.step.curvature)
+        image = camera.expose(visited[-1])
+        search.feed(tenengrad(image) if search.step.measured else None, (image,))
+    return visited
+
+
+@pytest.mark.parametrize("off", [0.0, 1.0, -3.0, 8.0, 20.0])
+def test_power_falls_with_defocus_as_the_pupil_says(model: DefocusModel, off: float) -> None:
+    """White texture: what is left of its power in each band, between an image in focus and one that is not."""
+    white = 1 + 0.3 * np.random.default_rng(2).standard_normal((2 * SIDE, 2 * SIDE))
+    camera = DefocusedCamera(white, 0.0, noise=0.0)
+    sharp, dull = (model.powers(camera.expose(defocus)) for defocus in (0.0, off * DEPTH))
+    expected = model.transfer(np.array([0.0, off * DEPTH]))[0]
+    np.testing.assert_allclose(dull / sharp, expected[1] / expected[0], atol=0.05)
+
+
+def test_noise_has_its_power_in_every_band_and_lamps_have_none(model: DefocusModel) -> None:
+    noise = 100 * (1 + 0.02 * np.random.default_rng(3).standard_normal((SIDE, SIDE)))
+    powers = model.powers(noise)
+    assert np.average(powers, weights=model.modes) == pytest.approx(0.02**2, rel=0.05)
+    lamp = 1 + 0.3 * np.linspace(-1, 1, SIDE)[:, None] - 0.2 * np.linspace(-1, 1, SIDE) ** 2
+    np.testing.assert_allclose(model.powers(noise * lamp), powers, rtol=0.2)
+
+
+def test_large_regions_are_tiled_and_small_ones_refused() -> None:
+    wide = DefocusModel((300, 700), LENS, 0.01)
+    image = 1 + 0.1 * np.random.default_rng(4).standard_normal((300, 700))
+    assert np.average(wide.powers(image), weights=wide.modes) == pytest.approx(0.01, rel=0.05)
+    with pytest.raises(ValueError, match="region = 20 x 100 px"):
+        DefocusModel((100, 20), LENS, 0.01)
+
+
+@pytest.mark.parametrize("place", [-0.0361, -0.0112, 0.0003, 0.0254])
+@pytest.mark.parametrize("start", [-0.03, 0.02, math.nan])
+def test_the_focus_is_found_in_few_images(model: DefocusModel, place: float, start: float) -> None:
+    search = FocusSearch(CONFIG, model, start)
+    visited = run(search, DefocusedCamera(clouds(), place))
+    assert search.peak is not None and not search.peak.at_limit
+    assert search.peak.curvature == pytest.approx(place, abs=DEPTH / 2)
+    assert search.measured == len(visited) <= 10
+    assert (search.reason, search.phase) == ("", Phase.FINE)
+    if start == 0.02:
+        assert visited[0] > 0, "the nearer one first"
+
+
+@pytest.mark.parametrize("place", [LOW - 0.002, HIGH + 0.002])
+def test_an_object_beyond_the_range_is_said_so(model: DefocusModel, place: float) -> None:
+    search = FocusSearch(CONFIG, model, 0.0)
+    run(search, DefocusedCamera(clouds(), place))
+    assert search.peak is not None and search.peak.at_limit
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_nothing_to_see_ends_without_a_focus_and_without_a_sweep(model: DefocusModel, noise: float) -> None:
+    search = FocusSearch(CONFIG, model, 0.0)
+    visited = run(search, DefocusedCamera(np.ones((2 * SIDE, 2 * SIDE)), 0.0, noise))
+    assert (search.peak, search.reason) == (None, "")
+    assert np.diff(np.sort([LOW, *visited, HIGH])).max() <= 0.1 * (HIGH - LOW)
+
+
+def test_what_the_mirror_refuses_is_left_out(model: DefocusModel) -> None:
+    search = FocusSearch(CONFIG, model, 0.0)
+    run(search, DefocusedCamera(clouds(), 0.01), reach=0.017)
+    assert search.peak is not None and search.peak.curvature == pytest.approx(0.01, abs=DEPTH / 2)
+    assert search.config.low > -0.021 and search.config.high < 0.021
+
+
+def test_where_the_optics_do_not_explain_the_images_the_range_is_swept(
+    model: DefocusModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So it is where no focus was found after so many images."""
+    monkeypatch.setattr(defocus_search, "MOST_IMAGES", 3)
+    search = FocusSearch(CONFIG, model, 0.0)
+    camera = DefocusedCamera(clouds(), 0.012)
+    while not search.done and not search.reason:
+        image = camera.expose(search.step.curvature)
+        search.feed(tenengrad(image), (image,))
+    assert "do not explain" in search.reason and search.measured == 3
+    before = search.measured
+    visited = run(search, DefocusedCamera(clouds(), 0.012))
+    assert search.peak is not None and search.peak.curvature == pytest.approx(0.012, abs=DEPTH)
+    assert search.measured == before + len(visited) <= search.steps
+
+
+def test_images_of_another_size_are_swept(model: DefocusModel) -> None:
+    search = FocusSearch(CONFIG, model, 0.0)
+    search.feed(1.0, (np.ones((10, 10)),))
+    assert "size" in search.reason
+
+
+def test_without_optics_or_a_mirror_to_trust_every_sweep_begins_below(model: DefocusModel) -> None:
+    assert "focal_length_px" in FocusSearch(CONFIG, None, 0.0).reason
+    search = FocusSearch(CONFIG, model, 0.0)
+    search.sweep("the mirror's hysteresis is not known", math.inf)
+    visited = run(search, DefocusedCamera(clouds(), 0.01))
+    assert search.peak is not None and search.peak.curvature == pytest.approx(0.01, abs=DEPTH)
+    assert visited.count(LOW) >= 3

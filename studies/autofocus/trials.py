@@ -1,0 +1,170 @@
+"""Every search on the same scenes: images, time and error of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_autofocus.defocus_model import DefocusModel, FocusLens
+from dm_autofocus.defocus_search import BEYOND, FocusSearch
+from dm_autofocus.search import NOISE_POINTS, PeakSearch, SearchConfig
+from dm_autofocus.sharpness import cut, tenengrad
+from studies.autofocus.rivals import RIVALS, Task
+from studies.autofocus.scenes import RANGE, Scene, SceneCamera, draw_scene
+
+#: Name of our search, and of the one before it: the range swept, each sweep from its low end.
+OURS, BEFORE = "few images", "sweep from below"
+#: Coarse step in depths of focus, as the node has it.
+COARSE_STEP = 8.0
+#: Time of a search: camera [images per second], from the end of an exposure to the request that follows from it [s],
+#: slew of the mirror [1/m per s], and wait after it [s]. Exposures begin at a multiple of the period.
+RATE, READ_OUT, SLEW, SETTLE = 30.0, 0.012, 2.5, 0.012
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One search on one scene.
+
+    Attributes:
+        method: which.
+        scene: on what.
+        images: taken.
+        seconds: it would take at RATE images per second.
+        error: of the place, in depths of focus; None = it found no focus.
+        swept: ours alone: the reason why it swept the range after all; "" = it did not.
+    """
+
+    method: str
+    scene: Scene
+    images: int
+    seconds: float
+    error: float | None
+    swept: str = ""
+
+
+class _Stage:
+    """Goes to a place and takes an image there; keeps the time."""
+
+    def __init__(self, camera: SceneCamera) -> None:
+        self.camera = camera
+        self.images = 0
+        self.seconds = 0.0
+        self._place = camera.scene.start
+
+    def go(self, place: float) -> None:
+        self.seconds += abs(place - self._place) / SLEW + SETTLE
+        self._place = place
+
+    def expose(self) -> NDArray[np.uint16]:
+        self.images += 1
+        self.seconds = (math.floor(self.seconds * RATE) + 1) / RATE + READ_OUT
+        return cut(self.camera.expose(self._place), self.camera.region())
+
+
+def _config(scene: Scene) -> SearchConfig:
+    depth = scene.depth_of_focus
+    points = max(NOISE_POINTS, 1 + math.ceil(2 * RANGE / (COARSE_STEP * depth)))
+    return SearchConfig(-RANGE, RANGE, depth, points, approach=0.0)
+
+
+def _few_images(stage: _Stage) -> tuple[float | None, str]:
+    scene, config = stage.camera.scene, _config(stage.camera.scene)
+    told = FocusLens(
+        scene.aperture_radius * scene.misinformed[1], scene.wavelength, scene.focal_length_px * scene.misinformed[0]
+    )
+    model = DefocusModel((scene.region_px,) * 2, told, 2 * RANGE + BEYOND * config.tolerance)
+    search = FocusSearch(config, model, scene.start)
+    while not search.done:
+        stage.go(search.step.curvature)
+        image = stage.expose()
+        search.feed(tenengrad(image), (image,))
+    return (search.peak.curvature if search.peak else None), search.reason
+
+
+def _sweep_from_below(stage: _Stage) -> tuple[float | None, str]:
+    config = _config(stage.camera.scene)
+    search = PeakSearch(SearchConfig(config.low, config.high, config.tolerance, config.coarse_points))
+    while not search.done:
+        stage.go(search.step.curvature)
+        search.feed(tenengrad(stage.expose()) if search.step.measured else None)
+    return (search.peak.curvature if search.peak else None), ""
+
+
+def _rival(name: str) -> Callable[[_Stage], tuple[float | None, str]]:
+    def run(stage: _Stage) -> tuple[float | None, str]:
+        scene = stage.camera.scene
+        depth = scene.depth_of_focus
+        search = RIVALS[name](Task(-RANGE, RANGE, scene.start, COARSE_STEP * depth, depth))
+        try:
+            place = next(search)
+            while True:
+                stage.go(place)
+                place = search.send(tenengrad(stage.expose()))
+        except StopIteration as end:
+            return end.value, ""
+
+    return run
+
+
+METHODS: dict[str, Callable[[_Stage], tuple[float | None, str]]] = {
+    OURS: _few_images,
+    BEFORE: _sweep_from_below,
+    **{name: _rival(name) for name in RIVALS},
+}
+
+
+def run_scene(seed: int, textured: bool = True, methods: Iterable[str] = tuple(METHODS)) -> list[Trial]:
+    """Every search on the scene of a seed."""
+    scene = draw_scene(seed, textured)
+    camera = SceneCamera(scene)
+    trials = []
+    for method in methods:
+        stage = _Stage(camera)
+        place, swept = METHODS[method](stage)
+        error = None if place is None else (place - scene.object_curvature) / scene.depth_of_focus
+        trials.append(Trial(method, scene, stage.images, stage.seconds, error, swept))
+    return trials
+
+
+def _blank(seed: int) -> list[Trial]:
+    return run_scene(seed, textured=False, methods=(OURS,))
+
+
+def run_scenes(seeds: Iterable[int], textured: bool, workers: int) -> Iterator[list[Trial]]:
+    """`run_scene` for each seed, in processes; scenes without texture only by ours."""
+    with ProcessPoolExecutor(workers) as pool:
+        yield from pool.map(run_scene if textured else _blank, seeds, chunksize=1 if textured else 20)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A method over all scenes: images and seconds (median, 90 %), shares of errors, largest share of false finds."""
+
+    images: tuple[float, float]
+    seconds: tuple[float, float]
+    within_half: float
+    within_one: float
+    found: float
+    gross: float
+    swept: float
+
+
+def figures_of(trials: list[Trial]) -> Figures:
+    """Figures of one method's trials; an error counts in depths of focus, `gross` = found, but more than 3 off."""
+    images = np.array([trial.images for trial in trials])
+    seconds = np.array([trial.seconds for trial in trials])
+    errors = np.array([np.inf if trial.error is None else abs(trial.error) for trial in trials])
+    return Figures(
+        (float(np.median(images)), float(np.quantile(images, 0.9))),
+        (float(np.median(seconds)), float(np.quantile(seconds, 0.9))),
+        float(np.mean(errors <= 0.5)),
+        float(np.mean(errors <= 1)),
+        float(np.mean(np.isfinite(errors))),
+        float(np.mean(np.isfinite(errors) & (errors > 3))),
+        float(np.mean([bool(trial.swept) for trial in trials])),
+    )
