@@ -81,9 +81,9 @@ class FocusController:
         Else requests are refused with the reason.
         """
         effects: list[Effect] = []
-        before = self.active
+        before, values = self.active, self._values
         try:
-            active = active_calibration(calibration, mirror, self._values["aperture_tolerance"])
+            active = active_calibration(calibration, mirror, values["aperture_tolerance"], values["hold_tilt"])
             # A new revision leaves the shape that stands as it is: so it can be held on.
             if before is None or before.calibration.id != active.calibration.id:
                 self.hold.end("another calibration is used")

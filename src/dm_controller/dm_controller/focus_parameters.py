@@ -71,6 +71,12 @@ PARAMETERS: Final = (
         text("~/.ros/focus_controller"),
         "folder that keeps what the actuators of each mirror have crept to, for the next start; empty = keep nothing",
     ),
+    Parameter(
+        "hold_tilt",
+        switch(True),
+        "keep the mirror's tilt while its curvature changes, so that the picture of a camera stands still; "
+        "false = tilt is free",
+    ),
     APERTURE_PARAMETER,
     *LOOP_PARAMETERS,
 )

@@ -54,6 +54,7 @@ VALUES: dict[str, Any] = {
     "hold.resolution": 3e-5,
     "calibration_age_max": 0.0,
     "aperture_tolerance": 0.02,
+    "hold_tilt": True,
 }
 
 

@@ -85,9 +85,9 @@ class ActiveCalibration:
 
 
 def active_calibration(
-    calibration: Calibration | None, mirror: MirrorInfo | None, aperture_tolerance: float
+    calibration: Calibration | None, mirror: MirrorInfo | None, aperture_tolerance: float, hold_tilt: bool = True
 ) -> ActiveCalibration:
-    """What to plan moves of `mirror` with.
+    """What to plan moves of `mirror` with; `hold_tilt`: see `CalibratedMirror`.
 
     Raises:
         Refusal: there is no calibration, it is of another mirror, or its numbers make no sense, naming the field.
@@ -110,7 +110,8 @@ def active_calibration(
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
         slew_rate = mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf
         limits = limits_from(mirror)
-        calibrated = CalibratedMirror(model_of(calibration), limits)
+        model = model_of(calibration, np.asarray(mirror.actuator_x), np.asarray(mirror.actuator_y))
+        calibrated = CalibratedMirror(model, limits, hold_tilt)
         recipes = recipe_book_from(calibration.recipes)
         if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
@@ -127,6 +128,7 @@ def active_calibration(
                     high=reach[1],
                     neighbour_difference=min(share, 1.0) * limits.neighbour_difference,
                 ),
+                hold_tilt,
             )
     except (ValueError, np.linalg.LinAlgError) as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
@@ -135,8 +137,13 @@ def active_calibration(
     return ActiveCalibration(calibration, calibrated, certain, planner, recipes, middle, slew_rate, high - low)
 
 
-def model_of(calibration: Any) -> InfluenceModel:
-    """The influence model of a dm_msgs/Calibration. Raises ValueError when its arrays do not fit together."""
+def model_of(
+    calibration: Any, actuator_x: NDArray[np.float64] | None = None, actuator_y: NDArray[np.float64] | None = None
+) -> InfluenceModel:
+    """The influence model of a dm_msgs/Calibration of a mirror whose actuators stand there, (N,) m.
+
+    Raises ValueError when its arrays do not fit together.
+    """
     actuators, terms, points = calibration.actuators, calibration.terms, calibration.points
 
     def matrix(name: str, rows: int) -> NDArray[np.float64]:
@@ -156,6 +163,8 @@ def model_of(calibration: Any) -> InfluenceModel:
         sag_offset=np.asarray(calibration.sag_offset, dtype=float),
         held_out_rms=calibration.held_out_rms,
         held_out_max_zernike=calibration.held_out_max_zernike,
+        actuator_x=actuator_x,
+        actuator_y=actuator_y,
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
-from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, tilt_influence
 from dm_controller.planning.target import FocusTarget
 
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
@@ -23,6 +23,9 @@ LEAST_AUTHORITY = 0.01
 #: Ridge on the signals, as a share of a typical actuator's rms response. On a simulated PDM30-37 it costs less than
 #: 1 % of the predicted residual and cuts the largest signal of a 0.02 1/m sphere from 1.0 to 0.3.
 RIDGE_SHARE = 0.01
+#: How much more tilt counts than the sag beyond the terms, where it is held: less than the coefficients, so that where
+#: a limit binds the shape has precedence.
+TILT_WEIGHT = 10.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class InfluenceModel:
     sag_offset: NDArray[np.float64]  # (P,) m
     held_out_rms: float  # m
     held_out_max_zernike: float  # m
+    actuator_x: NDArray[np.float64] | None = None  # (N,) m; None = tilt cannot be held
+    actuator_y: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         terms, actuators = self.influence_zernike.shape
@@ -109,29 +114,42 @@ class CalibratedMirror:
     """Solves focus targets on an influence model inside limits.
 
     The command makes the coefficients beyond tilt equal to the wanted ones and the sag beyond the terms as small as
-    possible, with piston and tilt free, inside the limits; where the limits forbid equality it is the closest in the
-    weighted least-squares sense. A mirror of few actuators moves fewer combinations of coefficients than there are; the
-    others count as the sag they are (measured with 19 actuators: 8 nm rms are left instead of 97, and no signal
-    saturates). A small ridge keeps actuators that the aperture hardly sees from running to their
-    limits for nothing.
+    possible, with piston free, inside the limits, and the tilt at what it is at zero signals, so that the picture of a
+    camera stands still while the focus changes (`hold_tilt`; else it is free too); where the limits forbid equality it
+    is the closest in the weighted least-squares sense. A mirror of few actuators moves fewer combinations of
+    coefficients than there are; the others count as the sag they are (measured with 19 actuators: 8 nm rms are left
+    instead of 97, and no signal saturates). A small ridge keeps actuators that the aperture hardly sees from running to
+    their limits for nothing.
+
+    Args:
+        model: of the mirror.
+        limits: of its signals.
+        hold_tilt: hold it where the model says where the actuators are.
 
     Attributes:
-        matrix: (K - 3 + P, N), `rows` of the influence function.
+        matrix: (R, N), `rows` of the influence function.
+        tilt: (2, N) m per unit signal, of the two tilts that are held; None = they are free.
         ridge: weight of the squared signals beside the squared rows.
         sag_root: (N, N), m: its product with signals is as long as their rms sag, piston and tilt removed.
     """
 
-    def __init__(self, model: InfluenceModel, limits: Limits) -> None:
+    def __init__(self, model: InfluenceModel, limits: Limits, hold_tilt: bool = True) -> None:
         self.model = model
         self.limits = limits
         self._weights = np.sqrt(model.sample_weight)
         self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
         self._tilt_free = self._terms[:, :PISTON_TILT]
         self._coefficient_rows = coefficient_rows(model.influence_zernike[PISTON_TILT:])
-        self.matrix = self.rows(model.influence_zernike, model.influence_sag)
         reduced = self._reduce(model.influence_sag, self._tilt_free)
         self.sag_root: NDArray[np.float64] = np.linalg.qr(reduced)[1]
         response = np.linalg.norm(reduced, axis=0)
+        self.tilt = None
+        if hold_tilt and model.actuator_x is not None and model.actuator_y is not None:
+            places = np.array([model.actuator_x, model.actuator_y]) / model.aperture_radius
+            self.tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
+        self.matrix = self.rows(model.influence_zernike, model.influence_sag)
+        if self.tilt is not None:
+            self.matrix[:2] = TILT_WEIGHT * self.tilt
         self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
@@ -145,15 +163,18 @@ class CalibratedMirror:
     def rows(self, coefficients: NDArray[np.float64], sag: NDArray[np.float64]) -> NDArray[np.float64]:
         """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
 
+        Where tilt is held, two rows above them are that of a surface that keeps it: zero, whatever tilt was measured.
+
         Args:
             coefficients: (K,) m, or (K, N), a surface in each column.
             sag: (P,) or (P, N) m.
 
         Returns:
-            (K - 3 + P,) or (K - 3 + P, N).
+            (R,) or (R, N); R = K - 3 + P, and 2 more where tilt is held.
         """
         weighted = self._coefficient_rows @ coefficients[PISTON_TILT:]
-        return np.concatenate([weighted, self._reduce(sag, self._terms)])
+        kept = np.zeros((0 if self.tilt is None else 2, *weighted.shape[1:]))
+        return np.concatenate([kept, weighted, self._reduce(sag, self._terms)])
 
     def solve(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """The signals (N,) inside the limits whose `matrix @ signals` comes nearest to `rows`.
@@ -207,7 +228,7 @@ class CalibratedMirror:
         )
 
     def wanted_rows(self, target: FocusTarget) -> NDArray[np.float64]:
-        """(K - 3 + P,) `rows` of `target` less those at zero signals.
+        """(R,) `rows` of `target` less those at zero signals.
 
         Raises:
             TargetError: no such surface exists over the aperture.
