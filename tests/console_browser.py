@@ -119,6 +119,15 @@ class Browser:
         field.send_keys(Keys.CONTROL, "a")
         field.send_keys(value)
 
+    def unfold(self, title: str) -> None:
+        """Open a card of details."""
+        self.driver.execute_script("arguments[0].open = true", self.find(title, "details"))
+
+    def prefer(self, scheme: str) -> None:
+        """Have the system prefer `light` or `dark` pages."""
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+
     def choose(self, name: str, option: str) -> None:
         """Choose from a list."""
         self.find(name, "input").click()

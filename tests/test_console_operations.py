@@ -87,7 +87,8 @@ def test_without_a_recipe_a_conditioned_move_is_refused(page: Browser) -> None:
 
 
 def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser) -> None:
-    page.enter("First, 1/m", "0.015")
+    page.unfold("Recipes")
+    page.enter("First, 1/m", "0,015")  # as half of Europe writes it
     page.enter("Recipes", "1")
     page.press("Build recipes")
     page.wait_for("1 of 1 recipes stored", 900)

@@ -24,6 +24,8 @@ pytestmark = [pytest.mark.processes, needs_browser]
 #: 19 actuators on a grid turned by 20 degrees.
 X, Y = hexagonal_positions(19, pitch=3.5e-3, start_angle=np.radians(20.0))
 #: Text with less contrast than WCAG 2.2 asks for: 4.5 to 1, 3 to 1 for large text; disabled controls are excepted.
+#: Cards that are folded until somebody wants them.
+DETAILS = ("Recipes", "Diagnostics", "Log")
 LOW_CONTRAST = """
 const parse = (text) => { const n = text.match(/[\\d.]+/g).map(Number); return n.length < 4 ? [...n, 1] : n; };
 const over = (top, below) => [0, 1, 2].map((k) => top[3] * top[k] + (1 - top[3]) * below[k]);
@@ -124,7 +126,16 @@ def test_a_poke_moves_one_of_nineteen_and_is_released(bench: tuple[Browser, Stan
     wait_until(lambda: stand_in.signals == [0.0] * 19, 60, "the release")
 
 
+def test_a_decimal_comma_is_a_decimal_sign(bench: tuple[Browser, StandIn, str]) -> None:
+    page = bench[0]
+    page.enter("Curvature, 1/m", "0,02")
+    page.wait_for("= +0.0400 dioptre")
+    page.enter("Curvature, 1/m", "0.0")
+
+
 def test_every_control_has_a_name(bench: tuple[Browser, StandIn, str]) -> None:
+    for title in DETAILS:
+        bench[0].unfold(title)
     told = named_nodes(bench[0])
     assert {"button", "spinbutton", "slider", "radio", "switch", "combobox"} <= {role for role, _name in told}
     assert [role for role, name in told if not name.strip()] == []
@@ -141,22 +152,37 @@ def test_errors_are_announced_at_once_and_progress_when_there_is_time(bench: tup
     assert bench[0].driver.execute_script("return document.documentElement.lang").startswith("en")
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_all_text_stands_out_from_its_ground(bench: tuple[Browser, StandIn, str], size: tuple[int, int]) -> None:
+def test_all_text_stands_out_from_its_ground(
+    bench: tuple[Browser, StandIn, str], size: tuple[int, int], scheme: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     page = bench[0]
     page.resize(*size)
+    page.prefer(scheme)
+    for title in DETAILS:
+        page.unfold(title)
     page.enter("Recipes", "0")
+    before = page.find("Move", "button").rect
     page.press("Build recipes")
     wait_until(lambda: "number = 0: must be a whole number" in page.alerts(), 60, "a refusal")
+    assert page.find("Move", "button").rect == before, "a message moves nothing"
+    assert page.driver.execute_script("return document.querySelector('.header').getBoundingClientRect().height") <= 120
     seen, poor = page.driver.execute_script(LOW_CONTRAST)
+    page.shoot(shots_folder(tmp_path_factory.mktemp("shots")) / f"console-{scheme}-{size[0]}.png")
     assert seen > 40
     assert poor == []
+    ground = page.driver.execute_script("return getComputedStyle(document.body).backgroundColor")
+    assert ("242" in ground) == (scheme == "light")
     page.dismiss_all()
+    page.prefer("light")
     page.resize(*DESKTOP)
 
 
 def test_the_focus_goes_through_the_page_in_order_and_is_seen(bench: tuple[Browser, StandIn, str]) -> None:
     page = bench[0]
+    for title in DETAILS:
+        page.unfold(title)
     page.driver.execute_script("document.activeElement.blur(); scrollTo(0, 0)")
     names: list[str] = []
     for _press in range(80):

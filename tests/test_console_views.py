@@ -6,12 +6,14 @@ import base64
 import io
 import json
 import re
+import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, MirrorInfo, SurfaceMapInfo, ZernikeCoefficients
 from matplotlib.image import imread
 
@@ -25,9 +27,11 @@ from dm_tools.console.charts.heat_map import SAG_COLOURS, heat_map
 from dm_tools.console.charts.plots import loop_chart, residual_chart, zernike_chart
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
+from dm_tools.console.session import SHOWN_S, Session
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
 from dm_tools.console.widgets.actuators import towards
+from dm_tools.console.widgets.components import decimal
 from dm_tools.console.widgets.recipes import evenly
 
 COUNT = 7
@@ -195,9 +199,42 @@ def test_the_worst_diagnostics_come_first() -> None:
 
 
 def test_the_log_can_be_narrowed_to_what_went_wrong() -> None:
-    lines = [(level, "n", "said") for level in ("INFO", "ERROR")]
-    assert [row[0] for row in status.log_rows(lines, True)] == ["ERROR", "INFO"]
-    assert [row[0] for row in status.log_rows(lines, False)] == ["ERROR"]
+    lines = [("12:00:00", level, "n", "said") for level in ("INFO", "ERROR")]
+    assert [row[1] for row in status.log_rows(lines, True)] == ["ERROR", "INFO"]
+    assert [row[1] for row in status.log_rows(lines, False)] == ["ERROR"]
+
+
+def test_messages_have_their_time_and_the_log_keeps_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines: list[tuple[object, ...]] = []
+    ros: Any = SimpleNamespace(take_log=lambda *line: lines.append(line), snapshot=Snapshot)
+    session = Session(ros)
+    session.fail("Move", "too far")
+    session.snapshot()
+    assert [failure.sentence for failure in session.failures] == ["too far"]
+    later = time.monotonic() + SHOWN_S + 1.0
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    session.snapshot()
+    assert session.failures == []
+    assert [line[1:] for line in lines] == [("ERROR", "console", "Move: too far")]
+
+
+def test_the_page_says_where_the_mirror_stands() -> None:
+    values = {"curvature": 0.05, "stands for": "40.0", "bound": 1.3e-9, "held": False}
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    heard = {"left/focus_controller": DiagnosticStatus(name="left/focus_controller", values=pairs)}
+    present = frozenset(("pdm_driver", "focus_controller"))
+    snapshot = Snapshot(actuator_state=ActuatorState(), diagnostics=heard, present=present)
+    assert status.now_text(snapshot) == "now: +0.0500 1/m for 40 s, within 1.3 nm (95 %)"
+    assert status.now_text(replace(snapshot, actuator_state=ActuatorState(moving=True))) == "now: moving"
+    assert "not at a curvature" in status.now_text(replace(snapshot, diagnostics={}))
+    assert "not heard" in status.now_text(Snapshot())
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("0,02", 0.02), (" -0.02 ", -0.02), ("−1", -1.0), ("", None), ("1,2,3", None), ("nan", None)]
+)
+def test_numbers_are_taken_as_people_write_them(text: str, value: float | None) -> None:
+    assert decimal(text) == value
 
 
 def test_the_reachable_range_needs_a_calibration() -> None:
@@ -276,7 +313,7 @@ def test_charts_are_described_and_have_axes() -> None:
     assert [axis["name"] for axis in axes if "name" in axis] == ["x, mm", "y, mm", "sag, nm"]
     message = ZernikeCoefficients(coefficients=(np.arange(21) * 1e-9).tolist(), sigma=[])
     zernike = zernike_chart(view_models.bars(message, None, False), "Coefficient")
-    assert "largest Z5,5 sin: 20.00 nm" in zernike.description
+    assert "largest pentafoil sin Z5,5: 20.00 nm" in zernike.description
     assert "residual of 2 maps, the last 3.0 nm" in residual_chart([2.0, 3.0]).description
 
 

@@ -59,6 +59,14 @@ def promise(bound: float) -> str:
     return f"{nanometres(bound):.2g} nm (95 % bound, {as_wavelengths(bound)})" if bound > 0.0 else "not known"
 
 
+def ago(seconds: float) -> str:
+    """A time that has passed, in the unit that fits it."""
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
 def verdict(promised: float, measured: float) -> str:
     """Promised and measured largest coefficient error (m), and whether the promise was kept, as a sentence."""
     kept = "[green]inside[/]" if measured <= promised else "[red]outside[/]"

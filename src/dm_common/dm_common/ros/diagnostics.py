@@ -11,6 +11,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from dm_common.messages import seconds
+
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
@@ -53,11 +55,14 @@ class Diagnostics:
         self._publisher.publish(message)
 
 
-def hear_log(node: Node, keep: int, take: Callable[[str, str, str], None]) -> None:
-    """Call `take(level, logger, message)` for every line on `/rosout`, the last `keep` of before among them."""
+def hear_log(node: Node, keep: int, take: Callable[[float, str, str, str], None]) -> None:
+    """Call `take(time, level, logger, message)` for every line on `/rosout`, the last `keep` of before among them.
+
+    The time is ROS time, s.
+    """
 
     def on_log(line: Log) -> None:
-        take(LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg)
+        take(seconds(line.stamp), LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg)
 
     # Nodes offer their latest lines to those who come late.
     profile = QoSProfile(depth=keep, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -80,7 +80,7 @@ class ConsoleNode:
         domain: ROS domain; None = the environment's.
 
     Attributes:
-        log: the last lines that nodes logged: level, logger, message.
+        log: the last lines that nodes logged, and what went wrong here: time, level, logger, message.
         lines_logged: how many were heard in all.
     """
 
@@ -94,9 +94,9 @@ class ConsoleNode:
         self.observer = StateObserver()
         self._connection = Connection("dm_console", namespace, domain, TOPICS, INTERFACES, self._take)
         self.node = self._connection.node
-        self.log: deque[tuple[str, str, str]] = deque(maxlen=LOG_LINES)
+        self.log: deque[tuple[str, str, str, str]] = deque(maxlen=LOG_LINES)
         self.lines_logged = 0
-        hear_log(self.node, LOG_LINES, self._take_log)
+        hear_log(self.node, LOG_LINES, self.take_log)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
         self.watched = {name: ExternalGoals(self.node, INTERFACES[name], name) for name in WATCHED}
         self._connection.start()
@@ -118,8 +118,9 @@ class ConsoleNode:
             self._diagnostics[status.name] = status
             self._heard[status.name] = time.monotonic()
 
-    def _take_log(self, level: str, logger: str, message: str) -> None:
-        self.log.append((level, logger, message))
+    def take_log(self, time_s: float, level: str, logger: str, message: str) -> None:
+        """Keep a line of the log."""
+        self.log.append((time.strftime("%H:%M:%S", time.localtime(time_s)), level, logger, message))
         self.lines_logged += 1
 
     def close(self) -> None:

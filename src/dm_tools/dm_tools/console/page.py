@@ -46,6 +46,7 @@ def serve(ros: ConsoleNode, port: int) -> None:
         port=port,
         title="Deformable mirror console",
         language="en-GB",
+        dark=None,  # as the system has it
         reload=False,
         show=False,
         show_welcome_message=False,

@@ -14,7 +14,8 @@ from dm_tools.console.console_node import ConsoleNode, Snapshot
 from dm_tools.console.loops import Loop
 from dm_tools.console.status import calibration_step, converge_step, recipe_step
 
-#: Failures that are kept until somebody dismisses them.
+#: Messages are shown so long, s of wall time, unless somebody dismisses them before; the log keeps failures.
+SHOWN_S = 120.0
 FAILURES_KEPT = 50
 #: What an action that was not started here is called.
 EXTERNAL = {
@@ -26,12 +27,13 @@ EXTERNAL = {
 
 @dataclass(frozen=True)
 class Failure:
-    """Something that was refused or went wrong."""
+    """Something that was refused or went wrong; `ends` is when it is shown no more, s of the steady clock."""
 
     number: int
     clock: str
     title: str
     sentence: str
+    ends: float
 
 
 @dataclass
@@ -72,13 +74,18 @@ class Session:
     base: list[float] | None = None
     poked: list[float] = field(default_factory=list)
     loops: dict[int, Loop] = field(default_factory=dict)
+    _outcome_ends: float = 0.0
     _numbers: Any = field(default_factory=lambda: itertools.count(1))
     _cancel: Callable[[], Awaitable[None]] | None = None
     _task: asyncio.Task[None] | None = None
     cancelled: bool = False
 
     def snapshot(self) -> Snapshot:
-        """What is known of the bench now."""
+        """What is known of the bench now; messages whose time is over go."""
+        now = time.monotonic()
+        self.failures[:] = [failure for failure in self.failures if failure.ends > now]
+        if now > self._outcome_ends:
+            self.outcome = ""
         return self.ros.snapshot()
 
     @property
@@ -108,9 +115,11 @@ class Session:
         return shown
 
     def fail(self, title: str, sentence: str) -> None:
-        """Show a sentence until it is dismissed."""
-        self.failures.append(Failure(next(self._numbers), time.strftime("%H:%M:%S"), title, sentence))
+        """Show a sentence until it is dismissed or its time is over."""
+        ends = time.monotonic() + SHOWN_S
+        self.failures.append(Failure(next(self._numbers), time.strftime("%H:%M:%S"), title, sentence, ends))
         del self.failures[:-FAILURES_KEPT]
+        self.ros.take_log(time.time(), "ERROR", "console", f"{title}: {sentence}")
 
     def dismiss(self, number: int) -> None:
         """Take a failure off the pages."""
@@ -137,7 +146,8 @@ class Session:
 
     async def _follow(self, title: str, work: Callable[[], Awaitable[str]]) -> None:
         try:
-            self.outcome = f"{title}: {await work()}"
+            self.outcome = f"{title}: {await work()} ({time.strftime('%H:%M:%S')})"
+            self._outcome_ends = time.monotonic() + SHOWN_S
         except (Refusal, ValueError) as error:
             self.fail(title, str(error))
         except Exception as error:  # a defect of the console must be seen, too

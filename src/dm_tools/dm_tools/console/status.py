@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration
 
 from dm_tools.console.view_models import QUALITIES
+from dm_tools.running_suite import ago, standing
 
 #: What each node does for the console, in words, when it is missing.
 NODES = {
@@ -150,9 +151,24 @@ def diagnostic_rows(statuses: dict[str, Any]) -> list[Row]:
     ]
 
 
-def log_rows(lines: Sequence[tuple[str, str, str]], everything: bool) -> list[tuple[str, str, str]]:
-    """(level, logger, message) of the log's lines, the newest first."""
-    return [line for line in reversed(lines) if everything or line[0] in ("WARN", "ERROR", "FATAL")]
+def log_rows(lines: Sequence[tuple[str, str, str, str]], everything: bool) -> list[tuple[str, str, str, str]]:
+    """(time, level, logger, message) of the log's lines, the newest first."""
+    return [line for line in reversed(lines) if everything or line[1] in ("WARN", "ERROR", "FATAL")]
+
+
+def now_text(snapshot: Any) -> str:
+    """Where the mirror stands, in one line."""
+    names = {name.rpartition("/")[2]: status for name, status in snapshot.diagnostics.items()}
+    shape, state = standing(names) if "focus_controller" in snapshot.present else None, snapshot.actuator_state
+    if "pdm_driver" not in snapshot.present or state is None:
+        return "now: not known, the driver is not heard"
+    if state.moving:
+        return "now: moving"
+    if shape is None:
+        return "now: not at a curvature that was asked for"
+    return f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {shape.bound * 1e9:.2g} nm (95 %)" + (
+        ", held" if shape.held else ""
+    )
 
 
 #: Phases of the action `calibrate`, by their number.

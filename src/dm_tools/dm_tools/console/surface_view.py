@@ -28,6 +28,7 @@ class SurfaceView:
         version: rises whenever something changed.
         measured, predicted, difference: None with a reason in `..._reason`. `predicted` is for now, `difference` for
             the moment of the map.
+        predicted_then: for the moment of the map; None = not known.
         predicted_zernike: (K,) m for the moment of the map; None = not known.
         doubt: why the prediction is a guess only, in words; "" = it is none.
         remark: on what the prediction leaves out, in words; "" = nothing.
@@ -40,6 +41,7 @@ class SurfaceView:
         self.measured: Surface | None = None
         self.predicted: Surface | None = None
         self.difference: Surface | None = None
+        self.predicted_then: Surface | None = None
         self.predicted_zernike: NDArray[np.float64] | None = None
         self.no_map_reason = "No map was measured yet."
         self.no_prediction_reason = self.no_difference_reason = NO_CALIBRATION
@@ -118,7 +120,7 @@ class SurfaceView:
         return True
 
     def _compare(self) -> None:
-        self.difference = self.predicted_zernike = None
+        self.difference = self.predicted_then = self.predicted_zernike = None
         if self._model is None:
             self.no_difference_reason = self.no_prediction_reason
         elif self.measured is None or self._at_map is None:
@@ -129,7 +131,8 @@ class SurfaceView:
             )
         else:
             try:
-                self.difference = difference(self.measured, self._model.surface(self._at_map.effective))
+                self.predicted_then = self._model.surface(self._at_map.effective)
+                self.difference = difference(self.measured, self.predicted_then)
                 self.predicted_zernike = self._model.coefficients(self._at_map.effective)
                 self.no_difference_reason = ""
             except ValueError as error:
@@ -142,5 +145,5 @@ class SurfaceView:
         if then is None or then.effective is None or now is None or then.effective.shape != now.shape:
             return ""
         if np.abs(then.effective - now).max() > SMALL_MOVE:
-            return "The mirror has moved since this map; the difference is for the moment of the map."
+            return "The mirror has moved since this map; all three are of the moment of the map."
         return "The map is of the present shape."

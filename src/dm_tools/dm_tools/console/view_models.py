@@ -12,7 +12,7 @@ from dm_msgs.msg import ActuatorState, Calibration, FocusRequest
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from dm_common.optics.zernike import NAMES, PISTON_TILT
+from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 
 Floats = NDArray[np.float64]
 
@@ -160,7 +160,7 @@ def bars(zernike: Any, predicted: Floats | None, as_difference: bool) -> list[Ba
     shown = measured - predicted if as_difference and predicted is not None else measured
     return [
         Bar(
-            name=NAMES[k].replace("_", "").replace("^", ","),
+            name=f"{SPOKEN[k].replace('secondary', '2nd')} {NAMES[k].split()[0].replace('_', '').replace('^', ',')}",
             value_nm=float(shown[k]) * NM,
             reach_nm=float(reach[k]) * NM,
             predicted_nm=float(predicted[k]) * NM if predicted is not None and usable and not as_difference else None,

@@ -9,6 +9,7 @@ from dm_tools.output import JsonOption, NamespaceOption, console, write_json
 from dm_tools.running_suite import (
     REPORT_S,
     Standing,
+    ago,
     hear_health,
     holder,
     nodes_of_suite,
@@ -64,7 +65,7 @@ def _now(by: Any, shape: Standing | None, state: Any) -> str:
         return f"{by} has the mirror"
     if shape is not None:
         return (
-            f"{shape.curvature:+.4f} 1/m ({2 * shape.curvature:+.3f} dioptre) for {_ago(shape.seconds)}, within "
+            f"{shape.curvature:+.4f} 1/m ({2 * shape.curvature:+.3f} dioptre) for {ago(shape.seconds)}, within "
             f"{promise(shape.bound)}{', held against creep' if shape.held else ''}"
         )
     if state is None or not state.applied:
@@ -80,7 +81,7 @@ def _calibration(calibration: Any) -> str:
     doubtful = sum(grade != 0 for grade in calibration.actuator_grade)
     law = "with hysteresis" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
     return (
-        f"{calibration.id}: {calibration.maps_used} maps {_ago(age)} ago, {law}, "
+        f"{calibration.id}: {calibration.maps_used} maps {ago(age)} ago, {law}, "
         f"{calibration.actuators - doubtful} of {calibration.actuators} actuators good"
     )
 
@@ -104,10 +105,3 @@ def _next(lacking: list[str], by: Any, calibration: Any, shape: Any, capabilitie
     if capabilities is not None and "wider error bound" in capabilities.message:
         return "./dm degauss: the actuators' history is not known, and the promise is wider for it"
     return "./dm check" if shape is not None else "./dm focus 0.02"
-
-
-def _ago(seconds: float) -> str:
-    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.0f} {unit}"
-    return f"{seconds:.0f} s"

@@ -17,7 +17,7 @@ from dm_tools.console.loops import modelled_loop
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import Cell, cells
-from dm_tools.console.widgets.components import ActionButton, Chart, Line, card, labelled
+from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card, labelled
 
 ARROWS = {"right": 0.0, "up": math.pi / 2, "left": math.pi, "down": -math.pi / 2}
 
@@ -59,7 +59,7 @@ class ActuatorCards:
                         "Number", value=session.chosen, min=1, step=1, format="%d", on_change=self._typed
                     )
                     self._number.classes("w-20")
-                    self._amplitude = ui.number("Amplitude", value=0.3, min=-2.0, max=2.0, step=0.1).classes("w-24")
+                    self._amplitude = DecimalField("Amplitude", 0.3, "w-24")
                 with ui.element("div").classes("line"):
                     self._on_click = ui.switch("Poke by click")
                     self._with_map = ui.switch("Map after a poke", value=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -22,6 +23,55 @@ def card(title: str) -> Iterator[None]:
     with ui.element("section").classes("card").props(f'aria-label="{title}"'):
         heading(title)
         yield
+
+
+@contextlib.contextmanager
+def folded(title: str) -> Iterator[None]:
+    """A card of details that a click on its heading unfolds."""
+    with ui.element("details").classes("card").props(f'aria-label="{title}"'):
+        with ui.element("summary"):
+            heading(title)
+        yield
+
+
+def decimal(text: str | None) -> float | None:
+    """The number in `text`, whose decimal sign may be a comma; None = there is none."""
+    try:
+        value = float((text or "").strip().replace(",", ".").replace("−", "-"))
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+class DecimalField:
+    """A field for a number as people write it: browsers read `0,02` in a field of their own for numbers as 2.
+
+    Args:
+        label: of it.
+        value: to begin with.
+        classes: of the page's style.
+        on_change: called without arguments.
+    """
+
+    def __init__(self, label: str, value: float, classes: str, on_change: Callable[[], Any] = lambda: None) -> None:
+        self._field = ui.input(
+            label, value=f"{value:g}", on_change=lambda: on_change(), validation={"not a number": self._is_number}
+        )
+        self._field.classes(classes).props('inputmode="decimal" hide-bottom-space')
+
+    @staticmethod
+    def _is_number(text: str) -> bool:
+        return decimal(text) is not None
+
+    @property
+    def value(self) -> float | None:
+        """What stands in it; None = no number."""
+        return decimal(self._field.value)
+
+    def set_value(self, value: float) -> None:
+        """Put a number in it, unless it stands there in other signs."""
+        if self.value != value:
+            self._field.set_value(f"{value:g}")
 
 
 def labelled(element: Any, name: str) -> Any:

@@ -15,7 +15,7 @@ from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import MODES, reachable
-from dm_tools.console.widgets.components import ActionButton, Line, card, labelled
+from dm_tools.console.widgets.components import ActionButton, DecimalField, Line, card, labelled
 
 #: Step of the slider, 1/m.
 STEP = 0.0005
@@ -38,10 +38,8 @@ class FocusCard:
             self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
             labelled(self._slider, "Curvature in 1 per metre").props("label switch-label-side")
             with ui.element("div").classes("line"):
-                self._number = ui.number("Curvature, 1/m", value=0.0, step=STEP, format="%.4f", on_change=self._typed)
-                self._number.classes("w-36")
-                self._conic = ui.number("Conic constant", value=0.0, step=0.1, on_change=lambda: self._touch())
-                self._conic.classes("w-28")
+                self._number = DecimalField("Curvature, 1/m", 0.0, "w-36", self._typed)
+                self._conic = DecimalField("Conic constant", 0.0, "w-28", self._touch)
                 self._power = Line("text figures")
             self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO, on_change=lambda: self._touch())
             labelled(self._mode.props("inline"), "Mode")

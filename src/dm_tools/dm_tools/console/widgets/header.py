@@ -8,7 +8,7 @@ from nicegui import ui
 
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
-from dm_tools.console.status import badges, missing
+from dm_tools.console.status import badges, missing, now_text
 from dm_tools.console.widgets.components import ActionButton, Line, heading
 
 
@@ -20,15 +20,19 @@ class Header:
         self._shown: tuple[object, ...] = ()
         self._badges_shown = ""
         with ui.element("header").classes("header"):
-            with ui.element("div").classes("line"):
+            with ui.element("div").classes("line one"):
                 heading("Deformable mirror console", 1)
                 self._badges = ui.html("", sanitize=False).classes("state").props('role="status" aria-label="State"')
-            with ui.element("div").classes("line") as self._line:
-                self._bar = ui.linear_progress(show_value=False).classes("grow").style("flex: 1; min-width: 120px")
-                self._bar.props('aria-label="Progress"')
-                self._text = Line("text figures")
-                self._cancel = ActionButton("Cancel", session.cancel, outline=True)
-            self._outcome = Line("text", live=True)
+            with ui.element("div").classes("line below"):
+                self._now = Line("text figures now")
+                with ui.element("div").classes("work") as self._line:
+                    self._bar = ui.linear_progress(show_value=False).style("flex: 1; min-width: 80px")
+                    self._bar.props('aria-label="Progress"')
+                    self._text = Line("text figures")
+                    self._cancel = ActionButton("Cancel", session.cancel, outline=True)
+                self._outcome = Line("text outcome", live=True)
+        # Apart from the header, at the foot of the window: it comes and goes without moving anything.
+        with ui.element("footer").classes("foot"):
             self._failures = ui.element("div").classes("failures")
             self._failures.props('role="alert" aria-live="assertive" aria-label="Errors"')
 
@@ -50,7 +54,8 @@ class Header:
         count = f" {progress.step}/{progress.steps}" if progress.steps else ""
         self._text.show(f"{progress.title}{count}: {progress.text}" if running else "")
         self._cancel.allow("" if progress.can_cancel else "This operation cannot be cancelled; it ends by itself.")
-        self._outcome.show(self._session.outcome)
+        self._now.show(now_text(snapshot))
+        self._outcome.show("" if running else self._session.outcome)
         lacking = missing(snapshot.present, snapshot.mirror_info is not None)
         state = snapshot.actuator_state
         if state is not None and state.error_code and state.message:

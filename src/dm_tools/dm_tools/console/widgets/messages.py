@@ -9,7 +9,7 @@ from nicegui import ui
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import diagnostic_rows, log_rows, shortened
-from dm_tools.console.widgets.components import card
+from dm_tools.console.widgets.components import folded
 
 
 def _short(text: str) -> str:
@@ -22,7 +22,7 @@ def _empty(text: str) -> str:
     return f'<div class="empty">{escape(text)}</div>'
 
 
-def _table(rows: list[tuple[str, str, str]]) -> str:
+def _table(rows: list[tuple[str, str, str, str]]) -> str:
     if not rows:
         return _empty("Nothing was logged yet.")
     cells = ("".join(f"<td>{_short(cell)}</td>" for cell in row) for row in rows)
@@ -34,7 +34,7 @@ class DiagnosticsCard:
 
     def __init__(self) -> None:
         self._shown = ""
-        with card("Diagnostics"):
+        with folded("Diagnostics"):
             self._place = ui.html("", sanitize=False).classes("scroll")
             self._place.props('tabindex="0" role="region" aria-label="Diagnostics"')
 
@@ -55,7 +55,7 @@ class LogCard:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._shown: tuple[int, bool] | None = None
-        with card("Log"):
+        with folded("Log"):
             self._all = ui.switch("Show everything, not only warnings and errors", value=True)
             self._place = ui.html("", sanitize=False).classes("scroll")
             self._place.props('tabindex="0" role="log" aria-label="Log"')

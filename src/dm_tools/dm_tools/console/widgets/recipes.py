@@ -13,7 +13,7 @@ from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import recipe_rows
-from dm_tools.console.widgets.components import ActionButton, Line, card
+from dm_tools.console.widgets.components import ActionButton, DecimalField, Line, folded
 
 #: Range of [1], section 3.2, 1/m, and the number of its curvatures.
 FIRST, LAST, NUMBER = -0.05, 0.05, 11
@@ -46,13 +46,13 @@ class RecipesCard:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._shown = ""
-        with card("Recipes"):
+        with folded("Recipes"):
             self._text = Line("text")
             self._table = ui.html("", sanitize=False).classes("scroll")
             self._table.props('tabindex="0" role="region" aria-label="Recipes of the calibration in use"')
             with ui.element("div").classes("line"):
-                self._first = ui.number("First, 1/m", value=FIRST, step=0.01, format="%.4f").classes("w-24")
-                self._last = ui.number("Last, 1/m", value=LAST, step=0.01, format="%.4f").classes("w-24")
+                self._first = DecimalField("First, 1/m", FIRST, "w-24")
+                self._last = DecimalField("Last, 1/m", LAST, "w-24")
                 self._number = ui.number("Recipes", value=NUMBER, min=1, max=NUMBER_MAX, step=1, format="%d")
                 self._number.classes("w-20")
             self._build = ActionButton("Build recipes", self._begin)

@@ -21,6 +21,8 @@ from dm_tools.console.widgets.components import ActionButton, Chart, Line, card,
 
 #: Share of the pixels that the scale of a difference covers: a few stray ones must not flatten it.
 COVERED = 99.5
+#: What the second panel shows, by whether it is of the moment of the map.
+PREDICTED = {True: "Predicted for the map", False: "Predicted now"}
 #: What the bars show, by whether it is a difference.
 KINDS = {True: "Measured − predicted", False: "Measured"}
 
@@ -30,19 +32,21 @@ class SurfaceCard:
 
     def __init__(self, session: Session, view: SurfaceView) -> None:
         self._session, self._view = session, view
-        self._shown = -1
+        self._shown: tuple[Any, ...] = ()
         self._panels: list[tuple[Chart, Line]] = []
+        self._names: list[ui.label] = []
         with card("Surface"):
             with ui.element("div").classes("line"):
                 self._measure = ActionButton(
                     "Measure", lambda: session.begin("Measure", lambda: operations.measure(session))
                 )
+                self._then = ui.switch("Prediction of the moment of the map", value=True)
                 self._when = Line("text")
             self._reason = Line("reason")
             with ui.element("div").classes("panels"):
-                for name in ("Measured", "Predicted now", "Measured − predicted"):
+                for name in ("Measured", PREDICTED[True], "Measured − predicted"):
                     with ui.element("div").classes("panel"):
-                        ui.label(name).classes("text").style("font-weight: 600")
+                        self._names.append(ui.label(name).classes("text").style("font-weight: 600"))
                         self._panels.append((Chart("heat"), Line("text figures")))
 
     def refresh(self, snapshot: Snapshot) -> None:
@@ -51,14 +55,18 @@ class SurfaceCard:
         self._reason.show(f"Not possible now: {reason}" if reason else "")
         view = self._view
         view.update(snapshot)
-        if view.version == self._shown:
+        key = (view.version, self._then.value)
+        if key == self._shown:
             return
-        self._shown = view.version
+        self._shown = key
         self._when.show(view.when)
-        limit = max([s.extent for s in (view.measured, view.predicted) if s is not None], default=np.nan)
+        then = bool(self._then.value) and view.predicted_then is not None
+        predicted = view.predicted_then if then else view.predicted
+        self._names[1].set_text(PREDICTED[then])
+        limit = max([s.extent for s in (view.measured, predicted) if s is not None], default=np.nan)
         self._panel(0, view.measured, limit, SAG_COLOURS, "measured surface", view.no_map_reason)
         text = " ".join([f"A guess: {view.doubt}." if view.doubt else "", view.remark]).strip()
-        self._panel(1, view.predicted, limit, SAG_COLOURS, "predicted surface", view.no_prediction_reason, text)
+        self._panel(1, predicted, limit, SAG_COLOURS, "predicted surface", view.no_prediction_reason, text)
         gap = view.difference
         extent = float(np.nanpercentile(np.abs(gap.sag), COVERED)) if gap is not None else np.nan
         self._panel(2, gap, extent, DIFFERENCE_COLOURS, "measured minus predicted", view.no_difference_reason)
