@@ -114,9 +114,9 @@ def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) ->
 
 def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibration, tmp_path: Path) -> None:
     file = tmp_path / "people.json"
-    keep_people(file, operator="A. N. Other", instrument="")
-    keep_people(file, instrument="Verifire")
-    keep_people(file, operator="")
+    keep_people({"operator": "A. N. Other", "instrument": ""}, file)
+    keep_people({"instrument": "Verifire"}, file)
+    keep_people({}, file)
     hysteresis = HysteresisFit("Prandtl-Ishlinskii", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
     text = one_html("", [certificate(replace(calibration, hysteresis=hysteresis), people(file))])
     for expected in ("<td>calibrated</td>", "2.00 nm (λ/316)", "A. N. Other", "Verifire"):

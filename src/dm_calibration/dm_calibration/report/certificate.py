@@ -38,14 +38,14 @@ def people(file: Path = PEOPLE) -> dict[str, str]:
     return {str(name): str(value) for name, value in content.items()} if isinstance(content, dict) else {}
 
 
-def keep_people(file: Path = PEOPLE, **names: str) -> None:
-    """Keep the names that are given for this report and those to come.
+def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
+    """Keep the names that are given for this report and those to come; "" = none, and not asked for again.
 
     Raises:
         OSError: the file cannot be written.
     """
-    if given := {name: value for name, value in names.items() if value}:
-        write_whole(file.expanduser(), json.dumps(people(file) | given).encode())
+    if names:
+        write_whole(file.expanduser(), json.dumps(people(file) | dict(names)).encode())
 
 
 def promise(calibration: Calibration) -> float:

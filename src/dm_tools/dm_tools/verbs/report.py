@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -80,7 +81,7 @@ def report(
 
     Reads the stored file; needs no running nodes, but takes the calibration of those that run.
     """
-    from dm_calibration.report.certificate import keep_people
+    from dm_calibration.report.certificate import keep_people, people
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
 
@@ -91,7 +92,11 @@ def report(
     if store is None:
         store = running_store(namespace) or newest_store(STORES)
     found, file = find_calibration(calibration, CalibrationStore(store))
-    keep_people(operator=operator, instrument=instrument)
+    names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
+    if console.is_terminal and sys.stdin.isatty():
+        for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):
+            names[name] = typer.prompt(f"{name}, for the first page (Enter = none)", default="", show_default=False)
+    keep_people(names)
     written = write_report(found, folder, file)
     console.print(
         f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "
