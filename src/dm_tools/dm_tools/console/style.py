@@ -4,7 +4,7 @@ PRIMARY, WARNING, ERROR = "#1a5a96", "#8a4b00", "#a61b1b"
 
 CSS = """
 :root { --page: #f2f4f7; --card: #ffffff; --ink: #1f2933; --faint: #52606d; --rule: #cbd2d9; --error: #a61b1b;
-  --doubt: #8a4b00; --error-page: #fdeaea; --doubt-page: #fff4e0; --focus: #1a5a96; }
+  --doubt: #8a4b00; --error-page: #fdeaea; --doubt-page: #fff4e0; --focus: #1a5a96; --on-primary: #ffffff; }
 html { scroll-padding: 130px 0 80px; }
 body { background: var(--page); color: var(--ink); }
 .nicegui-content { padding: 0 12px 26vh; gap: 12px; max-width: 1680px; margin: 0 auto; width: 100%; }
@@ -61,6 +61,7 @@ details.card:not([open]) { gap: 0; }
 .map:focus-visible, .scroll:focus-visible { outline: 3px solid var(--focus); outline-offset: 2px; }
 button:focus-visible, .q-slider:focus-within { outline: 3px solid var(--focus); outline-offset: 2px; }
 .q-btn { min-height: 40px; }
+.q-btn.bg-primary { color: var(--on-primary); }
 .chart { container-type: inline-size; width: 100%; }
 .chart .nicegui-echart { width: 100%; height: auto; }
 .chart .square { height: calc(100cqw + 44px); cursor: pointer; }
@@ -78,9 +79,9 @@ button:focus-visible, .q-slider:focus-within { outline: 3px solid var(--focus); 
 }
 @media (prefers-color-scheme: dark) {
   :root { --page: #12161b; --card: #1b2129; --ink: #e6eaee; --faint: #aab4bf; --rule: #3a444f; --error: #ff9a94;
-    --doubt: #f0b35c; --error-page: #3a1c1e; --doubt-page: #33270f; --focus: #7fb6e8; }
+    --doubt: #f0b35c; --error-page: #3a1c1e; --doubt-page: #33270f; --focus: #7fb6e8;
+    --on-primary: #0d1a26; }
   body { --q-primary: #7fb6e8 !important; --q-negative: #ff9a94 !important; --q-warning: #f0b35c !important; }
-  .q-btn.bg-primary.text-white { color: #0d1a26 !important; }
   .chart svg text[fill="#1f2933"] { fill: var(--ink); }
   .chart svg [stroke="#1f2933"] { stroke: var(--ink); }
   .chart svg [stroke="#c3ccd5"] { stroke: var(--rule); }

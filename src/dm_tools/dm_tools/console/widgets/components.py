@@ -92,8 +92,8 @@ class ActionButton:
         self._reason: str | None = None
         with ui.element("span") as self._shell:
             self._button = ui.button(text, on_click=lambda: on_click()).props("no-caps unelevated")
-            if outline:
-                self._button.props("outline")
+            # The words of a filled button have their colour from the page's style, which knows of the dark.
+            self._button.props("outline" if outline else "text-color=none")
 
     def allow(self, reason: str) -> None:
         """Enable it when `reason` is empty, else disable it and say why."""
