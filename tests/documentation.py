@@ -118,6 +118,7 @@ PARSED = {
     "./dm test src/dm_common/test/test_zernike_terms.py": "would run tests within a test",
     "./dm calibrate --plan full": _LONG + "test_end_to_end.py runs the plan",
     "./dm calibrate --plan pokes": _LONG + "test_doctor.py and others make such a calibration",
+    "./dm calibrate --until 2nm": _LONG + "test_calibrate_command.py checks what it asks for",
     "./dm calibrate --fresh": _LONG + "test_end_to_end.py runs the plan",
     "./dm calibrate --hysteresis 300": _LONG + "test_calibration_node.py and the demo run the plan",
     "./dm calibrate --plan surfaces --surfaces p06,p07,pz02": _LONG + "test_calibration_node.py runs the plan",
