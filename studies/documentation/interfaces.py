@@ -18,6 +18,8 @@ from typing import Any
 from rclpy.action import ActionServer, get_action_server_names_and_types_by_node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from studies.documentation.answers import PAGE, committed
+
 #: What rclpy gives every node, or every lifecycle node.
 STANDARD = ("rcl_interfaces", "lifecycle_msgs", "type_description_interfaces")
 STANDARD_TOPICS = ("rosout", "parameter_events")
@@ -236,6 +238,7 @@ def interfaces_page() -> str:
         parts.append(f"## {title}\n")
         for path in sorted((share / folder).glob(f"*.{folder}")):
             parts += definition(path)
+    parts.append(committed(PAGE.read_text()))  # from a run, which takes a minute
     parts.append(commands())
     return re.sub(r"\n{3,}", "\n\n", "\n".join(parts)).rstrip("\n") + "\n"
 

@@ -59,7 +59,7 @@ class Value:
         if isinstance(self.choices, Mapping):
             return ", ".join(f"{number} ({name})" for number, name in self.choices.items())
         if self.choices:
-            return "one of " + ", ".join(self.choices)
+            return "one of " + ", ".join(choice or "empty" for choice in self.choices)
         kind = self.item.__name__ + ("[]" if self.many else "")
         if math.isinf(self.low) and math.isinf(self.high):
             return f"a finite {kind}" if self.item is float else f"a {kind}"

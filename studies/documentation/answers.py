@@ -1,0 +1,174 @@
+"""The section Answers of docs/interfaces.md, from a run (`python -m studies.documentation.answers`).
+
+Every case of `answer_cases` is asked over ROS, one after another, of a calibrated mirror; the table holds code and
+sentence. What differs from run to run, names of files and measured figures, is an ellipsis.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from dm_msgs.action import Calibrate
+from dm_msgs.msg import ActuatorState, FocusState
+
+from dm_client.connection import Connection
+from dm_common.errors import ErrorCode
+from dm_common.ros import qos
+from dm_common.ros.worker import answers_arrive, call
+from studies.documentation.answer_cases import CASES
+
+#: Topics that carry commands: where their answers come.
+ANSWERED_ON = {"actuator_command": ("actuator_state", ActuatorState), "focus_request": ("focus_state", FocusState)}
+PATIENCE_S = 120.0
+TITLE = "## Answers\n"
+#: Codes whose sentences hold nothing that was measured.
+EXACT = (ErrorCode.INVALID_LENGTH, ErrorCode.NOT_FINITE, ErrorCode.OUT_OF_RANGE, ErrorCode.INVALID_ARGUMENT)
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "interfaces.md"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one call was answered.
+
+    Attributes:
+        name: of the interface.
+        values: as typed.
+        code: ErrorCode.
+        message: as it came.
+    """
+
+    name: str
+    values: str
+    code: int
+    message: str
+
+    def sentence(self) -> str:
+        """The message without what differs from run to run."""
+        text = re.sub(r"PDM30-37_\S+?Z|/\S+/|\S+\.dat\b", "…", self.message)
+        return text if self.code in EXACT else re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
+
+
+def fill(message: Any, values: Mapping[str, Any]) -> Any:
+    """Set the fields of `message` from a mapping, nested ones too."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            fill(getattr(message, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            kind = message.get_fields_and_field_types()[name].removeprefix("sequence<").rstrip(">").split("/")[-1]
+            module = __import__("dm_msgs.msg", fromlist=[kind])
+            setattr(message, name, [fill(getattr(module, kind)(), item) for item in value])
+        else:
+            setattr(message, name, value)
+    return message
+
+
+def parsed(values: str, names: Mapping[str, str]) -> dict[str, Any]:
+    """The mapping that `values` stands for; `names` holds what only the run knows."""
+    for name, actual in names.items():
+        values = values.replace(name, actual)
+    values = re.sub(r"\[(\d+) x ([^\]]+)\]", lambda m: f"[{', '.join([m[2]] * int(m[1]))}]", values)
+    return yaml.safe_load(f"{{{values}}}") or {}
+
+
+class Asker(Connection):
+    """Calls every interface, see `Connection`."""
+
+    def __init__(self, domain: int | None) -> None:
+        interfaces = {name: kind for name, (kind, _) in CASES.items() if name not in ANSWERED_ON}
+        topics = {topic: (kind, qos.STATE) for topic, kind in ANSWERED_ON.values()}
+        super().__init__("answers", "", domain, topics, interfaces, timeout_s=60.0)
+        self._publishers = {name: self.node.create_publisher(CASES[name][0], name, qos.COMMAND) for name in ANSWERED_ON}
+        self.start()
+
+    def ask(self, name: str, values: str, names: Mapping[str, str]) -> Answer:
+        """Try one case."""
+        kind, fields = CASES[name][0], parsed(values, names)
+        if name in ANSWERED_ON:
+            answer = self._publish(name, fill(kind(), fields))
+        elif hasattr(kind, "Goal"):
+            answer = self._goal(self.clients[name], fill(kind.Goal(), fields))
+        else:
+            answer = call(self.clients[name], fill(kind.Request(), fields), PATIENCE_S)
+        return Answer(name, values, answer.error_code, answer.message)
+
+    def _publish(self, name: str, message: Any) -> Any:
+        topic, _ = ANSWERED_ON[name]
+        publisher = self._publishers[name]
+        self.wait(lambda: publisher.get_subscription_count() > 0)
+        self.wait(lambda: topic in self.messages and not getattr(self.messages[topic], "moving", False), 3.0)
+        before = self.messages.pop(topic, None)
+        publisher.publish(message)
+        self.wait(lambda: topic in self.messages, 5.0)
+        return self.messages.get(topic, before)
+
+    def _goal(self, client: Any, goal: Any) -> Any:
+        self.wait(lambda: answers_arrive(client, client.server_is_ready))
+        accepted = client.send_goal_async(goal)
+        self.wait(accepted.done)
+        finished = accepted.result().get_result_async()
+        self.wait(finished.done, PATIENCE_S)
+        return finished.result().result
+
+
+def run() -> Iterator[Answer]:
+    """Every case, asked of a bench of this run's own."""
+    from dm_client import DeformableMirrorClient
+    from dm_common.ros.domains import own_domain
+    from dm_tools.demo.demo_bench import bench_config, running_bench
+
+    with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:
+        folder = Path(temporary)
+        config = bench_config(folder, "off", 0.0, 3, 20.0)
+        config["virtual_bench"] |= {"clock.period": 0.005, "camera.rate": 5.0, "camera.width": 64, "camera.height": 48}
+        config["autofocus"] = {"optics.rest_distance": 10.0, "use_sim_time": True}
+        config["calibration"]["write_report"] = False
+        with running_bench(config, folder, domain, DeformableMirrorClient) as client:
+            done = client.calibrate(
+                Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True), lambda _feedback: None
+            )
+            last = max((folder / "maps").iterdir(), key=lambda path: path.stat().st_mtime)
+            names = {"LONG": "x" * 5000, "IN_USE": done.id, "LAST_MAP": str(last)}
+            asker = Asker(domain)
+            try:
+                for name, (_, cases) in CASES.items():
+                    yield from (asker.ask(name, values, names) for values in cases)
+                    time.sleep(0.2)  # a move that the last case began
+            finally:
+                asker.close()
+
+
+def section(answers: Iterator[Answer]) -> str:
+    """The section, in Markdown."""
+    lines = [
+        TITLE,
+        "Asked of a calibrated mirror on the virtual bench; `./dm exec python -m studies.documentation.answers` writes",
+        "this section. `[37 x 0.0]` stands for so many values, LONG for a text of 5000 characters.",
+        "",
+        "| interface | values | code | sentence |",
+        "|---|---|---|---|",
+    ]
+    for answer in answers:
+        code = ErrorCode(answer.code)
+        sentence = answer.sentence().replace("|", r"\|")
+        lines.append(f"| `{answer.name}` | `{answer.values}` | {code.value} {code.name} | {sentence} |")
+    return "\n".join(lines) + "\n"
+
+
+def committed(page: str) -> str:
+    """The section that a page holds; "" = none."""
+    found = re.search(rf"(?ms)^{TITLE}.*?(?=^## )", page)
+    return found[0] if found else ""
+
+
+if __name__ == "__main__":
+    before = PAGE.read_text()
+    new = section(run()) + "\n"
+    old = committed(before)
+    PAGE.write_text(before.replace(old, new) if old else before.replace("## Commands\n", new + "## Commands\n", 1))
