@@ -233,7 +233,7 @@ def test_degauss_makes_the_history_known(driver: Driver) -> None:
     on_wire = signals_of(driver.unit.frames)
     assert np.abs(np.diff(on_wire, axis=0)).max() <= 0.1 + CODE
     bad = driver.observer.run_goal(Degauss, "degauss", Degauss.Goal(amplitude=1.5)).result
-    assert bad.error_code == ErrorCode.OUT_OF_RANGE and "must be 0 to 1" in bad.message
+    assert bad.error_code == ErrorCode.OUT_OF_RANGE and "must be float, 0 to 1" in bad.message
 
 
 def test_a_degauss_has_feedback_and_a_bound_and_is_cancelled_to_the_shape_before(driver: Driver) -> None:

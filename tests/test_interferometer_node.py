@@ -84,7 +84,7 @@ def test_ingested_map_is_published_whole(observer: Observer, start: Start, tmp_p
     counts = disc_counts(100, amplitude=20000)
     path.write_bytes(dat_bytes(counts, pitch=PITCH))
     answer = bench.ingest(path)
-    assert (answer.error_code, answer.message) == (ErrorCode.OK, "")
+    assert answer.error_code == ErrorCode.OK and answer.message.startswith("ingested: map.dat, rms")
     bench.wait_for_maps(1)
 
     sag = np.where(counts < 2147483640, counts * 0.5 * WAVELENGTH / 32768, np.nan)
@@ -228,7 +228,7 @@ def test_triggered_measurement_is_published_once(observer: Observer, start: Star
     before = observer.node.get_clock().now().nanoseconds
     answer = bench.measure(label="p55")
     after = observer.node.get_clock().now().nanoseconds
-    assert (answer.error_code, answer.message) == (ErrorCode.OK, "")
+    assert answer.error_code == ErrorCode.OK and answer.message.startswith("measured p55: ")
     stamp = answer.zernike.header.stamp
     assert before <= stamp.sec * 10**9 + stamp.nanosec <= after
     expected = np.zeros(21)
