@@ -134,8 +134,10 @@ class Browser:
         self.find(option, "div").click()
 
     def picked(self, name: str) -> Any:
-        """A radio button by its words."""
-        return self.find(name, "div")
+        """A radio button by its words, brought out from under the header."""
+        button = self.find(name, "div")
+        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+        return button
 
     def pictures(self, begin: str) -> list[str]:
         """Descriptions of the drawings in sight that begin with these words."""
