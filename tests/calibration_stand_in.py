@@ -8,11 +8,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo, SurfaceSamples, ZernikeCoefficients
-from dm_msgs.srv import Degauss, Measure, SetSignals
+from dm_msgs.srv import HoldMirror, Measure, SetSignals
 
+from dm_common.errors import Refusal
 from dm_common.mirror import Mirror
 from dm_common.ros import qos
+from dm_common.ros.worker import WorkerActionServer
+from dm_driver.commands.mirror_hold import MirrorHold
 from linear_mirror import RADIUS, LinearMirror
 
 
@@ -40,6 +44,7 @@ class StandIn:
         self.other: dict[str, Any] = {}  # what the maps say of aperture and instrument, where not as usual
         self.bump: dict[str, float] = {}  # tilt (m), shift_px, figure (m) of a mirror that was bumped
         self.driver_state, self.history_known = ActuatorState.STATE_ACTIVE, True
+        self.hold = MirrorHold(time.monotonic)
         self.turns, self.turned_at, self.written = 0, mirror.rest, node.get_clock().now()
         self.info = node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
         self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
@@ -47,7 +52,8 @@ class StandIn:
         self.samples = node.create_publisher(SurfaceSamples, "surface_samples", qos.STATE)
         node.create_timer(0.1, self.publish_state)  # a driver reports in any case
         node.create_service(SetSignals, "set_signals", self.on_set_signals)
-        node.create_service(Degauss, "degauss", self.on_degauss)
+        WorkerActionServer(node, Degauss, "degauss", lambda handle: self.on_degauss(handle.request.steps))
+        node.create_service(HoldMirror, "hold_mirror", self.on_hold_mirror)
         node.create_service(Measure, "measure", self.on_measure)
         self.publish_info(mirror)
         self.publish_state()
@@ -68,6 +74,7 @@ class StandIn:
         self.driver_state = self.driver_state if driver_state is None else driver_state
         message = ActuatorState(driver_state=self.driver_state, history_known=self.history_known)
         message.requested = message.applied = doubles(self.signals)
+        message.holder, message.holding = self.hold.holder, self.hold.sentence
         message.header.stamp = self.written.to_msg()
         message.turns, message.degausses, message.turned_at = self.turns, self.degaussed, doubles(self.turned_at)
         self.state.publish(message)
@@ -77,19 +84,27 @@ class StandIn:
         self.signals, self.written = np.array(signals), self.node.get_clock().now()
         self.publish_state()
 
+    def on_hold_mirror(self, request: Any, response: Any) -> Any:
+        try:
+            self.hold.ask(request.operation, request.holder, request.purpose, request.duration, request.lease)
+        except Refusal as refusal:
+            response.error_code, response.message = refusal.error_code, str(refusal)
+        self.publish_state()
+        return response
+
     def on_set_signals(self, request: Any, response: Any) -> Any:
         self.move(np.array(request.signals))
         response.applied = doubles(self.signals)
         return response
 
-    def on_degauss(self, request: Any, response: Any) -> Any:
-        self.degauss_steps.append(request.steps)
+    def on_degauss(self, steps: int) -> tuple[str, Any]:
+        self.degauss_steps.append(steps)
         self.degaussed += 1
         self.history_known = True
         self.move(self.mirror.rest)
         if self.on_degauss_done is not None:
             self.on_degauss_done()
-        return response
+        return "succeed", Degauss.Result()
 
     def on_measure(self, request: Any, response: Any) -> Any:
         time.sleep(self.pause)

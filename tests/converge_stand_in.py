@@ -11,7 +11,8 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import doubles
 from dm_common.ros.parameters import declare
-from dm_controller.focus_actions import LOOP_PARAMETERS, LoopHost, serve_loops
+from dm_controller.focus_actions import LoopHost, serve_loops
+from dm_controller.focus_parameters import LOOP_PARAMETERS
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
@@ -72,7 +73,6 @@ class Host(Node, LoopHost):
         self.refuse = False
         self.calibration: Calibration | None = calibration()
         self.values = declare(self, LOOP_PARAMETERS)
-        self.reserved: list[str] = []
         self.actions = serve_loops(self, self.values, self)
 
     def target(self, wanted: FocusRequest) -> FocusTarget:
@@ -85,6 +85,3 @@ class Host(Node, LoopHost):
 
     def hysteresis(self) -> HysteresisState | None:
         return None
-
-    def reserve(self, text: str) -> None:
-        self.reserved.append(text)

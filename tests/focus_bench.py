@@ -9,6 +9,7 @@ import threading
 from typing import Any
 
 import numpy as np
+from dm_msgs.action import Degauss
 from dm_msgs.msg import (
     ActuatorCommand,
     ActuatorHysteresis,
@@ -19,14 +20,14 @@ from dm_msgs.msg import (
     FocusState,
     MirrorInfo,
 )
-from dm_msgs.srv import Degauss, SetFocus
+from dm_msgs.srv import SetFocus
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 from dm_common.messages import doubles, recipe_book_message, time_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
-from dm_common.ros.worker import WorkerService
+from dm_common.ros.worker import WorkerActionServer
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from support import NodeProcess, Observer, wait_until
 
@@ -191,7 +192,7 @@ class RememberingBench(Bench):
         self.controller: NodeProcess | None = None
         self.reached: list[HysteresisState] = []
         self.other = observer.node.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
-        WorkerService(observer.node, Degauss, "degauss", self._on_degauss)
+        WorkerActionServer(observer.node, Degauss, "degauss", self._on_degauss)
 
     def _now(self) -> float:
         return 1e-9 * float(self.observer.node.get_clock().now().nanoseconds)
@@ -215,8 +216,8 @@ class RememberingBench(Bench):
         super()._on_command(command)
         self.reached.append(self.mirror)
 
-    def _on_degauss(self, request: Degauss.Request, response: Degauss.Response) -> Degauss.Response:
-        self.begun.append(request.steps)
+    def _on_degauss(self, handle: Any) -> tuple[str, Degauss.Result]:
+        self.begun.append(handle.request.steps)
         self.known = False
         self.publish_state([0.0] * 37, moving=True)
         assert self.degauss_may_end.wait(20.0)
@@ -224,8 +225,7 @@ class RememberingBench(Bench):
         self.degausses, self.known = self.degausses + 1, True
         self.turns, self.turned_at = self.turns + 1, [0.0] * 37
         self.publish_state([0.0] * 37)
-        response.duration = 0.2
-        return response
+        return "succeed", Degauss.Result(duration=0.2)
 
     def command(self, signals: NDArray[np.float64]) -> None:
         """A command of another publisher, carried out."""

@@ -19,7 +19,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import Autofocus
 from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
-from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
+from dm_msgs.srv import GetFocusRange, HoldMirror, SetFocus, SetFocusDistance
 from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
 from sensor_msgs.msg import CameraInfo, Image
@@ -65,6 +65,7 @@ class FilmedScene:
         self.request = self.node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.node.create_subscription(FocusRequest, "focus_request", self._on_request, qos.COMMAND)
         self.node.create_service(SetFocus, "set_focus", self._on_set_focus)
+        self.node.create_service(HoldMirror, "hold_mirror", lambda _request, response: response)
         self.states: list[AutofocusState] = observer.record(AutofocusState, "autofocus_state", qos.STATE)
         self._stop = threading.Event()
         self._camera = threading.Thread(target=self._film, args=(1 / rate,), daemon=True)

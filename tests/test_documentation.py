@@ -26,6 +26,7 @@ import typer
 import yaml
 
 import documentation as told
+from dm_bringup.nodes import LAUNCH_ARGUMENTS
 from dm_bringup.suite import load_config, save_config
 from dm_client import DeformableMirrorClient
 from dm_common.ros.domains import own_domain
@@ -203,7 +204,7 @@ def test_commands_of_ros_name_what_exists(command: str) -> None:
     if words[1] == "launch":
         file = ROOT / "src" / words[2] / "launch" / words[3]
         for argument in words[4:]:
-            assert f'DeclareLaunchArgument("{argument.split(":=")[0]}"' in file.read_text()
+            assert argument.split(":=")[0] in {name for name, _default, _text in LAUNCH_ARGUMENTS}
         assert file.is_file()
         return
     if words[1:3] == ["param", "set"]:

@@ -18,7 +18,7 @@ from dm_msgs.msg import ActuatorState, ErrorCode
 from std_srvs.srv import SetBool
 
 from dm_client import DeformableMirrorClient, DeformableMirrorError
-from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.domains import own_domain
 from dm_controller.planning.target import FocusTarget
 from dm_tools.verify import map_of, surface_error

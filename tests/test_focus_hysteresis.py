@@ -13,9 +13,8 @@ import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dm_msgs.action import MoveFocus
+from dm_msgs.action import Degauss, MoveFocus
 from dm_msgs.msg import ErrorCode, FocusRequest
-from dm_msgs.srv import Degauss
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 
@@ -49,7 +48,7 @@ def make(
 
 def degauss(bench: RememberingBench) -> None:
     count = bench.degausses
-    bench.observer.call(Degauss, "degauss")
+    bench.observer.run_goal(Degauss, "degauss", Degauss.Goal())
     wait_until(lambda: bench.degausses > count and bench.set_focus(dry_run=True).state.history_known)
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from dm_msgs.action import Degauss
 from dm_msgs.msg import (
     ActuatorCommand,
     ActuatorState,
@@ -31,8 +32,8 @@ from dm_msgs.msg import (
     FocusState,
     MirrorInfo,
 )
-from dm_msgs.srv import Degauss
 from numpy.typing import NDArray
+from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
@@ -80,7 +81,7 @@ class _Client(Node):
         self._commands: dict[tuple[int, int], int] = {}
         self._request = self.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.calibration = self.create_publisher(Calibration, "calibration", qos.LATCHED)
-        self.degauss = self.create_client(Degauss, "degauss")
+        self.degauss = ActionClient(self, Degauss, "degauss")
         self._relay_sent: dict[float, int] = {}
         self._relay_request = self.create_publisher(FocusRequest, "/relay/focus_request", qos.COMMAND)
         deep = QoSProfile(depth=200)
@@ -128,7 +129,8 @@ class _Client(Node):
         for overtaken in [curvature for curvature, when in self._sent.items() if when < sent]:
             del self._sent[overtaken]
         self.answered += 1
-        self.refused += state.error_code != ErrorCode.OK
+        # A request that a newer one replaced before the driver confirmed it is not refused: the latest wins.
+        self.refused += state.error_code not in (ErrorCode.OK, ErrorCode.PREEMPTED)
         came = self._commands.pop((state.header.stamp.sec, state.header.stamp.nanosec), None)
         if came is not None:
             self.window.latency_us.append(1e-3 * (came - sent))
@@ -177,12 +179,13 @@ def soak(
 
     try:
         with Suite(config, folder / "nodes", domain, nodes=NODES) as suite, _relay(domain):
-            wait_for("the driver", lambda: client.infos and client.active and client.degauss.service_is_ready())
+            wait_for("the driver", lambda: client.infos and client.active and client.degauss.server_is_ready())
             client.calibration.publish(stand_in_mirror.calibration(LAW, client.infos[-1].serial))
             wait_for("the controller's calibration", lambda: client.calibrated)
             serve(1.0)
-            degauss = client.degauss.call_async(Degauss.Request(steps=10))
+            degauss = client.degauss.send_goal_async(Degauss.Goal(steps=10))
             serve(PATIENCE_S, degauss.done)
+            serve(PATIENCE_S, degauss.result().get_result_async().done)
             serve(1.0)
             return _stream(client, suite, serve, seconds, random, progress)
     finally:

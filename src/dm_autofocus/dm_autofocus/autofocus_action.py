@@ -37,7 +37,7 @@ def ready_capabilities(probe: FocusProbe) -> Capabilities:
     if capabilities is None:
         raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
     if capabilities.quality == Capabilities.UNCALIBRATED:
-        raise Refusal(ErrorCode.NOT_CALIBRATED, capabilities.message)
+        raise Refusal(capabilities.error_code or ErrorCode.NOT_CALIBRATED, capabilities.message)
     return capabilities
 
 
@@ -90,10 +90,11 @@ class AutofocusAction:
         self._probe.start()
         try:
             config, region = self._config(goal_handle.request)
-            peak, config = self._search(goal_handle, config, region)
-            self._fill(result, peak)
-            if goal_handle.request.track:
-                self._track(goal_handle, config, region, peak, result)
+            with self._probe.held():
+                peak, config = self._search(goal_handle, config, region)
+                self._fill(result, peak)
+                if goal_handle.request.track:
+                    self._track(goal_handle, config, region, peak, result)
             outcome, result.error_code = "succeed", ErrorCode.OK
             result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}"
             if peak.at_limit:

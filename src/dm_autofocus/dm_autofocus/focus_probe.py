@@ -7,7 +7,8 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,8 @@ from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
+from dm_common.ros.clients import MirrorHolder
+from dm_common.ros.worker import ServiceCallError
 
 #: As cameras publish; depth 1: an image that was not fetched in time is dropped for the next.
 IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -71,6 +74,7 @@ class FocusProbe:
         self._measuring = False
         self._fresh: Image | None = None
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
+        self._hold = MirrorHolder(node, node.get_name())
         self._topic = node.resolve_topic_name("image_raw")
         node.create_subscription(Image, "image_raw", self._on_image, IMAGES)
         node.create_subscription(CameraInfo, "camera_info", self._on_camera_info, IMAGES)
@@ -124,6 +128,17 @@ class FocusProbe:
 
     # --- moving and measuring ---
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the mirror at the driver for the block. Raises Refusal: somebody else does, or there is no driver."""
+        purpose = "a search or tracking (action autofocus); cancel it to end it"
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(self._hold.held(purpose, 0.0, self._values["move_timeout"]))
+            except ServiceCallError as error:
+                raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
+            yield
+
     def start(self) -> None:
         """The mirror is this node's until `release`; count images from here."""
         self._other_request = None
@@ -135,12 +150,15 @@ class FocusProbe:
         Raises:
             Refusal: refused, no answer, another node moves the mirror, or the move does not end.
         """
+        if self._hold.lost is not None:
+            raise self._hold.lost
         with self._changed:
             self._gate = SettledGate(self._values["settle_time"], self._values["stamp_lead"])
             self.answer = None
             self.target = curvature
             self._asked.append(curvature)
-        self._request.publish(FocusRequest(curvature=curvature, mode=FocusRequest.MODE_DIRECT))
+        mode, holder = FocusRequest.MODE_DIRECT, self._hold.holder
+        self._request.publish(FocusRequest(curvature=curvature, mode=mode, holder=holder))
         limit = self._values["move_timeout"]
         if not self._wait(lambda: self.answer is not None, limit, stop):
             raise Refusal(

@@ -112,3 +112,56 @@ def node_environment(config_folder: Path) -> dict[str, str]:
         # Matrix products here take a millisecond; threads of several nodes would fight over the cores for longer.
         "OPENBLAS_NUM_THREADS": "1",
     }
+
+
+#: Arguments of the launch files: name, default (None = `config` must be given) and description.
+LAUNCH_ARGUMENTS = (
+    ("config", None, "parameter file of all nodes, see config/hardware.yaml"),
+    ("namespace", "", "namespace; one per mirror"),
+    ("respawn", "true", "start a node that died again"),
+    ("respawn_delay", "2.0", "s before that"),
+    ("log_level", "info", "of every node: debug, info, warn, error, fatal"),
+    ("remap", "", "remappings of every node, separated by blanks: image_raw:=/camera/image_raw"),
+    ("use_sim_time", "", "true or false; empty = as the parameter file says"),
+    ("autostart", "", "true: driver and interferometer configure and activate themselves; empty = as in the file"),
+)
+
+
+def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
+    """Keyword arguments of the launch action that starts a node.
+
+    Args:
+        values: of LAUNCH_ARGUMENTS, as text.
+
+    Raises:
+        ValueError: a value that cannot be; the message names the argument, the value and what is allowed.
+    """
+    parameters: list[Any] = [values["config"]]
+    switches = {
+        name: flag(name, values[name])
+        for name in ("use_sim_time", "autostart")
+        if values[name] and (name == "use_sim_time" or node.lifecycle)
+    }
+    if switches:
+        parameters.append(switches)
+    remappings = []
+    for rule in values["remap"].split():
+        old, arrow, new = rule.partition(":=")
+        if not (arrow and old and new):
+            raise ValueError(f"remap: {rule!r}: must be of the form from:=to")
+        remappings.append((old, new))
+    return {
+        "namespace": values["namespace"],
+        "parameters": parameters,
+        "remappings": remappings,
+        "arguments": ["--ros-args", "--log-level", values["log_level"]],
+        "respawn": flag("respawn", values["respawn"]),
+        "respawn_delay": float(values["respawn_delay"]),
+    }
+
+
+def flag(name: str, text: str) -> bool:
+    """Raises ValueError for what is neither true nor false."""
+    if text.lower() not in ("true", "false"):
+        raise ValueError(f"{name} = {text!r}: must be true or false")
+    return text.lower() == "true"

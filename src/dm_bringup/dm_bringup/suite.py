@@ -8,16 +8,23 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import yaml
 
-from dm_bringup.nodes import NAMES, nodes_of
+from dm_bringup.nodes import MODULES, NAMES, nodes_of
 
 Config = dict[str, dict[str, Any]]
+
+#: A node that ended is started again after this time, s; after twice as long each time that it ends soon again, up to
+#: RESTART_MAX_S. One that has run for SETTLED_S begins anew.
+RESTART_S, RESTART_MAX_S, SETTLED_S = 0.5, 30.0, 60.0
+#: Exit status of a node that could not be made: what it was configured with is wrong, see `dm_common.ros.executor`.
+NOT_MADE = 1
 
 
 class ConfigError(ValueError):
@@ -69,6 +76,16 @@ def stop_processes(processes: Collection[subprocess.Popen[bytes]], timeout_s: fl
             process.wait()
 
 
+@dataclass
+class _Restarts:
+    """Of one node: when it was started last and is due again, s, steady, and how long the next wait is."""
+
+    started: float
+    due: float | None = None
+    pause: float = RESTART_S
+    first: bool = True
+
+
 class Suite:
     """The nodes named in a configuration, each in a process of its own. Use as a context manager.
 
@@ -94,13 +111,14 @@ class Suite:
     ) -> None:
         self.folder = folder
         self._config = config
-        self._namespace = namespace
+        self._namespace = f"{namespace.strip('/')}/" if namespace.strip("/") else ""
         self._echo = echo
         self._nodes = NAMES if nodes is None else nodes
         self._environment = dict(os.environ)
         if domain is not None:
             self._environment["ROS_DOMAIN_ID"] = str(domain)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._restarts: dict[str, _Restarts] = {}
 
     def __enter__(self) -> Self:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -108,19 +126,56 @@ class Suite:
         save_config(self._config, parameters)
         for node in nodes_of(self._config):
             if node.name in self._nodes:
-                self._start(node.name, node.module, parameters)
+                self._start(node.name)
         return self
 
-    def _start(self, name: str, module: str, parameters: Path) -> None:
-        command = [sys.executable, "-m", module, "--ros-args", "--params-file", str(parameters)]
+    def _start(self, name: str) -> None:
+        arguments = ["--ros-args", "--params-file", str(self.folder / "config.yaml")]
         if self._namespace:
-            command += ["-r", f"__ns:=/{self._namespace.strip('/')}"]
+            arguments += ["-r", f"__ns:=/{self._namespace.rstrip('/')}"]
+        self._processes[name] = self._process(name, arguments)
+        self._restarts.setdefault(name, _Restarts(time.monotonic())).started = time.monotonic()
+
+    def _process(self, name: str, arguments: list[str]) -> subprocess.Popen[bytes]:
+        """A node with these command-line arguments, started."""
         with contextlib.ExitStack() as stack:
-            output = None if self._echo else stack.enter_context(self.log(name).open("wb"))
+            mode = "ab" if name in self._restarts else "wb"
+            output = None if self._echo else stack.enter_context(self.log(name).open(mode))
             # Their own process group: Ctrl-C on the terminal is passed on by us, in order, not to all at once.
-            self._processes[name] = subprocess.Popen(
-                command, stdout=output, stderr=subprocess.STDOUT, env=self._environment, start_new_session=True
+            return subprocess.Popen(
+                [sys.executable, "-m", MODULES[name], *arguments],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                start_new_session=True,
             )
+
+    def revive(self, say: Callable[[str], None]) -> None:
+        """Start nodes that have ended again, after a pause that grows while they end again; to be called often.
+
+        Args:
+            say: called with a sentence for every node that ended, and for every one that is started again.
+
+        Raises:
+            RuntimeError: a node could not be made with this configuration; the next try would end in the same way.
+        """
+        now = time.monotonic()
+        for name in self.ended():
+            restart = self._restarts[name]
+            if restart.due is None:
+                status = self._processes[name].returncode
+                if now - restart.started > SETTLED_S:
+                    restart.pause = RESTART_S
+                elif status == NOT_MADE and restart.first:
+                    self.check()
+                restart.due, restart.first = now + restart.pause, False
+                reason = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
+                say(f"the node {self._namespace}{name} {reason}; it is started again in {restart.pause:g} s")
+                restart.pause = min(2.0 * restart.pause, RESTART_MAX_S)
+            elif now >= restart.due:
+                restart.due = None
+                self._start(name)
+                say(f"the node {self._namespace}{name} is started again")
 
     def log(self, name: str) -> Path:
         """The log file of a node."""

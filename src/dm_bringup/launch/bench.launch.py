@@ -7,6 +7,7 @@ from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
+from dm_bringup.nodes import LAUNCH_ARGUMENTS
 from launch import LaunchDescription
 
 
@@ -15,11 +16,13 @@ def generate_launch_description():
     bench = str(share / "config" / "bench.yaml")
     return LaunchDescription(
         [
-            DeclareLaunchArgument("config", default_value=bench, description="parameter file of all nodes"),
-            DeclareLaunchArgument("namespace", default_value="", description="namespace; one per mirror"),
+            *(
+                DeclareLaunchArgument(name, default_value=bench if default is None else default, description=text)
+                for name, default, text in LAUNCH_ARGUMENTS
+            ),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(str(share / "launch" / "suite.launch.py")),
-                launch_arguments={name: LaunchConfiguration(name) for name in ("config", "namespace")}.items(),
+                launch_arguments={name: LaunchConfiguration(name) for name, _, _ in LAUNCH_ARGUMENTS}.items(),
             ),
         ]
     )

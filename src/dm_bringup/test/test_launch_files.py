@@ -10,10 +10,13 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from dm_bringup.nodes import NAMES, nodes_of
+from dm_bringup.nodes import LAUNCH_ARGUMENTS, NAMES, NODES, arguments_of, nodes_of
 from dm_bringup.suite import ConfigError, load_config
 
 SHARE = Path(__file__).resolve().parents[1]
+
+
+DEFAULTS = {name: default or "" for name, default, _text in LAUNCH_ARGUMENTS}
 
 
 class _Recorded:
@@ -33,8 +36,9 @@ class _Recorded:
 def test_launch_files_start_what_up_starts(
     config: str, nodes: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    stand_ins = dict.fromkeys(("LaunchConfiguration", "OpaqueFunction", "GroupAction"), _Recorded)
     for name in ("launch", "launch.actions", "launch.substitutions", "launch.launch_description_sources"):
-        monkeypatch.setitem(sys.modules, name, MagicMock(LaunchConfiguration=_Recorded, OpaqueFunction=_Recorded))
+        monkeypatch.setitem(sys.modules, name, MagicMock(**stand_ins))
     for name in ("launch_ros", "launch_ros.actions"):
         monkeypatch.setitem(sys.modules, name, MagicMock(Node=_Recorded))
     monkeypatch.setattr(sys.modules["launch"], "LaunchDescription", _Recorded)
@@ -46,10 +50,27 @@ def test_launch_files_start_what_up_starts(
     for file in ("bench.launch.py", "suite.launch.py"):
         launch = runpy.run_path(str(SHARE / "launch" / file))
         description = launch["generate_launch_description"]()
-    start_nodes = description.arguments[0][-1].keywords["function"]
-    actions = start_nodes({"config": str(path), "namespace": ""})
+    group = description.arguments[0][-1]
+    assert group.keywords["scoped"]
+    start_nodes = group.arguments[0][-1].keywords["function"]
+    actions = start_nodes(DEFAULTS | {"config": str(path)})
     assert tuple(action.keywords["executable"] for action in actions) == nodes
     assert tuple(node.name for node in nodes_of(load_config(path))) == nodes
     assert {action.keywords["parameters"][0] for action in actions} == {str(path)}
     with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
-        start_nodes({"config": str(tmp_path / "none.yaml"), "namespace": ""})
+        start_nodes(DEFAULTS | {"config": str(tmp_path / "none.yaml")})
+
+
+def test_what_a_fleet_sets_reaches_every_node() -> None:
+    given = {"config": "c.yaml", "namespace": "left", "remap": "image_raw:=/camera/image_raw", "log_level": "debug"}
+    for node in NODES:
+        action = arguments_of(node, DEFAULTS | given | {"autostart": "false", "use_sim_time": "true"})
+        own = {"autostart": False} if node.lifecycle else {}
+        assert action["parameters"] == ["c.yaml", {"use_sim_time": True} | own]
+        assert action["remappings"] == [("image_raw", "/camera/image_raw")] and action["namespace"] == "left"
+        assert action["arguments"][-1] == "debug"
+        assert (action["respawn"], action["respawn_delay"]) == (True, 2.0)
+    assert arguments_of(NODES[0], DEFAULTS | {"config": "c.yaml"})["parameters"] == ["c.yaml"]
+    for name, value in (("respawn", "perhaps"), ("remap", "image_raw")):
+        with pytest.raises(ValueError, match=f"{name}.*must be"):
+            arguments_of(NODES[0], DEFAULTS | {name: value})

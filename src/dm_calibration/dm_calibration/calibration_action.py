@@ -25,7 +25,7 @@ from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, ident
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.mirror import Mirror
-from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.bench_services import BenchServices, told_by
 from dm_common.ros.worker import wait_for_clock
 
 #: Least time between two feedback messages, s.
@@ -74,7 +74,8 @@ class CalibrateAction:
             self._services.check_ready()
             self._services.settle_time = handle.request.settle_time or self._values["settle_time"]
             self._services.cancelled = lambda: bool(handle.is_cancel_requested)
-            with UnfinishedRuns(self._manager.store.folder) as runs:
+            held = self._services.held("cancel the action calibrate to end it", result.expected_duration)
+            with UnfinishedRuns(self._manager.store.folder) as runs, held:
                 self._run_kept(handle, plan, options, mirror, runs, result)
         except EXPECTED as error:
             result.error_code, result.message = error_code(error), str(error)
@@ -188,6 +189,8 @@ class CalibrateAction:
             feedback.maps_dropped, feedback.residual_rms = now.dropped, now.residual_rms
             # Reference frames belong to the phase around them.
             report(_PHASES.get(now.kind, feedback.phase), now.label, now.done)
+
+        self._services.waiting = told_by(handle, feedback)
 
         def told(reached: float) -> None:
             feedback.reached_max_zernike = reached

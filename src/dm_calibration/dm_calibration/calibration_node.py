@@ -51,7 +51,7 @@ class CalibrationNode(Node):
         self._frame_id = ""
         self._start_pending = bool(self._values["load_on_start"])
         # Latched: a controller that starts later must know the calibration in use.
-        self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.LATCHED)
+        self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.with_lease(qos.LATCHED))
         self._reports = ReportWriter(self._log_report)
         self._manager = CalibrationManager(
             CalibrationStore(self._values["calibration_folder"], self._write_report),

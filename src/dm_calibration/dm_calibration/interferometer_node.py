@@ -56,6 +56,10 @@ class InterferometerNode(LifecycleNode):
         self._last_file = self._last_refusal = ""
         self._warned_of_pitch = False
         self._published: dict[str, str] = {}  # sha256 by path of what came from the watched folder
+        # There in every state: by its lease others know that this node lives.
+        self._info_publisher = self.create_lifecycle_publisher(
+            SurfaceMapInfo, "surface_map_info", qos.with_lease(qos.STATE)
+        )
         self._diagnostics = diagnostics.Diagnostics(self, "interferometer", self._health)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self._worker_services = [
@@ -89,7 +93,6 @@ class InterferometerNode(LifecycleNode):
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
         self._map_publisher = self.create_lifecycle_publisher(Image, "surface_map", qos.MAP)
-        self._info_publisher = self.create_lifecycle_publisher(SurfaceMapInfo, "surface_map_info", qos.STATE)
         self._zernike_publisher = self.create_lifecycle_publisher(ZernikeCoefficients, "zernike", qos.STATE)
         self._samples_publisher = self.create_lifecycle_publisher(SurfaceSamples, "surface_samples", qos.STATE)
         self._configured = True
@@ -129,7 +132,6 @@ class InterferometerNode(LifecycleNode):
             with self._publishing:
                 for publisher in (
                     self._map_publisher,
-                    self._info_publisher,
                     self._zernike_publisher,
                     self._samples_publisher,
                 ):

@@ -15,10 +15,9 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
+from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
 from dm_msgs.srv import (
-    Degauss,
     Flatten,
     IngestFile,
     ListCalibrations,
@@ -147,9 +146,15 @@ class DeformableMirrorClient(Connection):
         """Set all actuator signals (normalised, -1..+1)."""
         return self.call("set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait))
 
-    def degauss(self, timeout_s: float = 120.0) -> Degauss.Response:
-        """Remove the hysteresis and end at mid range."""
-        return self.call("degauss", Degauss.Request(), timeout_s)
+    def degauss(
+        self,
+        steps: int = 0,
+        *,
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 200.0,
+    ) -> Degauss.Result:
+        """Remove the hysteresis and end at mid range; `steps` half-swings, 0 = as configured in the driver."""
+        return self.run_action("degauss", Degauss.Goal(steps=steps), on_feedback, timeout_s)
 
     def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:
         """Take one map with the interferometer."""

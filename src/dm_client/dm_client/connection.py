@@ -9,14 +9,39 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
+from dm_msgs.msg import Calibration, Capabilities, MirrorInfo, SurfaceMapInfo
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros import qos
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.qos import Liveliness
 from dm_common.ros.worker import ServiceCallError, answers_arrive, call
 
+#: Topics by which the nodes are known to live, and what they serve.
+WATCHED: dict[str, tuple[Any, str, Any, tuple[str, ...]]] = {
+    "pdm_driver": (MirrorInfo, "mirror_info", qos.LATCHED, ("set_signals", "degauss")),
+    "interferometer": (SurfaceMapInfo, "surface_map_info", qos.STATE, ("measure", "ingest_file")),
+    "calibration": (
+        Calibration,
+        "calibration",
+        qos.LATCHED,
+        ("calibrate", "list_calibrations", "load_calibration", "update_calibration"),
+    ),
+    "focus_controller": (
+        Capabilities,
+        "capabilities",
+        qos.LATCHED,
+        ("set_focus", "flatten", "move_focus", "converge", "build_recipes"),
+    ),
+}
+#: Of a node that does not answer; TIMEOUT for the others.
+UNAVAILABLE = {
+    "pdm_driver": ErrorCode.DRIVER_UNAVAILABLE,
+    "interferometer": ErrorCode.INTERFEROMETER_UNAVAILABLE,
+}
 #: Two connections of one process need two names.
 _NUMBERS = itertools.count(1)
 
@@ -77,6 +102,10 @@ class Connection:
         self.clients: dict[str, Any] = {}
         for topic, (message_type, profile) in topics.items():
             self.hear(topic, message_type, profile)
+        self._servers: dict[str, Liveliness] = {}
+        for server, (message_type, topic, profile, served) in WATCHED.items():
+            watched = Liveliness(self.node, server, message_type, topic, profile)
+            self._servers |= dict.fromkeys(served, watched)
         for interface_name, interface in interfaces.items():
             make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
             self.clients[interface_name] = make(self.node, interface, interface_name)
@@ -114,9 +143,21 @@ class Connection:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
         try:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
-            return checked(call(self.clients[name], request, timeout_s))
+            return checked(call(self.clients[name], request, timeout_s, lambda: self._lost(name)))
         except ServiceCallError as error:
+            self._check_server(name)
             raise DeformableMirrorError(ErrorCode.TIMEOUT, str(error)) from error
+
+    def _lost(self, name: str) -> bool:
+        """Whether the node that serves `name` has died."""
+        return name in self._servers and self._servers[name].missing(lambda: True)
+
+    def _check_server(self, name: str) -> None:
+        """Raise DeformableMirrorError when the node that serves `name` has died."""
+        if self._lost(name):
+            answers_arrive(self.clients[name], lambda: False)  # the next one has to discover the client anew
+            server = self._servers[name]
+            raise DeformableMirrorError(UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {server.text}")
 
     def run_action(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float) -> Any:
         """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
@@ -124,20 +165,26 @@ class Connection:
         Ctrl-C cancels it first, so that the mirror is left safe.
         """
         client = self.clients[name]
+        self._check_server(name)
         if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
         finished = None
         try:
-            if not self.wait(accepted.done):
+            self.wait(lambda: accepted.done() or self._lost(name))
+            if not accepted.done():
+                self._check_server(name)
                 raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no answer to the goal")
             if not accepted.result().accepted:
                 raise DeformableMirrorError(ErrorCode.BUSY, f"{name}: refused, another goal is running")
             finished = accepted.result().get_result_async()
-            if not self.wait(finished.done, timeout_s):
+            self.wait(lambda: finished.done() or self._lost(name), timeout_s)
+            if not finished.done():
+                self._check_server(name)
                 raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: not finished within {timeout_s:g} s")
         except BaseException:
-            self._cancel(accepted, finished)
+            if not self._lost(name):
+                self._cancel(accepted, finished)
             raise
         return checked(finished.result().result)
 

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import answers_arrive

@@ -15,7 +15,7 @@ from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import Flatten, SetSignals
 from std_msgs.msg import Int32
 
-from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.worker import (
     ServiceCallError,
     WorkerActionServer,

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_types import CommandedShape
+from dm_controller.planning.active_calibration import ActiveCalibration
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +56,10 @@ class CreepHold:
     def active(self) -> bool:
         """Whether a shape is held."""
         return self.shape is not None and self.shape.held
+
+    def wanted(self, active: ActiveCalibration | None) -> bool:
+        """Whether shapes of this calibration are corrected for creep."""
+        return active is not None and self._values["hold.enable"] and active.planner.law.creep_rate > 0.0
 
     @property
     def next_check(self) -> float:

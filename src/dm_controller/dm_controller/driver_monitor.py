@@ -10,13 +10,15 @@ import math
 import statistics
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from dm_msgs.msg import ActuatorState
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_controller.focus_types import CommandedShape, DriverReport, Floats, Order, Progress
+from dm_controller.focus_types import CommandedShape, DriverReport, Floats, Order, Progress, PublishState
+from dm_controller.planning.target import Request
 
 #: A message's constants are properties of its class, which take longer to look up.
 _ACTIVE = ActuatorState.STATE_ACTIVE
@@ -57,6 +59,7 @@ class DriverMonitor:
         latest: the driver's last report; None before the first.
         starts: how often the driver was activated anew, as far as reports tell.
         trusted_until: s, until when the driver counts as one that takes commands; after it ask `check`.
+        gone: what became of a driver that is known to be dead, as a sentence; "" = it may live.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -65,6 +68,7 @@ class DriverMonitor:
         self.latest: DriverReport | None = None
         self.starts = 0
         self.trusted_until = -math.inf
+        self.gone = ""
         self._heard = 0.0
         self._latencies: deque[float] = deque(maxlen=MOVES)
 
@@ -72,6 +76,11 @@ class DriverMonitor:
     def latency(self) -> float:
         """s from a command to the driver's first write of it, median; 0 = not known."""
         return statistics.median(self._latencies) if self._latencies else 0.0
+
+    def lost(self, reason: str) -> None:
+        """The driver is dead, for a reason as a sentence; "" = it is back, or another is there."""
+        self.gone = reason
+        self._trust()
 
     def observe(self, report: DriverReport, now: float) -> bool:
         """Take the driver's next report; returns whether the latency is known from now on."""
@@ -90,11 +99,13 @@ class DriverMonitor:
         return len(self._latencies) == 1
 
     def _trust(self) -> None:
-        active = self.latest is not None and self.latest.driver_state == _ACTIVE
+        active = self.latest is not None and self.latest.driver_state == _ACTIVE and not self.gone
         self.trusted_until = self._heard + (self._values["driver_timeout"] or math.inf) if active else -math.inf
 
     def silent(self, now: float) -> str:
         """That the driver does not report any more, as a sentence; "" = it does, or never did."""
+        if self.gone:
+            return self.gone
         limit = self._values["driver_timeout"]
         age = now - self._heard
         if self.latest is None or not limit or age <= limit:
@@ -106,15 +117,41 @@ class DriverMonitor:
         report = self.latest
         if report is None:
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no actuator_state from pdm_driver yet: is the driver running?")
+        if self.gone:
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, self.gone)
         if report.driver_state != _ACTIVE:
             raise _not_active(report)
         if silent := self.silent(now):
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
 
+    def refusal(self, now: float) -> Refusal | None:
+        """What `check` raises; None = the driver takes commands."""
+        try:
+            self.check(now)
+        except Refusal as refusal:
+            return refusal
+        return None
+
+    def check_holder(self, request: Request) -> None:
+        """Raise Refusal when somebody else holds the mirror and `request` does not take it over."""
+        report = self.latest
+        if report is not None and report.holder not in ("", request.holder) and not request.take_over:
+            raise Refusal(ErrorCode.BUSY, report.holding)
+
+    def settled(self, replaced: str = "") -> list[PublishState]:
+        """What came of the order of the last command, once: the driver has confirmed it, or it is `replaced` before."""
+        sent = self.shape.sent if self.shape is not None else None
+        if sent is None or sent.order is None or sent.given_up or not (sent.confirmed or replaced):
+            return []
+        order, sent.order = sent.order, None
+        refusal = None if sent.confirmed else Refusal(ErrorCode.PREEMPTED, replaced)
+        order.outcome = replace(order.outcome, applied=sent.confirmed, refusal=refusal)
+        return [PublishState(order.outcome)]
+
     def stopped(self, now: float) -> str:
         """The reason why what was begun with the driver will not end any more; "" = it may: a lost link comes back."""
         report = self.latest
-        if report is not None and report.driver_state in _STOPPED:
+        if report is not None and report.driver_state in _STOPPED and not self.gone:
             return "pdm_driver left its active state" + (f": {report.message}" if report.message else "")
         return self.silent(now)
 
@@ -164,13 +201,13 @@ class DriverMonitor:
         """
         self._trust()  # the parameter may have changed
         limit = self._values["driver_timeout"]
-        if self.shape is None or not limit:
+        if self.shape is None or not (limit or self.gone):
             return None
         sent = self.shape.sent
-        if sent.confirmed or sent.given_up or now - sent.steady <= limit:
+        if sent.confirmed or sent.given_up or (now - sent.steady <= limit and not self.gone):
             return None
         sent.given_up = True
-        text = f"the driver has not taken the command within {limit:g} s"
+        text = "the driver has not confirmed the command"
         try:
             self.check(now)
         except Refusal as refusal:

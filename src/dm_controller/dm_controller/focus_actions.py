@@ -1,4 +1,4 @@
-"""The actions of the focus controller: `move_focus`, and `converge` and `build_recipes` on an interferometer."""
+"""The actions of the focus controller: `move_focus`, `converge` and `build_recipes`; and the driver's `degauss`."""
 
 from __future__ import annotations
 
@@ -6,78 +6,28 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from dm_msgs.action import BuildRecipes, Converge, MoveFocus
+from dm_msgs.action import BuildRecipes, Converge, Degauss, MoveFocus
 from dm_msgs.msg import FocusRequest
-from dm_msgs.srv import Degauss, StoreRecipes
+from dm_msgs.srv import StoreRecipes
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.parameters import Parameter
-from dm_common.ros.worker import WorkerActionServer, sleep
-from dm_common.values import Fields, real, reals, text, whole
-from dm_controller.focus_types import Order
+from dm_common.ros.clients import ThreadedActionClient
+from dm_common.ros.worker import WorkerActionServer, answers_arrive, sleep
+from dm_controller.conditioning import Run
+from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE, MOVE_FOCUS
+from dm_controller.focus_types import Order, StartDegauss
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget, Request
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
     from dm_controller.focus_controller_node import FocusControllerNode
-
-#: Parameters that the hosting node declares beside its own.
-LOOP_PARAMETERS = (
-    Parameter(
-        "converge.tolerance",
-        real(2e-9, 1e-11, 1e-5, "m"),
-        "largest coefficient error at which a closed loop ends",
-        live=True,
-    ),
-    Parameter("converge.max_maps", whole(5, 1, 100), "maps that a closed loop may take", live=True),
-    Parameter(
-        "converge.creep",
-        real(0.01, 0.0, 0.2),
-        "growth of a move per decade of time that a loop foresees where no creep was identified; 0 = none",
-        live=True,
-    ),
-    Parameter(
-        "recipes.tolerance",
-        real(6.3e-10, 1e-11, 1e-5, "m"),
-        "largest re-measured coefficient error of a recipe",
-        live=True,
-    ),
-    Parameter("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take", live=True),
-    Parameter("recipes.average", whole(8, 2, 50), "most maps averaged after each degauss of a recipe", live=True),
-    Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
-    Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
-    Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
-    Parameter("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed", live=True),
-    Parameter("recipes.degauss_steps", whole(100, 1, 10000), "half-swings of the degauss that recipes begin with"),
-    Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
-)
-
-
-#: What the fields of goals may be; what they request of the mirror is judged with the mirror at hand.
-_TOLERANCE, _MAPS = real(0.0, 0.0, 1e-3, "m", zero="as configured"), whole(0, 1, 100, zero="as configured")
-CONVERGE = Fields({"method": text(""), "tolerance": _TOLERANCE, "max_maps": _MAPS})
-BUILD_RECIPES = Fields(
-    {
-        "curvatures": reals([], sizes=range(1, 1001)),
-        "conic_constant": real(0.0),
-        "tolerance": _TOLERANCE,
-        "max_maps": whole(0, 4, 100, zero="as configured"),
-    }
-)
-MOVE_FOCUS = Fields(
-    {
-        "tolerance": replace(_TOLERANCE, zero="any inside the reachable range"),
-        "settle_time": real(0.0, 0.0, 3600.0, "s", zero="as configured"),
-    }
-)
 
 
 class LoopHost:
@@ -103,11 +53,6 @@ class LoopHost:
         with self._node.controller() as (controller, now):
             return controller.observer.estimate(now.time).state
 
-    def reserve(self, text: str) -> None:
-        """Refuse requests from now on, with this sentence as the reason; "" = serve them again."""
-        with self._node.controller() as (controller, _now):
-            controller.reserved = text
-
 
 class LoopBench(BenchServices):
     """Driver and interferometer, for one goal of either action at a time.
@@ -127,29 +72,28 @@ class LoopBench(BenchServices):
         self._goal = threading.Lock()
 
     @contextmanager
-    def reserved(self, text: str, cancelled: Callable[[], bool]) -> Iterator[None]:
+    def reserved(self, text: str, cancelled: Callable[[], bool], waiting: Callable[[str], None]) -> Iterator[None]:
         """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
 
         Args:
-            text: what the host says to requests meanwhile.
+            text: what requests of others are told meanwhile.
+            waiting: called with what is waited for.
 
         Raises:
-            Refusal: another goal has it.
+            Refusal: another goal has it, or somebody else holds the mirror.
         """
         if not self._goal.acquire(blocking=False):
             raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
         try:
-            self.cancelled = cancelled
-            self.host.reserve(text)
-            yield
+            self.cancelled, self.waiting = cancelled, waiting
+            with self.held(f"{text}; cancel it to end it"):
+                yield
         finally:
-            self.host.reserve("")
             self._goal.release()
 
     def degauss(self) -> None:
         """The condition that recipes begin with: the driver's own number of steps may be another."""
-        request = Degauss.Request(steps=int(self._parameters["recipes.degauss_steps"]))
-        self._call(self._degauss, request, self._values["degauss_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
+        self._run_degauss(int(self._parameters["recipes.degauss_steps"]))
 
     def measure(self, label: str) -> Measurement:
         """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""
@@ -285,3 +229,54 @@ class MoveFocusAction:
         if self._node.stop(order):
             return "canceled", ErrorCode.CANCELED, "canceled; the mirror holds the shape it had reached"
         return "canceled", ErrorCode.CANCELED, "canceled; the mirror follows a newer request"
+
+
+class DegaussClient:
+    """One degauss at a time; nothing here waits.
+
+    Args:
+        node: hosts the client.
+        ended: called by the executor with the number of the run, the s that it took, and the refusal; None = done.
+    """
+
+    def __init__(self, node: Node, ended: Callable[[int, float, Refusal | None], None]) -> None:
+        self._node, self._ended = node, ended
+        self._client = ThreadedActionClient(node, Degauss, "degauss")
+        self._waiting: StartDegauss | None = None
+
+    @property
+    def offered(self) -> bool:
+        """Whether the driver is there and offers it."""
+        return bool(self._client.server_is_ready())
+
+    def start(self, run: StartDegauss) -> None:
+        """Call the driver, or keep `run` until the driver has discovered the client: its answer would be lost."""
+        self._waiting = run
+        self._call()
+
+    def retry(self, run: Run | None) -> None:
+        """Call the driver for a run that is kept, if it is still the one under way; to be asked now and then."""
+        if self._waiting is not None and (run is None or run.number != self._waiting.number):
+            self._waiting = None  # given up: the mirror must not swing when a driver comes back
+        self._call()
+
+    def _call(self) -> None:
+        if self._waiting is None or not answers_arrive(self._client, self._client.server_is_ready):
+            return
+        number, steps, holder = self._waiting
+        self._waiting = None
+        # By the executor: an answer may be there already, and then this thread would take the node's lock twice.
+        self._client.send_goal_async(Degauss.Goal(steps=steps, holder=holder)).add_done_callback(
+            lambda done: self._node.executor.create_task(self._accepted, number, done)
+        )
+
+    def _accepted(self, number: int, done: Any) -> None:
+        done.result().get_result_async().add_done_callback(
+            lambda ended: self._node.executor.create_task(self._answered, number, ended)
+        )
+
+    def _answered(self, number: int, ended: Any) -> None:
+        answer, refusal = ended.result().result, None
+        if answer.error_code != ErrorCode.OK:
+            refusal = Refusal(answer.error_code, f"conditioning: {answer.message}")
+        self._ended(number, answer.duration, refusal)

@@ -21,7 +21,6 @@ from dm_controller.focus_types import (
     CommandedShape,
     DriverReport,
     Effect,
-    Floats,
     Log,
     Moment,
     Order,
@@ -57,8 +56,7 @@ class FocusController:
         hold: corrects the shape that stands for creep.
         conditioning: a degauss on the way, and the order that waits for it.
         requests, refused: counts since the start.
-        degauss_offered: asked whether the driver offers the service `degauss`.
-        reserved: what has the mirror for itself, as a sentence; "" = nothing does.
+        degauss_offered: asked whether the driver offers the action `degauss`.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -71,7 +69,6 @@ class FocusController:
         self._at_rest: ActuatorEstimate | None = None  # what a mirror at rest holds until its next report
         self.requests = self.refused = 0
         self.degauss_offered: Callable[[], bool] = lambda: False
-        self.reserved = ""
 
     # --- what is known ---
 
@@ -114,11 +111,24 @@ class FocusController:
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
             self.active.planner.prepare(self._at_rest.state)
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
-        known = report.driver_state, self.observer.unknown
-        if latency_learnt or self._reported != known:
-            self._reported = known
-            effects.append(PublishCapabilities())
-        return effects
+        return [*effects, *self.monitor.settled(), *self._news(now, latency_learnt)]
+
+    def driver_lost(self, reason: str, now: Moment) -> list[Effect]:
+        """The driver is known to be dead, for a reason as a sentence; "" = it is back, or another is there."""
+        self.monitor.lost(reason)
+        return self.tick(now)
+
+    def unavailable(self, now: Moment) -> Refusal | None:
+        """The reason why requests are refused now, whatever they ask for; None = they are not."""
+        return self.not_calibrated if self.active is None else self.monitor.refusal(now.steady)
+
+    def _news(self, now: Moment, more: bool = False) -> list[Effect]:
+        """Publish the capabilities when the driver or what is known of the actuators changed, or there is `more`."""
+        known = refusal.error_code if (refusal := self.unavailable(now)) else ErrorCode.OK, self.observer.unknown
+        if not more and self._reported == known:
+            return []
+        self._reported = known
+        return [PublishCapabilities()]
 
     # --- requests ---
 
@@ -159,7 +169,6 @@ class FocusController:
     ) -> tuple[Order, list[Effect]]:
         effects: list[Effect] = []
         move = refusal = None
-        applied = False
         try:
             move = self.judge(order.request, now, degaussed)
             assert self.active is not None
@@ -167,11 +176,9 @@ class FocusController:
             if not dry_run:
                 if now.steady > self.monitor.trusted_until:
                     self.monitor.check(now.steady)
-                if self.reserved:
-                    raise Refusal(ErrorCode.BUSY, f"{self.reserved}; cancel it first")
+                self.monitor.check_holder(order.request)
                 if degaussed is not None or (move.degauss is None and self.conditioning.run is None):
-                    effects.append(self._go(order, move, now))
-                    applied = True
+                    effects += self._go(order, move, now)
                 else:
                     effects += self._condition(order, move, now)
         except Refusal as error:
@@ -181,16 +188,16 @@ class FocusController:
             now.ns,
             self.active,
             move,
-            applied=applied,
             pending=order.pending,
             unknown=(self._at_rest or self.observer).unknown,
-            creep_held=self._holds(),
+            creep_held=self.hold.wanted(self.active),
             refusal=refusal,
         )
         if refusal is not None:
             self.refused += 1
             effects.append(Log("warning", f"refused: {refusal}"))
-        if not dry_run:
+        # What became of a command is published when the driver has said so.
+        if not dry_run and (refusal is not None or order.pending):
             effects.append(PublishState(order.outcome))
         return order, effects
 
@@ -200,30 +207,23 @@ class FocusController:
         order.outcome = Outcome(order.request, now.ns, refusal=refusal)
         return [Log("warning", f"refused: {refusal}"), PublishState(order.outcome)]
 
-    def _go(self, order: Order, move: Move, now: Moment) -> SendCommand:
+    def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
         """The command of `move`, whose shape is to stand from now on."""
         assert self.active is not None
-        order.began = now.steady
-        sent = Sent(SendCommand(move.signals, now.ns), order, now.time, now.steady)
-        shape = CommandedShape(move, self.active.planner, sent, self._holds(), now.time, began=now.time)
+        order.began, request = now.steady, order.request
+        replaced = self.monitor.settled("a newer request took its place before the driver confirmed it")
+        command = SendCommand(move.signals, now.ns, 0, request.holder, request.take_over)
+        sent = Sent(command, order, now.time, now.steady)
+        shape = CommandedShape(move, self.active.planner, sent, self.hold.wanted(self.active), now.time, began=now.time)
         self.monitor.shape = self.hold.shape = shape
-        return sent.command
-
-    def _holds(self) -> bool:
-        """Whether shapes are corrected for creep."""
-        return self.active is not None and self._values["hold.enable"] and self.active.planner.law.creep_rate > 0.0
-
-    def _send_on(self, shape: CommandedShape, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
-        """Another command for the shape that was commanded last."""
-        shape.sent = Sent(SendCommand(signals, now.ns, expected_turns), None, now.time, now.steady)
-        return shape.sent.command
+        return [command, *replaced]
 
     # --- a degauss on the way ---
 
     def _condition(self, order: Order, move: Move, now: Moment) -> list[Effect]:
         """Have the mirror degaussed before `order` is carried out, unless it is already."""
         if not self.degauss_offered():
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "service degauss: pdm_driver does not offer it (yet)")
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "action degauss: pdm_driver does not offer it (yet)")
         self.hold.end("the mirror is conditioned")
         effects: list[Effect] = []
         before = self.conditioning.wait(order)
@@ -232,8 +232,8 @@ class FocusController:
             refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
             effects += self._refuse(before, refusal, now)
         if self.conditioning.run is None:
-            steps = move.degauss or 0
-            effects.append(StartDegauss(self.conditioning.begin(steps, self.monitor, now.steady), steps))
+            number = self.conditioning.begin(move.degauss or 0, self.monitor, now.steady)
+            effects.append(StartDegauss(number, move.degauss or 0, order.request.holder))
         return effects
 
     def degauss_answered(
@@ -270,7 +270,7 @@ class FocusController:
             self.hold.end("the driver did not take the command")
             # A correction, or the end of a move, answers no order.
             effects += self._refuse(order, refusal, now) if order is not None else [Log("warning", str(refusal))]
-        return [*effects, *self._compensate_creep(now)]
+        return [*effects, *self._news(now), *self._compensate_creep(now)]
 
     def quick_ticks(self, now: Moment) -> bool:
         """Whether something can be due before `SLOW_PERIOD_S` has passed."""
@@ -280,13 +280,12 @@ class FocusController:
         report, shape = self.monitor.latest, self.hold.shape
         if shape is None or not shape.held or report is None or report.applied.moving:
             return []
-        if self.reserved:
-            self.hold.end(self.reserved)
-            return []
+        if report.holder not in ("", shape.sent.command.holder):
+            return []  # goes on afterwards, if they leave the shape as it is
         signals = self.hold.correction(self.observer.estimate(now.time), now.time)
         if signals is None:
             return []
-        return [self._send_on(shape, signals, now, expected_turns=report.applied.turns)]
+        return [shape.send_on(signals, now, report.applied.turns)]
 
     def stop(self, order: Order, now: Moment) -> list[Effect] | None:
         """Leave the move of `order` where it is; None = another shape was asked for since, and nothing is sent."""
@@ -295,6 +294,7 @@ class FocusController:
             return None
         self.hold.end("the move was cancelled")
         shape.kept = False
+        effects: list[Effect] = [*self.monitor.settled("it was cancelled before the driver confirmed it")]
         if report is None or not report.applied.signals.size:
-            return []
-        return [self._send_on(shape, report.applied.signals, now)]
+            return effects
+        return [*effects, shape.send_on(report.applied.signals, now)]

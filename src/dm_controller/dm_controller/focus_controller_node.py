@@ -23,9 +23,9 @@ from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare, frame_id
-from dm_common.ros.worker import never_silent
-from dm_controller.degauss_client import DegaussClient
-from dm_controller.focus_actions import LoopHost, MoveFocusAction, serve_loops
+from dm_common.ros.qos import GONE, Liveliness
+from dm_common.ros.worker import WorkerService
+from dm_controller.focus_actions import DegaussClient, LoopHost, MoveFocusAction, serve_loops
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
 from dm_controller.focus_messages import capabilities_message, driver_report_from, health, state_message
 from dm_controller.focus_parameters import PARAMETERS
@@ -46,8 +46,9 @@ from dm_controller.planning.target import Request
 STEADY_PERIOD_S = 0.5
 #: How often what the actuators have crept to is put on disk, s of wall time.
 RECORD_PERIOD_S = 30.0
-#: `focus_state` is worked out so much after its command, s: else it would take the core that the driver is woken up on.
-STATE_DELAY_S = 1e-3
+#: Longest wait of a service for the driver's confirmation where `driver_timeout` sets none, s, and how often it is
+#: looked for.
+CONFIRM_S, POLL_S = 3.0, 0.001
 
 
 class FocusControllerNode(Node):
@@ -59,27 +60,26 @@ class FocusControllerNode(Node):
         self._lock, self._controller = threading.Lock(), FocusController(values)
         self._mirror: MirrorInfo | None = None
         self._calibration: Calibration | None = None
-        self._outcomes: list[Outcome] = []
         self._command = self.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
         self._focus_state = self.create_publisher(FocusState, "focus_state", qos.STATE)
-        self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.LATCHED)
+        self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.with_lease(qos.LATCHED))
         self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
         self._controller.degauss_offered = lambda: self._degauss.offered
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._recorder = CreepRecorder(values["state_folder"], self._controller.observer)
         self.create_timer(RECORD_PERIOD_S, self._keep_record, clock=steady)
         self._quick = self.create_timer(values["hold.period"], self._tick)
-        self._states_due = self.create_timer(STATE_DELAY_S, self._publish_states, clock=steady, autostart=False)
         self.create_timer(SLOW_PERIOD_S, self._tick)
         self.create_timer(STEADY_PERIOD_S, self._tick, clock=steady)
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         self._actions = MoveFocusAction(self, values["settle_time"]), *serve_loops(self, values, LoopHost(self))
+        self._driver = Liveliness(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED, self._on_driver_life)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         self.create_subscription(FocusRequest, "focus_request", self.order, qos.COMMAND)
         for kind, name, answer in ((SetFocus, "set_focus", self._on_set_focus), (Flatten, "flatten", self._on_flatten)):
-            self.create_service(kind, name, never_silent(self, name, answer), qos_profile=qos.SERVICE)
+            WorkerService(self, kind, name, answer)
         self._publish_capabilities()
 
     @property
@@ -90,9 +90,12 @@ class FocusControllerNode(Node):
     def controller(self) -> Iterator[tuple[FocusController, Moment]]:
         """The controller, for one thread at a time, and what time it is."""
         with self._lock:
-            clock = self.get_clock()  # without a simulator its time is the system's, which costs a tenth
-            ns = int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
-            yield self._controller, Moment(ns, 1e-9 * ns, time.monotonic())
+            yield self._controller, self._now()
+
+    def _now(self) -> Moment:
+        clock = self.get_clock()  # without a simulator its time is the system's, which costs a tenth
+        ns = int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
+        return Moment(ns, 1e-9 * ns, time.monotonic())
 
     # --- what comes in ---
 
@@ -129,12 +132,23 @@ class FocusControllerNode(Node):
         return self._answer(request.request, request.dry_run, response)
 
     def _on_flatten(self, request: Flatten.Request, response: Flatten.Response) -> Flatten.Response:
-        return self._answer(FocusRequest(), request.dry_run, response)
+        return self._answer(FocusRequest(take_over=request.take_over), request.dry_run, response)
 
     def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
-        response.state = self.state(self.order(request, dry_run).outcome)
+        """In a worker thread, for the driver's confirmation is waited for."""
+        order = self.order(request, dry_run)
+        deadline = time.monotonic() + 1.0 + (self._values["driver_timeout"] or CONFIRM_S)
+        while not (dry_run or order.pending or order.outcome.applied or order.outcome.refusal):
+            if time.monotonic() > deadline:
+                break
+            time.sleep(POLL_S)
+        response.state = self.state(order.outcome)
         response.error_code, response.message = response.state.error_code, response.state.message
         return response
+
+    def _on_driver_life(self) -> None:
+        with self.controller() as (controller, now):
+            self._do(controller.driver_lost(f"pdm_driver {GONE}" if self._driver.lost else "", now), now)
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):
@@ -151,12 +165,11 @@ class FocusControllerNode(Node):
         for effect in effects:
             if isinstance(effect, SendCommand):
                 command = ActuatorCommand(signals=doubles(effect.signals), expected_turns=effect.expected_turns)
+                command.holder, command.take_over = effect.holder, effect.take_over
                 command.header.stamp = time_message(effect.stamp_ns)
                 self._command.publish(command)
             elif isinstance(effect, PublishState):
-                self._outcomes.append(effect.outcome)
-                if self._states_due.is_canceled():
-                    self._states_due.reset()
+                self._focus_state.publish(self.state(effect.outcome))
             elif isinstance(effect, PublishCapabilities):
                 self._publish_capabilities()
             elif isinstance(effect, StartDegauss):
@@ -174,11 +187,6 @@ class FocusControllerNode(Node):
         elif self._quick.is_canceled():
             self._quick.reset()
 
-    def _publish_states(self) -> None:
-        self._states_due.cancel()
-        while self._outcomes:
-            self._focus_state.publish(self.state(self._outcomes.pop(0)))
-
     def state(self, outcome: Outcome) -> FocusState:
         """What came of a request."""
         self._forecast.use(self._controller.active, self._values["reachable_tolerance"])
@@ -187,8 +195,7 @@ class FocusControllerNode(Node):
         return state
 
     def _publish_capabilities(self) -> None:
-        now_ns = int(self.get_clock().now().nanoseconds)
-        message = capabilities_message(self._controller, self._mirror, self._values, now_ns)
+        message = capabilities_message(self._controller, self._mirror, self._values, self._now())
         message.header.frame_id = self._frame_id
         self._capabilities.publish(message)
 

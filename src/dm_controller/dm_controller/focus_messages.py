@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import ActuatorState, Capabilities, FocusState, MirrorInfo
 
-from dm_common.errors import Refusal
 from dm_common.messages import applied_from, doubles, stamp_ns, time_message
 from dm_common.ros import diagnostics
 from dm_common.values import without_figures
@@ -36,6 +35,8 @@ def driver_report_from(message: ActuatorState) -> DriverReport:
         message.sequence,
         message.error_code,
         message.message,
+        message.holder,
+        message.holding,
     )
 
 
@@ -94,12 +95,9 @@ def remarks(active: ActiveCalibration, unknown: str, values: Mapping[str, Any], 
 
 def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment) -> str:
     """The reason why requests are refused, or predictions worse than they could be; "" = all is well."""
-    if controller.active is None:
-        return str(controller.not_calibrated)
-    try:
-        controller.monitor.check(now.steady)
-    except Refusal as refusal:
+    if (refusal := controller.unavailable(now)) is not None:
         return str(refusal)
+    assert controller.active is not None
     return remarks(controller.active, controller.observer.unknown, values, now.ns)
 
 
@@ -127,7 +125,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment) 
 
 
 def capabilities_message(
-    controller: FocusController, mirror: MirrorInfo | None, values: Mapping[str, Any], now_ns: int
+    controller: FocusController, mirror: MirrorInfo | None, values: Mapping[str, Any], now: Moment
 ) -> Capabilities:
     """What the mirror can do now.
 
@@ -135,27 +133,30 @@ def capabilities_message(
         controller: of the mirror.
         mirror: None = not known.
         values: parameters of the node.
-        now_ns: for the header.
+        now: a driver that does not report any more by then takes no requests.
     """
     active, unknown, tolerance = controller.active, controller.observer.unknown, values["reachable_tolerance"]
     message = Capabilities(residual_tolerance=tolerance, latency=controller.monitor.latency)
-    message.header.stamp = time_message(now_ns)
+    message.header.stamp = time_message(now.ns)
     if mirror is not None and mirror.slew_rate_max > 0.0:
         # From the first write to the settled shape over the full range.
         message.settling = (mirror.signal_max - mirror.signal_min) / mirror.slew_rate_max
-    if active is None:
-        message.quality, message.message = Capabilities.UNCALIBRATED, str(controller.not_calibrated)
+    if active is not None:
+        message.calibration_id, message.aperture_radius = active.calibration.id, active.calibration.aperture_radius
+    if (refusal := controller.unavailable(now)) is not None:
+        message.quality, message.error_code = Capabilities.UNCALIBRATED, refusal.error_code
+        message.message = str(refusal)
         return message
+    assert active is not None
     low, high = active.reachable_range(FocusTarget(0.0), tolerance)
     sentences = [f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
     if unknown and active.planner.hysteresis is not None:
         sentences.append(f"wider error bound: {unknown}")
-    if stale := active.stale(now_ns, values["calibration_age_max"]):
+    if stale := active.stale(now.ns, values["calibration_age_max"]):
         sentences.append(stale)
-    message.calibration_id, message.quality = active.calibration.id, active.calibration.quality
+    message.quality = active.calibration.quality
     message.curvature_min, message.curvature_max = low, high
     message.power_min, message.power_max = 2 * low, 2 * high
-    message.aperture_radius = active.calibration.aperture_radius
     message.error_bound = active.error_bound(not unknown)
     message.error_bound_conditioned = active.conditioned_error
     message.condition_time = controller.conditioning.duration(

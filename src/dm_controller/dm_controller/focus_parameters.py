@@ -1,13 +1,45 @@
-"""Parameters of the node `focus_controller`."""
+"""Parameters of the node `focus_controller`, and what the fields of its goals may be."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from dm_common.ros.parameters import APERTURE_PARAMETER, Parameter, real, switch, text, whole
+from dm_common.values import Fields, reals
 from dm_controller.creep_hold import PERIOD_S
-from dm_controller.focus_actions import LOOP_PARAMETERS
 from dm_controller.planning.planner import SETTLE_S
+
+#: Of the closed loops, for whatever node hosts them.
+LOOP_PARAMETERS = (
+    Parameter(
+        "converge.tolerance",
+        real(2e-9, 1e-11, 1e-5, "m"),
+        "largest coefficient error at which a closed loop ends",
+        live=True,
+    ),
+    Parameter("converge.max_maps", whole(5, 1, 100), "maps that a closed loop may take", live=True),
+    Parameter(
+        "converge.creep",
+        real(0.01, 0.0, 0.2),
+        "growth of a move per decade of time that a loop foresees where no creep was identified; 0 = none",
+        live=True,
+    ),
+    Parameter(
+        "recipes.tolerance",
+        real(6.3e-10, 1e-11, 1e-5, "m"),
+        "largest re-measured coefficient error of a recipe",
+        live=True,
+    ),
+    Parameter("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take", live=True),
+    Parameter("recipes.average", whole(8, 2, 50), "most maps averaged after each degauss of a recipe", live=True),
+    Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
+    Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
+    Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
+    Parameter("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed", live=True),
+    Parameter("recipes.degauss_steps", whole(100, 1, 10000), "half-swings of the degauss that recipes begin with"),
+    Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
+)
 
 PARAMETERS: Final = (
     Parameter(
@@ -79,4 +111,22 @@ PARAMETERS: Final = (
     ),
     APERTURE_PARAMETER,
     *LOOP_PARAMETERS,
+)
+
+#: What the fields of goals may be; what they request of the mirror is judged with the mirror at hand.
+_TOLERANCE, _MAPS = real(0.0, 0.0, 1e-3, "m", zero="as configured"), whole(0, 1, 100, zero="as configured")
+CONVERGE = Fields({"method": text(""), "tolerance": _TOLERANCE, "max_maps": _MAPS})
+BUILD_RECIPES = Fields(
+    {
+        "curvatures": reals([], sizes=range(1, 1001)),
+        "conic_constant": real(0.0),
+        "tolerance": _TOLERANCE,
+        "max_maps": whole(0, 4, 100, zero="as configured"),
+    }
+)
+MOVE_FOCUS = Fields(
+    {
+        "tolerance": replace(_TOLERANCE, zero="any inside the reachable range"),
+        "settle_time": real(0.0, 0.0, 3600.0, "s", zero="as configured"),
+    }
 )

@@ -42,6 +42,8 @@ class DriverReport:
         sequence: of reports, rising while the driver runs.
         error_code: why a command is not followed.
         message: the same as a sentence.
+        holder: who holds the mirror; "" = nobody.
+        holding: since when, what for and how to end it, as a sentence.
     """
 
     applied: Applied
@@ -51,6 +53,8 @@ class DriverReport:
     sequence: int = 0
     error_code: int = 0
     message: str = ""
+    holder: str = ""
+    holding: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +66,7 @@ class Outcome:
         stamp_ns: of the command, where one went out; else of the judgement.
         active: the calibration in use; None = there was none.
         move: None = refused before one was planned.
-        applied: the command went out.
+        applied: the driver has confirmed the command.
         pending: the mirror is degaussed first.
         unknown: the reason why the actuators' history is not known; "" = it is.
         creep_held: the shape is corrected for creep from now on.
@@ -129,18 +133,26 @@ class SendCommand:
         signals: (N,)
         stamp_ns: of its header.
         expected_turns: it counts only while the driver reports so many; 0 = in any case.
+        holder: who asks, where somebody holds the mirror; "" = nobody in particular.
+        take_over: even if somebody else holds it.
     """
 
     signals: Floats
     stamp_ns: int
     expected_turns: int = 0
+    holder: str = ""
+    take_over: bool = False
 
 
 class StartDegauss(NamedTuple):
-    """Have the driver degauss by `steps` half-swings (0 = as it does), and report the end of run `number`."""
+    """Have the driver degauss by `steps` half-swings (0 = as it does), and report the end of run `number`.
+
+    `holder` asks for it; "" = nobody in particular.
+    """
 
     number: int
     steps: int
+    holder: str = ""
 
 
 class PublishState(NamedTuple):
@@ -203,6 +215,12 @@ class CommandedShape:
     checked: float
     kept: bool = True
     began: float = 0.0
+
+    def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
+        """Another command for the shape that was commanded last, on behalf of the same holder."""
+        command = SendCommand(signals, now.ns, expected_turns, self.sent.command.holder)
+        self.sent = Sent(command, None, now.time, now.steady)
+        return command
 
 
 Effect = SendCommand | StartDegauss | PublishState | PublishCapabilities | Log

@@ -6,10 +6,11 @@ import threading
 from typing import Any
 
 import pytest
-from dm_msgs.srv import Degauss
+from dm_msgs.action import Degauss
 
+from dm_common.ros.worker import WorkerActionServer
 from dm_controller.conditioning import Run
-from dm_controller.degauss_client import DegaussClient
+from dm_controller.focus_actions import DegaussClient
 from dm_controller.focus_types import StartDegauss
 from ros_fixtures import Observer
 from waiting import wait_until
@@ -20,16 +21,16 @@ def test_a_run_that_waits_for_the_driver_is_called_unless_it_was_given_up(observ
     asked: list[int] = []
     ended = threading.Event()
 
-    def serve(request: Degauss.Request, response: Degauss.Response) -> Any:
-        asked.append(request.steps)
-        return response
+    def serve(handle: Any) -> tuple[str, Any]:
+        asked.append(handle.request.steps)
+        return "succeed", Degauss.Result()
 
     client = DegaussClient(observer.node, lambda *_result: ended.set())
     client.start(StartDegauss(1, 10))
     assert not client.offered
     if given_up:
         client.retry(None)
-    observer.node.create_service(Degauss, "degauss", serve)
+    WorkerActionServer(observer.node, Degauss, "degauss", serve)
     wait_until(lambda: client.offered)
     if given_up:
         for _ in range(10):

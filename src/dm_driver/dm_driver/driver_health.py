@@ -1,12 +1,48 @@
-"""The driver's health on /diagnostics."""
+"""The driver's health on /diagnostics, and what it logs of the link."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.diagnostics import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
+from dm_driver.moves import WriterState
+
+#: A unit that has not answered for so long after the configuration is missing, s; before, it is awaited: the driver may
+#: have been started first.
+AWAIT_S = 15.0
+
+
+class LinkLog:
+    """What to log of the link to the electronics: each change once, and an error only where something is wrong.
+
+    Args:
+        now: steady time of the configuration, s.
+    """
+
+    def __init__(self, now: float) -> None:
+        self._began = now
+        self._up, self._logged = False, ""
+
+    def news(self, state: WriterState, now: float) -> tuple[str, str] | None:
+        """Severity ("info" or "error") and text of what is to be logged now; None = nothing."""
+        if state.link_up:
+            text = "" if self._up else "the link to the drive electronics is up"
+            self._up, self._logged = True, ""
+            return ("info", text) if text else None
+        if state.fault in ("", "closed"):
+            return None
+        missing = self._up or now - self._began > AWAIT_S
+        severity = "error" if missing else "info"
+        text = f"{state.fault}; {'trying again' if missing else 'waiting for the drive electronics'}"
+        # While they are awaited, how exactly they do not answer is of no interest.
+        key = text if missing else "awaited"
+        self._up, before, self._logged = False, self._logged, key
+        if missing:
+            self._began = -math.inf
+        return (severity, text) if key != before else None
 
 
 def driver_health(writer: ActuatorWriter | None, refusal: Refusal | None, refused: Mapping[str, int]) -> Health:

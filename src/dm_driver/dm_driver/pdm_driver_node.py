@@ -14,9 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
-from dm_msgs.srv import Degauss as DegaussService
 from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -31,7 +29,7 @@ from dm_driver.commands.command_gate import CommandGate
 from dm_driver.commands.degauss_action import CODE_OF_OUTCOME, DegaussAction
 from dm_driver.commands.mirror_hold import MirrorHold
 from dm_driver.driver_configuration import DriverConfiguration, build_configuration
-from dm_driver.driver_health import driver_health
+from dm_driver.driver_health import LinkLog, driver_health
 from dm_driver.driver_messages import mirror_info_message, state_message, unconfigured_message
 from dm_driver.driver_parameters import PARAMETERS
 from dm_driver.last_shape import LastShape, record_path
@@ -54,19 +52,19 @@ class PdmDriverNode(LifecycleNode):
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         # Guards publishing: state leaves the executor's, the writer's and the services' threads.
         self._state_lock = threading.Lock()
+        self._link_log = LinkLog(time.monotonic())
         self._published_at = 0.0
         # Plain publishers: the state must be seen in every lifecycle state.
-        self._state_publisher = self.create_publisher(ActuatorState, "actuator_state", qos.STATE)
-        self._info_publisher = self.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
+        self._state_publisher = self.create_publisher(ActuatorState, "actuator_state", qos.with_lease(qos.STATE))
+        self._info_publisher = self.create_publisher(MirrorInfo, "mirror_info", qos.with_lease(qos.LATCHED))
         self.create_subscription(ActuatorCommand, "actuator_command", self._on_command, qos.COMMAND)
         WorkerService(self, SetSignals, "set_signals", self._on_set_signals)
-        WorkerService(self, DegaussService, "degauss", self._on_degauss)
         DegaussAction(self, self._begin_degauss)
         answer = never_silent(self, "hold_mirror", self._on_hold_mirror)
         self.create_service(HoldMirror, "hold_mirror", answer, qos_profile=qos.SERVICE)
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(self._values["state_period"], self._publish_state, clock=steady)
+        self._timer = self.create_timer(self._values["state_period"], self._periodic, clock=steady)
         if self._values["autostart"]:
             self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
 
@@ -103,6 +101,7 @@ class PdmDriverNode(LifecycleNode):
             stamp_ns=lambda: int(self.get_clock().now().nanoseconds),
             last=self._last_shape(configuration),
         )
+        self._link_log = LinkLog(time.monotonic())
         self._gate.writer.start()
         self._gate.writer.wait_for_link(self._values["electronics.timeout"])
         self._info_publisher.publish(
@@ -129,10 +128,7 @@ class PdmDriverNode(LifecycleNode):
         if writer.enable(MARGIN_S if writer.state().link_up else 0.0):
             self.get_logger().info("active; the mirror stands in the safe shape")
         else:
-            self.get_logger().warning(
-                f"active, but the electronics are unreachable: {writer.state().fault}; the safe shape is written as"
-                " soon as they answer"
-            )
+            self.get_logger().info("active; the safe shape is written as soon as the drive electronics answer")
         self._publish_state()
         return TransitionCallbackReturn.SUCCESS
 
@@ -165,6 +161,8 @@ class PdmDriverNode(LifecycleNode):
         outcome = writer.disable(ramp_time + self._values["electronics.timeout"] + MARGIN_S)
         if outcome is Outcome.REACHED:
             self.get_logger().info(f"{occasion}: the mirror stands in the safe shape")
+        elif writer.state().sequence == 0:
+            self.get_logger().info(f"{occasion}: the drive electronics were never there, nothing was written")
         else:
             self.get_logger().error(
                 f"{occasion}: the safe shape was not reached ({outcome.value}); the outputs probably hold their last"
@@ -221,18 +219,6 @@ class PdmDriverNode(LifecycleNode):
         assert move is not None
         return move if isinstance(move, Refusal) else (used[0], move)
 
-    def _on_degauss(self, request: Any, response: Any) -> Any:
-        begun = time.monotonic()
-        goal = Degauss.Goal(amplitude=request.amplitude, steps=request.steps, end_signals=request.end_signals)
-        move = self._begin_degauss(goal)
-        result = move if isinstance(move, Refusal) else move[1]
-        if isinstance(result, Move):
-            result.wait()
-        response.duration = time.monotonic() - begun
-        response.message = f"degaussed in {response.duration:.1f} s"
-        self._answer(response, result, wait=True)
-        return response
-
     def _on_hold_mirror(self, request: Any, response: Any) -> Any:
         before = self._hold.holder
         try:
@@ -263,10 +249,26 @@ class PdmDriverNode(LifecycleNode):
 
     def _on_writer(self, state: WriterState, edge: bool) -> None:
         """Runs in the writer's thread after every write and every change of the link."""
-        if edge and state.fault and state.fault != "closed":
-            self.get_logger().error(f"{state.fault}; trying again", throttle_duration_sec=5.0)
+        if edge:
+            self._log_link(state)
         if edge or time.monotonic() - self._published_at >= STATE_INTERVAL_S:
             self._publish_state()
+
+    def _log_link(self, state: WriterState) -> None:
+        with self._state_lock:
+            news = self._link_log.news(state, time.monotonic())
+        if news is None:
+            return
+        if news[0] == "error":
+            self.get_logger().error(news[1], throttle_duration_sec=5.0)
+        else:
+            self.get_logger().info(news[1])
+
+    def _periodic(self) -> None:
+        """Periodically: a unit that never answers changes nothing, and is missing all the same."""
+        if (writer := self._gate.writer) is not None:
+            self._log_link(writer.state())
+        self._publish_state()
 
     def _publish_state(self) -> None:
         with self._state_lock:

@@ -58,6 +58,8 @@ def test_who_lost_it_does_not_get_it_back_by_renewing(hold: MirrorHold) -> None:
     hold.evict("")
     with refused(ErrorCode.PREEMPTED):
         hold.ask(Operation.RENEW, "calibration")
+    with refused(ErrorCode.PREEMPTED):
+        hold.check("calibration", take_over=False)
     hold.ask(Operation.HOLD, "calibration")
     hold.ask(Operation.TAKE_OVER, "operator")
     with refused(ErrorCode.PREEMPTED):

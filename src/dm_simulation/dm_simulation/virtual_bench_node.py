@@ -31,6 +31,9 @@ from dm_simulation.bench import VirtualBench
 from dm_simulation.camera import camera_matrix
 from dm_simulation.parameters import PARAMETERS, bench_config
 
+#: Longest wait for the driver to leave before this node does, s; `ros2 launch` loses patience after 5 s.
+DRIVER_LEAVES_S = 4.0
+
 
 class FastClock:
     """Starts at the Unix time of its making and runs at `speed` times the wall clock."""
@@ -160,7 +163,15 @@ class VirtualBenchNode(Node):
         return Health(OK, f"{record.frames} frames, {bench.maps_written} maps", values)
 
     def make_safe(self) -> None:
-        """Free ports and threads before the node goes."""
+        """Let the driver bring the mirror to its safe shape, then free ports and threads before the node goes.
+
+        Ctrl-C reaches all processes of a launch at once; emulated hardware that left first would not be reached.
+        """
+        deadline = time.monotonic() + DRIVER_LEAVES_S
+        while ("pdm_driver", self.get_namespace()) in self.get_node_names_and_namespaces():
+            if time.monotonic() > deadline:
+                break
+            time.sleep(0.02)
         self._stop.set()
         if self._ticker is not None:
             self._ticker.join(2)

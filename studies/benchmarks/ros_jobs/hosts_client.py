@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, MirrorInfo
-from dm_msgs.srv import Degauss
+from rclpy.action import ActionClient
 from rclpy.node import Node
 
 from dm_common.ros import qos
@@ -35,7 +36,7 @@ class Client(Node):
         super().__init__("client", namespace=namespace)
         self.request = self.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.calibration = self.create_publisher(Calibration, "calibration", qos.LATCHED)
-        self.degauss = self.create_client(Degauss, "degauss")
+        self.degauss = ActionClient(self, Degauss, "degauss")
         self.infos: list[MirrorInfo] = []
         self.capabilities: list[Capabilities] = []
         self.commands: list[tuple[int, Any]] = []
@@ -70,7 +71,7 @@ def main() -> int:
     def active() -> bool:
         return bool(client.reports) and client.reports[-1][1].driver_state == ActuatorState.STATE_ACTIVE
 
-    if not serve(FIRST_S, lambda: client.infos and active() and client.degauss.service_is_ready()):
+    if not serve(FIRST_S, lambda: client.infos and active() and client.degauss.server_is_ready()):
         print("the driver did not appear", file=sys.stderr)
         return 1
     client.calibration.publish(stand_in_mirror.calibration(LAW, client.infos[-1].serial))
@@ -78,8 +79,9 @@ def main() -> int:
         print("the controller did not take the calibration", file=sys.stderr)
         return 1
     serve(1.0)
-    done = client.degauss.call_async(Degauss.Request(steps=10))
-    serve(FIRST_S, done.done)
+    accepted = client.degauss.send_goal_async(Degauss.Goal(steps=10))
+    serve(FIRST_S, accepted.done)
+    serve(FIRST_S, accepted.result().get_result_async().done)
     serve(1.0)
     generator = np.random.default_rng(6)
     command_us, report_us = [], []

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode
-from dm_msgs.srv import Degauss, SetSignals
+from dm_msgs.srv import SetSignals
 from lifecycle_msgs.msg import Transition
 from numpy.typing import NDArray
 from rosgraph_msgs.msg import Clock
 
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import ACTUATORS, DriverRig
-from fault_injection.rigs.parts import checked, other_client
+from fault_injection.rigs.parts import begin_degauss, checked, other_client
 
 ROUNDS = 3  # injections per start of a driver, where one driver can take several
 
@@ -86,7 +86,7 @@ def driver_killed_in_move(rig: DriverRig, random: Random, record: FaultRecord) -
 
 @fault("kill -9 of the driver in the middle of a degauss")
 def driver_killed_in_degauss(rig: DriverRig, random: Random, record: FaultRecord) -> None:
-    rig.begin(Degauss, Degauss.Request(steps=40))
+    begin_degauss(rig, 40)
     rig.wait_moving(random.randint(5, 40))
     rig.kill()
     _restart(rig)

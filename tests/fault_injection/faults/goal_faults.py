@@ -8,13 +8,13 @@ from typing import Any
 
 from dm_msgs.action import Converge, MoveFocus
 from dm_msgs.msg import ErrorCode, FocusRequest
-from dm_msgs.srv import Degauss
 
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.faults import controller_faults
 from fault_injection.faults.controller_faults import REGISTRY, fault, lost
 from fault_injection.rigs.driver_rig import PATIENCE_S, RigError
 from fault_injection.rigs.focus_rig import ANSWER_S, FocusRig
+from fault_injection.rigs.parts import begin_degauss
 
 
 def _end_somehow(rig: FocusRig, random: Random, handle: Any, result: Any) -> Any:
@@ -116,7 +116,7 @@ def loop_cancelled(rig: FocusRig, random: Random, record: FaultRecord) -> None:
 
 @fault("a degauss that somebody else began when requests come: carried out after it, or refused in words", rounds=2)
 def foreign_degauss(rig: FocusRig, random: Random, record: FaultRecord) -> None:
-    future = rig.begin(Degauss, Degauss.Request(steps=10))
+    future = begin_degauss(rig, 10)
     rig.wait_moving(random.randint(2, 30))
     state = rig.set_focus(rig.curvature(random))
     rig.account_for(state, record)

@@ -18,7 +18,7 @@ import numpy as np
 import rclpy
 import yaml
 from dm_msgs.msg import ActuatorCommand, ActuatorState, ErrorCode
-from dm_msgs.srv import Degauss, SetSignals
+from dm_msgs.srv import SetSignals
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from numpy.typing import ArrayLike, NDArray
@@ -112,7 +112,6 @@ class DriverRig:
         self.publisher = self.node.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
         self._clients = {
             SetSignals: self.node.create_client(SetSignals, "set_signals"),
-            Degauss: self.node.create_client(Degauss, "degauss"),
             ChangeState: self.node.create_client(ChangeState, "pdm_driver/change_state"),
         }
         self._background = BackgroundExecutor(self.node)

@@ -24,7 +24,7 @@ from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 
 from dm_common.ros import qos
-from dm_common.ros.action_client import ThreadedActionClient
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import ServiceCallError, answers_arrive, call
 

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from dm_bringup.nodes import MODULES
 from dm_bringup.suite import Suite
@@ -87,11 +87,8 @@ Process = subprocess.Popen[bytes] | ForkedNode
 class ForkedSuite(Suite):
     """The nodes named in a configuration, forked off the server."""
 
-    def _start(self, name: str, module: str, parameters: Path) -> None:
-        arguments = ["--ros-args", "--params-file", str(parameters)]
-        if self._namespace:
-            arguments += ["-r", f"__ns:=/{self._namespace.strip('/')}"]
-        self._processes[name] = cast(Any, ForkedNode(module, arguments, self.log(name), self._environment))
+    def _process(self, name: str, arguments: list[str]) -> Any:
+        return ForkedNode(MODULES[name], arguments, self.log(name), self._environment)
 
 
 def _run(module: str, arguments: list[str], log: str, environment: dict[str, str], folder: str) -> None:

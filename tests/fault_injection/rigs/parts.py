@@ -5,7 +5,12 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
+from dm_msgs.action import Degauss
+
+from dm_common.ros.clients import ThreadedActionClient
+from dm_common.ros.worker import answers_arrive
 from fault_injection.fault import FaultRecord
 from fault_injection.rigs.driver_rig import PATIENCE_S, DriverRig
 
@@ -23,6 +28,15 @@ def checked(rig: DriverRig, record: FaultRecord) -> Iterator[None]:
                 f"{seen.jumps} jumps, largest {seen.largest_jump:.3f}; {seen.neighbour_violations} neighbours; "
                 f"{seen.range_violations} out of range"
             )
+
+
+def begin_degauss(rig: DriverRig, steps: int) -> Any:
+    """Begin a degauss; returns the future of its result."""
+    client = ThreadedActionClient(rig.node, Degauss, "degauss")
+    rig.wait(lambda: answers_arrive(client, client.server_is_ready), "action degauss")
+    accepted = client.send_goal_async(Degauss.Goal(steps=steps))
+    rig.wait(accepted.done, "acceptance of the degauss")
+    return accepted.result().get_result_async()
 
 
 @contextmanager

@@ -247,8 +247,9 @@ class MapListener:
         with self._turn:
             if self._busy():
                 raise Refusal(ErrorCode.BUSY, "a calibration is running")
-            self._wait_for_rest()
-            measured = self._services.measure_as_it_stands("calibration check")
+            with self._services.held("a map is compared with the calibration (service update_calibration)"):
+                self._wait_for_rest()
+                measured = self._services.measure_as_it_stands("calibration check")
             try:
                 verdict = self._judge(measured, request.dry_run)
             except MapNotUsableError as error:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rclpy
-from dm_msgs.msg import ActuatorState
-from dm_msgs.srv import Degauss, Measure, SetSignals
+from dm_msgs.action import Degauss
+from dm_msgs.msg import ActuatorState, MirrorInfo, SurfaceMapInfo
+from dm_msgs.srv import Measure, SetSignals
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -20,7 +22,9 @@ from rclpy.signals import SignalHandlerOptions
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
-from dm_common.ros.worker import ServiceCallError, call, sleep
+from dm_common.ros.clients import MirrorHolder, ThreadedActionClient, run_goal
+from dm_common.ros.qos import Liveliness
+from dm_common.ros.worker import ServiceCallError, answers_arrive, call, sleep
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
@@ -41,6 +45,20 @@ def _never() -> bool:
     return False
 
 
+def _not_shown(_text: str) -> None:
+    pass
+
+
+def told_by(handle: Any, feedback: Any) -> Callable[[str], None]:
+    """Puts what is waited for in the `message` of an action's feedback, which is published."""
+
+    def tell(text: str) -> None:
+        feedback.message = text
+        handle.publish_feedback(feedback)
+
+    return tell
+
+
 class BenchServices:
     """Driver and interferometer of one calibration; implements :class:`dm_common.measurement.Bench`.
 
@@ -51,14 +69,19 @@ class BenchServices:
         settle_time: s of ROS time between command and map.
         cancelled: asked while waiting.
         map_time: s of ROS time that the last map took; 0 = none was taken yet.
+        waiting: called with what is waited for, a node that is missing for example; "" = it goes on.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._node = node
         self._values = values
         self._set_signals = node.create_client(SetSignals, "set_signals")
-        self._degauss = node.create_client(Degauss, "degauss")
+        self._degauss = ThreadedActionClient(node, Degauss, "degauss")
         self._measure = node.create_client(Measure, "measure")
+        self._driver = Liveliness(node, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
+        self._interferometer = Liveliness(node, "interferometer", SurfaceMapInfo, "surface_map_info", qos.STATE)
+        self._hold = MirrorHolder(node, node.get_name())
+        self.waiting: Callable[[str], None] = _not_shown
         self.state: ActuatorState | None = None
         self.settle_time = float(values["settle_time"])
         self.cancelled: Callable[[], bool] = _never
@@ -69,6 +92,22 @@ class BenchServices:
 
     def _on_state(self, message: ActuatorState) -> None:
         self.state = message
+
+    @contextmanager
+    def held(self, purpose: str, duration: float = 0.0) -> Iterator[None]:
+        """Hold the mirror for the block: commands of others are refused.
+
+        Args:
+            purpose: what for and how to end it, for those who are refused meanwhile.
+            duration: s that it will last, about; 0 = not known.
+
+        Raises:
+            Refusal: somebody else holds it, or there is no driver.
+        """
+        with ExitStack() as stack:
+            with self._answered("hold_mirror", self._driver, self._set_signals.service_is_ready) as stop:
+                stack.enter_context(self._hold.held(purpose, duration, self._values["driver_timeout"], stop))
+            yield
 
     def check_ready(self) -> None:
         """Raise Refusal when the driver says that it takes no commands."""
@@ -96,27 +135,62 @@ class BenchServices:
 
     def degauss(self) -> None:
         self._history_known = False
-        self._call(self._degauss, Degauss.Request(), self._values["degauss_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
+        self._run_degauss(0)
+
+    def _run_degauss(self, steps: int) -> None:
+        """A degauss of so many half-swings, 0 = as configured in the driver. Raises as `degauss`."""
+        goal = Degauss.Goal(steps=steps, holder=self._hold.holder)
+        with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
+            result = run_goal(self._degauss, goal, self._values["degauss_timeout"], stop)
+        self._check("degauss", result)
 
     def apply(self, signals: Floats) -> Floats:
-        request = SetSignals.Request(signals=doubles(signals), wait=True)
-        response = self._call(self._set_signals, request, self._values["driver_timeout"], ErrorCode.DRIVER_UNAVAILABLE)
+        request = SetSignals.Request(signals=doubles(signals), wait=True, holder=self._hold.holder)
+        with self._answered("set_signals", self._driver, self._set_signals.service_is_ready) as stop:
+            response = call(self._set_signals, request, self._values["driver_timeout"], stop)
+        self._check("set_signals", response)
         self._commanded = signals
         applied = np.array(response.applied, dtype=np.float64)
         return applied if applied.shape == signals.shape else signals
 
     def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         try:
-            return sleep(self._node.get_clock(), share * self.settle_time + dwell, self.cancelled)
+            slept = sleep(self._node.get_clock(), share * self.settle_time + dwell, self._stopping)
         except TimeoutError as error:
             raise Refusal(ErrorCode.TIMEOUT, str(error)) from error
+        if self._hold.lost is not None:
+            raise self._hold.lost
+        return slept
 
     def measure(self, label: str) -> Measurement:
-        return self._measured(label, self._check_undisturbed)
+        while True:
+            try:
+                return self._measured(label, self._check_undisturbed)
+            except MeasurementError:
+                if not self._no_interferometer() or not self._interferometer_returns():
+                    raise
 
     def measure_as_it_stands(self, label: str) -> Measurement:
-        """Take one map of whatever stands at the mirror. Raises as `measure`."""
+        """One map of whatever stands there; does not wait for an interferometer to return. Raises as `measure`."""
         return self._measured(label, lambda: None)
+
+    def _no_interferometer(self) -> bool:
+        return self._interferometer.missing(self._measure.service_is_ready)
+
+    def _interferometer_returns(self) -> bool:
+        """Wait for an interferometer that has died, as long as for a map; whether it is back. Raises Cancelled."""
+        self.waiting(f"waiting: {self._interferometer.text}")
+        deadline = time.monotonic() + self._values["measure_timeout"]
+        try:
+            while not answers_arrive(self._measure, lambda: not self._no_interferometer()):
+                if self._stopping():
+                    raise self._hold.lost or Cancelled("cancelled")
+                if time.monotonic() > deadline:
+                    return False
+                time.sleep(0.02)
+            return True
+        finally:
+            self.waiting("")
 
     def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
@@ -124,9 +198,11 @@ class BenchServices:
         began = self._node.get_clock().now()
         # The interferometer keeps the time itself; the call waits a little longer for its answer, which says why.
         try:
-            response = self._call(self._measure, request, timeout + 5.0, ErrorCode.INTERFEROMETER_UNAVAILABLE)
+            with self._answered("measure", self._interferometer, self._measure.service_is_ready) as stop:
+                response = call(self._measure, request, timeout + 5.0, stop)
+            self._check("measure", response)
         except Refusal as error:
-            if error.error_code in _FATAL:
+            if error.error_code in _FATAL or self._hold.lost is not None:
                 raise
             raise MeasurementError(error.error_code, str(error)) from error
         self.map_time = (self._node.get_clock().now() - began).nanoseconds * 1e-9
@@ -148,6 +224,8 @@ class BenchServices:
                 self.apply(signals)
                 return "the mirror is back at mid range"
             except Refusal as error:
+                if self._hold.lost is not None:
+                    return f"the mirror is left as it is: {self._hold.lost}"
                 # A degauss or ramp that was cancelled here may still be running there.
                 if error.error_code in (ErrorCode.BUSY, ErrorCode.PREEMPTED) and time.monotonic() < deadline:
                     time.sleep(0.2)
@@ -166,7 +244,9 @@ class BenchServices:
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
             if not client.wait_for_service(timeout_sec=timeout):
                 return "the mirror could NOT be brought back to mid range: the driver does not answer"
-            future = client.call_async(SetSignals.Request(signals=doubles(signals), wait=True))
+            future = client.call_async(
+                SetSignals.Request(signals=doubles(signals), wait=True, holder=self._hold.holder)
+            )
             executor.spin_until_future_complete(future, timeout_sec=timeout)
             response = future.result() if future.done() else None
             if response is None or response.error_code != ErrorCode.OK:
@@ -177,16 +257,32 @@ class BenchServices:
             node.destroy_node()
             context.try_shutdown()
 
-    def _call(self, client: Any, request: Any, timeout_s: float, unavailable: int) -> Any:
+    def _stopping(self) -> bool:
+        return self.cancelled() or self._hold.lost is not None
+
+    @contextmanager
+    def _answered(self, what: str, server: Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+        """Give a call a condition to end its wait by, and its failure a code and a sentence.
+
+        Args:
+            what: is called.
+            server: of the node that serves it.
+            ready: whether it is served.
+        """
         try:
-            response = call(client, request, timeout_s, self.cancelled)
+            yield lambda: self._stopping() or server.missing(ready)
         except ServiceCallError as error:
             if self.cancelled():
                 raise Cancelled("cancelled") from error
-            raise Refusal(unavailable, str(error)) from error
+            if self._hold.lost is not None:
+                raise self._hold.lost from error
+            code = ErrorCode.DRIVER_UNAVAILABLE if server is self._driver else ErrorCode.INTERFEROMETER_UNAVAILABLE
+            raise Refusal(code, f"{what}: {server.text}" if server.missing(ready) else str(error)) from error
+
+    @staticmethod
+    def _check(what: str, response: Any) -> None:
         if response.error_code != ErrorCode.OK:
-            raise Refusal(response.error_code, f"{client.srv_name}: {response.message}")
-        return response
+            raise Refusal(response.error_code, f"{what}: {response.message}")
 
     def _check_undisturbed(self) -> None:
         """Raise Refusal when the mirror no longer holds what this node commanded: the map shows something else."""

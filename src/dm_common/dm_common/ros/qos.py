@@ -1,6 +1,21 @@
-"""Quality-of-service profiles, one per kind of topic."""
+"""Quality-of-service profiles, one per kind of topic, and whether a node that one depends on is alive.
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+A service of a process that was killed stays in the ROS graph for 20 s, and its clients wait on. DDS asserts liveliness
+for every publisher with a lease, whatever is published; so the nodes that others wait for give a topic one, and those
+who wait watch it here: they know within a second, also after kill -9.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from copy import copy
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 #: Set-points: reliable, and the latest wins, so that a slow reader never works off a queue of old requests.
 COMMAND = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
@@ -23,3 +38,82 @@ SERVICE = QoSProfile(depth=1000, history=HistoryPolicy.KEEP_LAST, reliability=Re
 #: Surface maps of several megabytes. Reliable, because best effort loses whole maps once they exceed the transport's
 #: datagram size (ros2/rmw_fastrtps#739).
 MAP = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
+
+#: A publisher whose process does not say for so long that it lives counts as dead, s.
+LEASE_S = 1.0
+#: A run that may have taken hours is not given up for a node before it has been lost for so long, s: a machine that
+#: stalls loses all nodes for a moment.
+SURE_S = 0.7
+#: A node that has not appeared for so long after the one that watches it was started is missing, s.
+APPEAR_S = 5.0
+#: What became of a node that is lost.
+GONE = "has died or was stopped: start it again"
+
+
+def with_lease(profile: QoSProfile) -> QoSProfile:
+    """`profile` with a lease: for publishers that others watch, and for subscriptions that watch them."""
+    leased = copy(profile)
+    leased.liveliness = LivelinessPolicy.AUTOMATIC
+    leased.liveliness_lease_duration = Duration(seconds=LEASE_S)
+    return leased
+
+
+class Liveliness:
+    """Watches the publisher of a topic by a subscription of its own, whose messages it does not even decode.
+
+    A publisher without a lease is not seen at all: nothing is known of it.
+
+    Args:
+        node: hosts the subscription.
+        name: of the node that is watched.
+        message_type, topic: one that is published seldom.
+        profile: of the topic, without the lease.
+        changed: called by the executor at every change.
+
+    Attributes:
+        name: of the node that is watched.
+        lost: there was a publisher, and now there is none.
+        seen: there was one at all.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        message_type: Any,
+        topic: str,
+        profile: QoSProfile,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.name, self.lost, self.seen = name, False, False
+        self._born = self._lost_at = time.monotonic()
+        self._changed = changed
+        node.create_subscription(
+            message_type,
+            topic,
+            lambda _message: None,
+            with_lease(profile),
+            event_callbacks=SubscriptionEventCallbacks(
+                liveliness=self._on_change,
+                incompatible_qos=lambda _info: None,  # a publisher without a lease is no mistake
+            ),
+            raw=True,
+        )
+
+    def missing(self, served: Callable[[], bool]) -> bool:
+        """Whether the node is lost, or never came: not even what it serves is there, which `served` looks for."""
+        if self.lost:
+            return time.monotonic() - self._lost_at > SURE_S
+        return not self.seen and time.monotonic() - self._born > APPEAR_S and not served()
+
+    @property
+    def text(self) -> str:
+        """What became of a node that is missing, and what to do."""
+        return f"the node {self.name} {GONE if self.seen else 'is not running: start it'}"
+
+    def _on_change(self, info: Any) -> None:
+        lost = info.alive_count == 0
+        self.seen = self.seen or not lost
+        if lost != self.lost:
+            self.lost, self._lost_at = lost, time.monotonic()
+            self._changed()

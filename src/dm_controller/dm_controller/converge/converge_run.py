@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.messages import doubles
+from dm_common.ros.bench_services import told_by
 from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.goals import ending
@@ -43,15 +44,15 @@ class ConvergeRun:
     def run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
         """Outcome and result of the goal."""
         steps: list[LoopStep] = []
+        feedback = Converge.Feedback()
 
         def report(step: LoopStep) -> None:
             steps.append(step)
-            handle.publish_feedback(
-                Converge.Feedback(step=step.map, residual_rms=step.rms, max_zernike=step.max_zernike)
-            )
+            feedback.step, feedback.residual_rms, feedback.max_zernike = step.map, step.rms, step.max_zernike
+            handle.publish_feedback(feedback)
 
         try:
-            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested)):
+            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)):
                 outcome, error_code, message = self._judge(self._loop(handle.request, report))
         except Exception as error:
             outcome, error_code, message = ending(error)

@@ -20,6 +20,7 @@ from rclpy.node import Node
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
+from dm_common.ros.bench_services import told_by
 from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
 from dm_controller.converge.goals import ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
@@ -50,9 +51,11 @@ class RecipeRun:
 
     def run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
         """Outcome and result of the goal."""
+        feedback = BuildRecipes.Feedback()
+
         try:
-            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested)):
-                outcome, result = self._build_and_store(handle)
+            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)):
+                outcome, result = self._build_and_store(handle, feedback)
         except Exception as error:
             outcome, error_code, message = ending(error)
             result = BuildRecipes.Result(
@@ -65,7 +68,9 @@ class RecipeRun:
             self._node.get_logger().warning(f"build_recipes: {result.message}")
         return outcome, result
 
-    def _build_and_store(self, handle: ServerGoalHandle) -> tuple[str, BuildRecipes.Result]:
+    def _build_and_store(
+        self, handle: ServerGoalHandle, feedback: BuildRecipes.Feedback
+    ) -> tuple[str, BuildRecipes.Result]:
         """Build and store.
 
         Raises:
@@ -88,11 +93,9 @@ class RecipeRun:
             return float(clock.now().nanoseconds * 1e-9)
 
         def report(step: BuildStep) -> None:
-            handle.publish_feedback(
-                BuildRecipes.Feedback(
-                    step=builder.maps, curvature=step.curvature, residual_rms=step.rms, max_zernike=step.max_zernike
-                )
-            )
+            feedback.step, feedback.curvature = builder.maps, step.curvature
+            feedback.residual_rms, feedback.max_zernike = step.rms, step.max_zernike
+            handle.publish_feedback(feedback)
 
         builder = RecipeBuilder(
             planner,

@@ -94,6 +94,8 @@ class Request:
         mode: FocusRequest.MODE_AUTO, MODE_DIRECT or MODE_CONDITIONED.
         time_budget: s that AUTO may take; 0 = as configured.
         stamp_ns: when it was made; 0 = now.
+        holder: who asks, where somebody holds the mirror; "" = nobody in particular.
+        take_over: even if somebody else holds it.
     """
 
     curvature: float = 0.0
@@ -102,6 +104,8 @@ class Request:
     mode: int = 0
     time_budget: float = 0.0
     stamp_ns: int = 0
+    holder: str = ""
+    take_over: bool = False
 
     @classmethod
     def from_message(cls, message: FocusRequest) -> Request:
@@ -112,4 +116,6 @@ class Request:
             message.mode,
             message.time_budget,
             stamp_ns(message.header.stamp),
+            message.holder,
+            message.take_over,
         )

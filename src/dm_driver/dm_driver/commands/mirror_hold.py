@@ -72,8 +72,8 @@ class MirrorHold:
                 raise Refusal(ErrorCode.OUT_OF_RANGE, f"{name} = {value:g} s: must be 0 to {high:g} s")
         with self._lock:
             current = self._current()
-            if operation == Operation.RENEW and current != holder and holder == self._evicted:
-                raise Refusal(ErrorCode.PREEMPTED, f"{self._evicted_by} has taken the mirror over")
+            if operation == Operation.RENEW:
+                self._check_evicted(holder)
             if current not in ("", holder):
                 if operation != Operation.TAKE_OVER:
                     raise Refusal(ErrorCode.BUSY, self._sentence())
@@ -93,9 +93,11 @@ class MirrorHold:
         """Whether a command of `holder` ("" = nobody in particular) takes the mirror from somebody.
 
         Raises:
-            Refusal: BUSY, somebody else holds the mirror.
+            Refusal: BUSY, somebody else holds the mirror; PREEMPTED, they lost it and have not held it again.
         """
         with self._lock:
+            if not take_over:
+                self._check_evicted(holder)
             other = self._current() not in ("", holder)
             if other and not take_over:
                 raise Refusal(ErrorCode.BUSY, self._sentence())
@@ -105,6 +107,10 @@ class MirrorHold:
         """Whoever holds the mirror does so no longer: a command of `by` ("" = nobody in particular) is carried out."""
         with self._lock:
             self._evict(by or "a command with take_over")
+
+    def _check_evicted(self, holder: str) -> None:
+        if holder and holder == self._evicted:
+            raise Refusal(ErrorCode.PREEMPTED, f"{self._evicted_by} has taken the mirror over")
 
     def _current(self) -> str:
         if self._holder and self._clock() > self._until:

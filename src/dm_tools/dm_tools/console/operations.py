@@ -6,9 +6,9 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from dm_msgs.action import BuildRecipes, Calibrate, Converge, MoveFocus
+from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
 from dm_msgs.msg import FocusRequest
-from dm_msgs.srv import Degauss, Flatten, LoadCalibration, Measure, SetFocus, SetSignals
+from dm_msgs.srv import Flatten, LoadCalibration, Measure, SetFocus, SetSignals
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
@@ -70,7 +70,11 @@ async def flatten(session: Session) -> str:
 async def degauss(session: Session) -> str:
     """Wipe the history of the actuators."""
     session.progress.text = "alternating with falling amplitude about mid range"
-    answer = await session.ros.call("degauss", Degauss.Request(), DEGAUSS_S)
+
+    def show(feedback: Any) -> None:
+        session.progress.step, session.progress.steps = feedback.step, feedback.steps
+
+    answer = await session.ros.run("degauss", Degauss.Goal(), show, DEGAUSS_S)
     session.base = None
     return f"done in {answer.duration:.1f} s; the mirror is at mid range"
 

@@ -124,6 +124,8 @@ def reason_against(need: str, snapshot: Any, running: str) -> str:
         capabilities = snapshot.capabilities
         if capabilities is None or not capabilities.calibration_id:
             return "The mirror is not calibrated: run a calibration or load one."
+        if capabilities.error_code:
+            return f"Requests are refused: {capabilities.message}."
     return ""
 
 

@@ -34,8 +34,8 @@ _HEALTH = ("/diagnostics",)
 _TRANSITIONS = ("~/transition_event",)
 _LIFECYCLE = frozenset(node.name for node in NODES if node.lifecycle)
 #: What an operator's program calls.
-_OPERATION = ("degauss", "flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
-_LONG_OPERATION = ("build_recipes", "calibrate", "converge", "move_focus")
+_OPERATION = ("flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
+_LONG_OPERATION = ("build_recipes", "calibrate", "converge", "degauss", "move_focus")
 #: Enclaves of nodes that go by simulated time.
 _TIMED = frozenset(node.name for node in NODES) - {"virtual_bench"}
 
@@ -69,7 +69,7 @@ _DECLARED = (
         "pdm_driver",
         publish=(*_HEALTH, "actuator_state", "mirror_info"),
         subscribe=("actuator_command",),
-        reply=("degauss", "hold_mirror", "set_signals"),
+        reply=("hold_mirror", "set_signals"),
         execute=("degauss",),
     ),
     NodeInterface(
@@ -83,13 +83,14 @@ _DECLARED = (
         "calibration",
         "calibration",
         publish=(*_HEALTH, "calibration"),
-        subscribe=("actuator_state", "mirror_info", "surface_samples", "zernike"),
+        subscribe=("actuator_state", "mirror_info", "surface_map_info", "surface_samples", "zernike"),
         reply=(
             *("fit_influence_function", "fit_regression", "list_calibrations", "load_calibration"),
             *("predict_error", "store_recipes", "update_calibration"),
         ),
-        request=("degauss", "measure", "set_signals"),
+        request=("hold_mirror", "measure", "set_signals"),
         execute=("calibrate",),
+        call=("degauss",),
     ),
     # The way back to mid range when the node ends in a run: the same process, over a node of its own.
     NodeInterface("calibration_exit", "calibration", request=("set_signals",)),
@@ -97,10 +98,11 @@ _DECLARED = (
         "focus_controller",
         "focus_controller",
         publish=(*_HEALTH, "actuator_command", "capabilities", "focus_state"),
-        subscribe=("actuator_state", "calibration", "focus_request", "mirror_info"),
+        subscribe=("actuator_state", "calibration", "focus_request", "mirror_info", "surface_map_info"),
         reply=("flatten", "set_focus"),
-        request=("degauss", "measure", "predict_error", "set_signals", "store_recipes"),
+        request=("hold_mirror", "measure", "predict_error", "set_signals", "store_recipes"),
         execute=("build_recipes", "converge", "move_focus"),
+        call=("degauss",),
     ),
     NodeInterface(
         "autofocus",
@@ -108,7 +110,7 @@ _DECLARED = (
         publish=(*_HEALTH, "autofocus_state", "focus_request"),
         subscribe=("actuator_state", "capabilities", "focus_state", "camera_info", "image_raw"),
         reply=("get_focus_range", "set_focus_distance"),
-        request=("set_focus",),
+        request=("hold_mirror", "set_focus"),
         execute=("autofocus",),
     ),
     NodeInterface(

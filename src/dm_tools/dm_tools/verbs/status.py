@@ -89,6 +89,8 @@ def _calibration(calibration: Any) -> str:
 def _promise(capabilities: Any) -> str:
     if capabilities is None:
         return "not known: focus_controller is not heard"
+    if capabilities.error_code:
+        return f"none now: {capabilities.message}"
     return (
         f"largest coefficient within {promise(capabilities.error_bound)} from {capabilities.curvature_min:+.4f} to "
         f"{capabilities.curvature_max:+.4f} 1/m"

@@ -45,7 +45,10 @@ def up(
     ] = None,
     logs: Annotated[Path | None, typer.Option(help="Write the nodes' output to files in this folder instead.")] = None,
 ) -> None:
-    """Start the nodes and keep them running until Ctrl-C or SIGTERM; the mirror is then ramped to its safe shape."""
+    """Start the nodes and keep them running until Ctrl-C or SIGTERM; the mirror is then ramped to its safe shape.
+
+    A node that dies is started again, after a pause that grows while it dies again.
+    """
     from dm_bringup.suite import Suite
     from dm_tools.doctor.bench import effective
 
@@ -76,7 +79,7 @@ def up(
             watcher.start()
         while not stop.wait(0.2):
             for suite in suites:
-                suite.check()
+                suite.revive(lambda text: console.print(f"[yellow]{text}[/]"))
         console.print("\nstopping")
         for watcher in watchers:
             watcher.join(1.0)

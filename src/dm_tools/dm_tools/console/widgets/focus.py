@@ -118,7 +118,10 @@ class FocusCard:
     def _take_range(self, snapshot: Snapshot) -> None:
         found = reachable(snapshot.capabilities)
         if found is None:
-            self._text.show("Reachable range: not known without a calibration.")
+            capabilities = snapshot.capabilities
+            calibrated = capabilities is not None and capabilities.calibration_id
+            reason = capabilities.message if calibrated else "not known without a calibration"
+            self._text.show(f"Reachable range: {reason}.")
             self._slider.set_enabled(False)
             return
         self._slider.set_enabled(True)

@@ -1,0 +1,55 @@
+"""Nodes that die are started again, later each time, and it is said."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dm_bringup import suite as suite_module
+from dm_bringup.suite import RESTART_S, Suite
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Suite]:
+    """A suite of one node that runs this code."""
+
+    def run(code: str) -> Suite:
+        (tmp_path / "node_of_a_test.py").write_text(code)
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        monkeypatch.setitem(suite_module.MODULES, "calibration", "node_of_a_test")
+        return Suite({"calibration": {}}, tmp_path / "run", nodes=("calibration",))
+
+    return run
+
+
+def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:
+    """What is said until so many restarts, and the pauses before them, s."""
+    told: list[str] = []
+    times: list[float] = []
+
+    def say(text: str) -> None:
+        told.append(text)
+        times.append(time.monotonic())
+
+    deadline = time.monotonic() + 30.0
+    while len(told) < 2 * count and time.monotonic() < deadline:
+        suite.revive(say)
+        time.sleep(0.01)
+    return told, [times[2 * k + 1] - times[2 * k] for k in range(count)]
+
+
+def test_a_node_that_dies_is_started_again_later_each_time(run: Callable[[str], Suite]) -> None:
+    with run("import os; os.kill(os.getpid(), 9)") as suite:
+        told, pauses = revived(suite, 2)
+    assert told[0] == f"the node calibration was killed by signal 9; it is started again in {RESTART_S:g} s"
+    assert told[1] == "the node calibration is started again" and told[2].endswith(f"in {2 * RESTART_S:g} s")
+    assert pauses[0] >= RESTART_S and pauses[1] >= 2 * RESTART_S
+
+
+def test_a_node_that_cannot_be_made_is_not_tried_again(run: Callable[[str], Suite]) -> None:
+    with run("import sys; sys.exit('ParameterError: mirror.serial is missing')") as suite:
+        with pytest.raises(RuntimeError, match=r"calibration ended with status 1\nParameterError: mirror.serial"):
+            revived(suite, 1)

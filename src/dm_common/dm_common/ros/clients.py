@@ -1,0 +1,171 @@
+"""Clients for threads that may wait: of actions, and one that holds the mirror so that nobody else commands it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from dm_msgs.srv import HoldMirror
+from rclpy.action import ActionClient
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros.worker import ServiceCallError, answers_arrive, call
+
+#: How often a hold is renewed, s: several times within the driver's lease of 3 s.
+RENEW_S = 0.7
+#: Longest wait for the driver to take a hold back, s; else it ends with its lease.
+RELEASE_S = 1.0
+#: Longest wait for the end of a goal that was cancelled, s.
+CANCEL_S = 20.0
+
+
+class ThreadedActionClient(ActionClient):
+    """`rclpy.action.ActionClient` whose requests and answers exclude each other.
+
+    rclpy sends a request first and notes its number afterwards. An answer that the executor takes in between is thrown
+    away ("Ignoring unexpected goal response"), and the caller waits for ever.
+    """
+
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        self._sending = threading.RLock()
+        super().__init__(*arguments, **keywords)
+
+    def send_goal_async(self, *arguments: Any, **keywords: Any) -> Any:
+        with self._sending:
+            return super().send_goal_async(*arguments, **keywords)
+
+    def _get_result_async(self, goal_handle: Any) -> Any:
+        with self._sending:
+            return super()._get_result_async(goal_handle)
+
+    def _cancel_goal_async(self, goal_handle: Any) -> Any:
+        with self._sending:
+            return super()._cancel_goal_async(goal_handle)
+
+    async def execute(self, taken_data: Any) -> None:
+        with self._sending:
+            await super().execute(taken_data)
+
+
+def run_goal(client: ActionClient, goal: Any, timeout_s: float, cancelled: Callable[[], bool] = lambda: False) -> Any:
+    """Run a goal from a worker thread and wait for its result; a goal that is given up is cancelled first.
+
+    Never call this from an executor callback: it would wait for itself.
+
+    Raises:
+        ServiceCallError: no server or no end within `timeout_s`, the goal was refused, or `cancelled()` became true.
+    """
+    name = client._action_name
+    deadline = time.monotonic() + timeout_s
+
+    def wait(condition: Callable[[], bool], missing: str) -> None:
+        while not condition():
+            if cancelled():
+                raise ServiceCallError(f"{name}: cancelled")
+            if time.monotonic() > deadline:
+                raise ServiceCallError(f"{name}: {missing} within {timeout_s:g} s")
+            time.sleep(0.01)
+
+    wait(lambda: answers_arrive(client, client.server_is_ready), "no such action")
+    accepted = client.send_goal_async(goal)
+    finished = None
+    try:
+        wait(accepted.done, "no answer to the goal")
+        if not accepted.result().accepted:
+            raise ServiceCallError(f"{name}: refused, another goal is running")
+        finished = accepted.result().get_result_async()
+        wait(finished.done, "not finished")
+    except ServiceCallError:
+        if accepted.done() and accepted.result().accepted:
+            accepted.result().cancel_goal_async()
+            end = time.monotonic() + CANCEL_S
+            while finished is not None and not finished.done() and time.monotonic() < end:
+                time.sleep(0.01)
+        raise
+    return finished.result().result
+
+
+class MirrorHolder:
+    """One hold at a time, taken and given back by a worker thread, renewed by the executor.
+
+    A driver that was restarted gets the renewal too, so that the hold outlives it.
+
+    Args:
+        node: hosts the client.
+        holder: who holds the mirror; goes with every command as well.
+
+    Attributes:
+        lost: the refusal once somebody else took the mirror over; None = nobody did.
+    """
+
+    def __init__(self, node: Node, holder: str) -> None:
+        self.holder = holder
+        self.lost: Refusal | None = None
+        self._client = node.create_client(HoldMirror, "hold_mirror")
+        self._request = HoldMirror.Request(holder=holder)
+        self._renewal: Any = None
+        self._one = threading.Lock()  # held with the mirror
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(RENEW_S, self._renew, clock=clock, autostart=False)
+
+    @contextmanager
+    def held(
+        self, purpose: str, duration: float, timeout_s: float, cancelled: Callable[[], bool] = lambda: False
+    ) -> Iterator[None]:
+        """Hold the mirror for the block.
+
+        Args:
+            purpose: what for and how to end it, for those who are refused meanwhile.
+            duration: s that it will last, about; 0 = not known.
+            timeout_s: longest wait for the driver.
+            cancelled: ends that wait.
+
+        Raises:
+            Refusal: BUSY, somebody else holds it.
+            ServiceCallError: there is no driver.
+        """
+        if not self._one.acquire(blocking=False):
+            raise Refusal(ErrorCode.BUSY, f"{self.holder} holds the mirror already: {self._request.purpose}")
+        try:
+            self.lost = None
+            self._request.purpose, self._request.duration = purpose, duration
+            self._ask(HoldMirror.Request.HOLD, timeout_s, cancelled)
+            self._request.operation = HoldMirror.Request.RENEW
+            self._timer.reset()
+            try:
+                yield
+            finally:
+                self._timer.cancel()
+                if self.lost is None:
+                    self._release()
+        finally:
+            self._one.release()
+
+    def _release(self) -> None:
+        try:
+            self._ask(HoldMirror.Request.RELEASE, RELEASE_S, lambda: False)
+        except (Refusal, ServiceCallError):
+            pass  # the driver is gone, or somebody took the mirror over just now
+
+    def _ask(self, operation: int, timeout_s: float, cancelled: Callable[[], bool]) -> None:
+        self._request.operation = operation
+        answer = call(self._client, self._request, timeout_s, cancelled)
+        if answer.error_code != ErrorCode.OK:
+            raise Refusal(answer.error_code, answer.message)
+
+    def _renew(self) -> None:
+        if self._renewal is not None:
+            self._client.remove_pending_request(self._renewal)
+        self._renewal = self._client.call_async(self._request)
+        self._renewal.add_done_callback(self._renewed)
+
+    def _renewed(self, done: Any) -> None:
+        answer = done.result()
+        if answer.error_code != ErrorCode.OK and not self._timer.is_canceled():
+            self._timer.cancel()
+            self.lost = Refusal(ErrorCode.PREEMPTED, answer.message)

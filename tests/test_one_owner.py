@@ -1,0 +1,229 @@
+"""One owner of the mirror at a time, and nodes that die under the others: known within two seconds, and gone on from.
+
+One suite for all tests, whose nodes are killed and started again one after the other.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dm_msgs.action import Calibrate, Converge
+from dm_msgs.msg import Capabilities, ErrorCode, FocusRequest
+from dm_msgs.srv import SetFocus, SetSignals
+from std_srvs.srv import SetBool
+
+from dm_bringup.suite import Suite
+from dm_client import DeformableMirrorClient, DeformableMirrorError
+from dm_common.ros import qos
+from dm_common.ros.domains import own_domain
+from fault_injection.rigs.forked_node import ForkedSuite
+from support import fast_bench, wait_until
+
+pytestmark = pytest.mark.processes
+
+#: Within which a missing node is known, s.
+KNOWN_S = 2.0
+
+
+@dataclass
+class Running:
+    """A goal in a thread of its own."""
+
+    client: DeformableMirrorClient
+    name: str
+    goal: Any
+    feedback: list[Any] = field(default_factory=list)
+    result: Any = None
+
+    def __post_init__(self) -> None:
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.result = self.client.run_action(self.name, self.goal, self.feedback.append, 300.0)
+        except DeformableMirrorError as error:
+            self.result = error.response
+
+    def end(self) -> Any:
+        self._thread.join(300.0)
+        return self.result
+
+    def wait_for(self, condition: Any, timeout_s: float = 60.0) -> None:
+        wait_until(lambda: self.feedback and condition(self.feedback[-1]), timeout_s, f"feedback of {self.name}")
+
+
+class Bench:
+    """The suite, a client, and what restarts nodes meanwhile, as `./dm up` does."""
+
+    def __init__(self, suite: Suite, client: DeformableMirrorClient) -> None:
+        self.suite, self.client = suite, client
+        self.said: list[str] = []
+        self.paused = False
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._revive)
+        self._thread.start()
+
+    def _revive(self) -> None:
+        while not self._stop.wait(0.05):
+            if not self.paused:
+                self.suite.revive(self.said.append)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def kill(self, node: str) -> None:
+        os.kill(self.suite.pids[node], signal.SIGKILL)
+
+    def applies(self) -> bool:
+        answer = self.focus()
+        return answer is not None and answer.state.applied
+
+    def focus(self, curvature: float = 0.01, **fields: Any) -> Any:
+        """The answer of `set_focus`; None = there was none."""
+        try:
+            request = SetFocus.Request(request=FocusRequest(curvature=curvature, **fields))
+            return self.client.call("set_focus", request)
+        except DeformableMirrorError as error:
+            return error.response
+
+    def set_signals(self, value: float) -> Any:
+        try:
+            return self.client.call("set_signals", SetSignals.Request(signals=[value] * 37))
+        except DeformableMirrorError as error:
+            return error.response
+
+    def calibrate(self) -> Running:
+        running = Running(self.client, "calibrate", Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True))
+        running.wait_for(lambda feedback: feedback.step > 3)
+        return running
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    folder: Path = tmp_path_factory.mktemp("suite")
+    config = fast_bench(folder, 5)
+    config["calibration"]["load_on_start"] = "newest"
+    with (
+        own_domain() as domain,
+        ForkedSuite(config, folder, domain) as suite,
+        DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
+    ):
+        client.wait_until_active()
+        client.calibrate(Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True))
+        assert client.wait(lambda: client.capabilities.quality != Capabilities.UNCALIBRATED, 30.0)
+        bench = Bench(suite, client)
+        yield bench
+        bench.close()
+
+
+@pytest.fixture(autouse=True)
+def _all_run_afterwards(bench: Bench) -> Iterator[None]:
+    yield
+    bench.paused = False
+    wait_until(lambda: not bench.suite.ended(), 60.0)
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.OK, 60.0)
+
+
+def test_a_calibration_is_not_harmed_by_requests_and_goes_on_when_the_interferometer_is_back(bench: Bench) -> None:
+    running = bench.calibrate()
+    stream = bench.client.node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
+    timer = bench.client.node.create_timer(0.02, lambda: stream.publish(FocusRequest(curvature=0.02)))
+    busy = bench.focus()
+    assert busy.error_code == ErrorCode.BUSY and not busy.state.applied
+    assert "calibration has held the mirror for" in busy.message and "cancel the action calibrate" in busy.message
+    assert bench.set_signals(0.5).error_code == ErrorCode.BUSY
+    bench.kill("interferometer")
+    running.wait_for(lambda feedback: "the node interferometer has died" in feedback.message, KNOWN_S)
+    running.wait_for(lambda feedback: feedback.message == "")
+    result = running.end()
+    timer.cancel()
+    assert result.error_code == ErrorCode.OK, result.message
+    assert result.maps_dropped == 0 and result.held_out_rms < 5e-9
+    assert bench.client.wait(lambda: bench.client.actuator_state.holder == "")
+    assert bench.focus().state.applied
+
+
+def test_taking_over_is_explicit_and_ends_the_run(bench: Bench) -> None:
+    running = bench.calibrate()
+    taken = bench.focus(take_over=True)
+    assert taken.error_code == ErrorCode.OK and taken.state.applied
+    result = running.end()
+    assert result.error_code == ErrorCode.PREEMPTED and "has taken the mirror over" in result.message
+    assert list(bench.client.actuator_state.requested) == pytest.approx(list(taken.state.signals))
+
+
+def test_a_dead_driver_is_known_and_used_again(bench: Bench) -> None:
+    bench.paused = True
+    bench.kill("pdm_driver")
+    began = time.monotonic()
+    answers = [bench.focus() for _ in range(3)]
+    assert {answer.error_code for answer in answers} == {ErrorCode.DRIVER_UNAVAILABLE}
+    assert not any(answer.state.applied for answer in answers)
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.DRIVER_UNAVAILABLE, KNOWN_S)
+    assert time.monotonic() - began < 2 * KNOWN_S
+    assert bench.client.capabilities.curvature_max == 0.0
+    bench.paused = False
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.OK, 60.0)
+    assert bench.client.wait(bench.applies, 20.0)
+    assert any("pdm_driver was killed by signal 9" in text for text in bench.said)
+
+
+def test_an_unplugged_unit_is_known(bench: Bench) -> None:
+    power = bench.client.node.create_client(SetBool, "virtual_bench/power")
+    bench.client.clients["power"] = power
+    assert wait_until(power.service_is_ready)
+    power.call_async(SetBool.Request(data=False))
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code != ErrorCode.OK, KNOWN_S + 1.0)
+    assert bench.client.capabilities.quality == Capabilities.UNCALIBRATED
+    power.call_async(SetBool.Request(data=True))
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.OK, 20.0)
+
+
+def test_a_closed_loop_names_the_interferometer_and_goes_on_with_it(bench: Bench) -> None:
+    goal = Converge.Goal(request=FocusRequest(curvature=0.02), tolerance=1e-10, max_maps=20)
+    running = Running(bench.client, "converge", goal)
+    running.wait_for(lambda feedback: feedback.step > 0)
+    assert bench.focus().error_code == ErrorCode.BUSY
+    bench.kill("interferometer")
+    running.wait_for(lambda feedback: "the node interferometer has died" in feedback.message, KNOWN_S)
+    began = time.monotonic()
+    running.wait_for(lambda feedback: feedback.message == "" and np.isfinite(feedback.max_zernike))
+    result = running.end()
+    assert result.error_code in (ErrorCode.OK, ErrorCode.NOT_CONVERGED) and result.maps > 1, result.message
+    assert time.monotonic() - began < 60.0
+
+
+def test_a_check_without_an_interferometer_says_so_at_once(bench: Bench) -> None:
+    bench.focus()
+    bench.paused = True
+    bench.kill("interferometer")
+    began = time.monotonic()
+    with pytest.raises(DeformableMirrorError, match="the node interferometer has died") as refused:
+        bench.client.update_calibration(dry_run=True)
+    assert refused.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE
+    assert time.monotonic() - began < KNOWN_S + 2.5  # the mirror is let stand first
+    bench.paused = False
+
+
+@pytest.mark.parametrize("node", ["calibration", "focus_controller"])
+def test_the_others_go_on_when_it_is_back(bench: Bench, node: str) -> None:
+    bench.paused = True
+    bench.kill(node)
+    time.sleep(KNOWN_S)
+    with pytest.raises(DeformableMirrorError, match=f"the node {node} has died"):
+        bench.client.list_calibrations() if node == "calibration" else bench.client.focus(0.01)
+    bench.paused = False
+    wait_until(lambda: any(f"{node} is started again" in text for text in bench.said), 30.0)
+    assert bench.client.wait(bench.applies, 60.0)
+    assert bench.client.list_calibrations().ids
