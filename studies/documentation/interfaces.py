@@ -207,6 +207,9 @@ def _row(line: str) -> str:
         return f"| | | *{comment}* |" if comment else ""
     kind, _, rest = declaration.partition(" ")
     name = " ".join(rest.split())
+    if "=" not in name and " " in name:  # a default value
+        name, _, default = name.partition(" ")
+        comment = f"{comment} (default {default})"
     return f"| `{name}` | {kind} | {comment} |"
 
 
