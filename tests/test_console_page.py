@@ -83,8 +83,7 @@ def test_nothing_is_fetched_from_elsewhere(page: Browser) -> None:
 
 
 def test_a_calibration_that_is_cancelled_says_so(page: Browser) -> None:
-    page.choose("Plan", "Pokes only")
-    page.press("Calibrate")
+    page.press("Calibrate")  # the longest plan: it must not end before it is cancelled
     page.wait_for("Step ", 30)
     page.press("Cancel calibration")
     wait_until(lambda: "cancel" in page.alerts(), 60, "the sentence of the node")
@@ -94,6 +93,7 @@ def test_a_calibration_that_is_cancelled_says_so(page: Browser) -> None:
 
 
 def test_a_calibration_shows_progress_and_residual_and_is_used(page: Browser, shots: Path) -> None:
+    page.choose("Plan", "Pokes only")
     page.press("Calibrate")
     page.wait_for("Step ", 30)
     wait_until(lambda: page.pictures("residual of"), 60, "residuals of the run")

@@ -6,6 +6,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from dm_msgs.msg import FocusRequest
+from dm_msgs.srv import SetFocus
 
 from fault_injection.fault import FaultRecord, run_faults
 from fault_injection.faults.registry import GROUPS, OTHERS, select
@@ -37,15 +39,20 @@ def test_every_request_is_carried_out_or_refused_and_the_mirror_kept(name: str, 
     assert len(record.recovery_s) == record.injected
 
 
-def test_a_request_that_a_dead_driver_swallows_counts_as_lost(tmp_path: Path, domain: int) -> None:
-    """What `driver_timeout` is for; and a loss that must be counted."""
+def test_a_dead_driver_is_known_and_what_nobody_carries_out_counts_as_lost(tmp_path: Path, domain: int) -> None:
+    """Without `driver_timeout` too: liveliness says so; and a loss must be counted."""
     random, record = Random(1), FaultRecord("dead driver")
     with FocusRig(tmp_path, domain, driver_timeout=0.0) as rig:
         rig.refocus(random)
+        planned = SetFocus.Request(request=FocusRequest(curvature=rig.curvature(random)), dry_run=True)
+        answered = rig.begin(SetFocus, planned)
+        rig.wait(answered.done, "the controller's answer", 20.0)
+        rig.account_for(answered.result().state, record, patience_s=1.0)
+        assert record.lost == 1
+        assert "neither carried out nor told of" in record.remarks[0]
         rig.kill()
         rig.account_for(rig.set_focus(rig.curvature(random)), record, patience_s=4.0)
     assert record.lost == 1
-    assert "neither carried out nor told of" in record.remarks[0]
 
 
 def test_groups_stand_for_their_faults() -> None:

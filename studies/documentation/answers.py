@@ -52,6 +52,7 @@ class Answer:
     def sentence(self) -> str:
         """The message without what differs from run to run."""
         text = re.sub(r"PDM30-37_\S+?Z|/\S+/|\S+\.dat\b", "…", self.message)
+        text = re.sub(r"inside [-+]0\.\d{4} to [-+]0\.\d{4}", "inside … to …", text)  # what the calibration reaches
         return text if self.code in EXACT else re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
 
 
