@@ -9,7 +9,8 @@ import pytest
 import typer
 
 from dm_bringup.suite import ConfigError, load_config
-from dm_tools.verbs.calibrate import metres, write_parameters
+from dm_calibration.procedure.forecast import GoodEnough
+from dm_tools.verbs.calibrate import REACHED, metres, source_of, write_parameters
 from dm_tools.verbs.up import shared_config
 
 FOUND = "/**/interferometer:\n  ros__parameters:\n    orientation.rotate_deg: -35.010000\n    orientation.flip_x: true"
@@ -22,27 +23,40 @@ def test_lengths(text: str, value: float) -> None:
     assert metres(text) == pytest.approx(value)
 
 
-@pytest.mark.parametrize("text", ["2", "nm", "2mm", "-2nm", "2e-9", "1.2.3nm", "two nm"])
+@pytest.mark.parametrize("text", ["2", "nm", "2mm", "-2nm", "2e-9", "1.2.3nm", "two nm", "0nm", "0.0um"])
 def test_what_is_no_length(text: str) -> None:
-    with pytest.raises(typer.BadParameter, match="must be a number with pm, nm or um, such as 2nm"):
+    with pytest.raises(typer.BadParameter, match="must be a number above 0 with pm, nm or um, such as 2nm"):
         metres(text)
 
 
 def test_what_a_poke_check_finds_goes_into_a_copy(tmp_path: Path) -> None:
     target = tmp_path / "my_bench.yaml"
-    write_parameters(FOUND, target, None, "virtual-1")  # of the shipped bench, for there is no other
+    write_parameters("", target, source_of(target, None, "virtual-1"))
+    assert not target.exists()
+    write_parameters(FOUND, target, source_of(target, None, "virtual-1"))  # the shipped bench, for there is no other
     found = load_config(target)["interferometer"]
     assert found["orientation.rotate_deg"] == -35.01 and found["orientation.flip_x"] is True
     assert "# m: the whole field of the simulated camera" in target.read_text()
     target.write_text(target.read_text().replace("flip_x: true", "flip_x: false  # of mine"))
-    write_parameters(FOUND, target, None, "virtual-1")  # of the file itself, which is kept
+    write_parameters(FOUND, target, source_of(target, None, "virtual-1"))  # the file itself, which is kept
     assert "flip_x: true  # of mine" in target.read_text()
     assert "flip_x: false  # of mine" in (tmp_path / "my_bench.yaml.before").read_text()
+    write_parameters(FOUND, target, source_of(target, None, "virtual-1"))
+    assert "flip_x: false  # of mine" in (tmp_path / "my_bench.yaml.before").read_text()  # the first is not lost
+    assert "flip_x: true  # of mine" in (tmp_path / "my_bench.yaml.before2").read_text()
 
 
 def test_the_file_of_another_mirror_is_refused(tmp_path: Path) -> None:
     source = tmp_path / "other.yaml"
     shutil.copy(shared_config("bench.yaml"), source)
     with pytest.raises(ConfigError, match=r"is of the mirror 'virtual-1', the nodes run 'T-7'"):
-        write_parameters(FOUND, tmp_path / "new.yaml", source, "T-7")
-    assert not (tmp_path / "new.yaml").exists()
+        source_of(tmp_path / "new.yaml", source, "T-7")
+
+
+def test_what_was_reached_is_one_part_of_a_result_message() -> None:
+    enough = GoodEnough(2e-9)
+    assert enough.sentence(1e-9) == "2 nm is reached: 1 nm"  # no part was long enough to say so
+    enough.reached = [5e-9, 3e-9]
+    for found in (1e-9, 3e-9):
+        sentence = enough.sentence(found)
+        assert "; " not in sentence and REACHED.search(sentence) and sentence.endswith("(part by part 5, 3 nm)")

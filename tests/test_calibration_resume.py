@@ -6,16 +6,20 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from dm_msgs.action import Calibrate
 
+from dm_calibration.calibration_action import CalibrateAction
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.procedure.event_frames import map_hashes, record_hash
+from dm_calibration.procedure.event_frames import Storing, map_hashes, record_hash
 from dm_calibration.procedure.outcome import Event, MapTaken
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -271,3 +275,24 @@ def test_an_interrupted_poke_run_predicts_as_well(law: str, figure: float, tmp_p
     assert parts.held_out_rms < 1.2 * whole.held_out_rms < 1.2 * figure
     difference = np.linalg.norm(parts.influence_sag - whole.influence_sag)
     assert difference < 0.05 * np.linalg.norm(whole.influence_sag)
+
+
+def test_a_run_killed_while_it_was_stored_measures_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may have ended before its plan did: other maps than those that are stored would be refused for ever."""
+    run = opened(tmp_path, POKES)
+    with pytest.raises(PowerCut):
+        procedure(run, POKES, lagging_bench(), cut_before(5)).run()
+    run.journal.keep(Storing("stored", 1))
+    run.journal.close()
+    again = opened(tmp_path, POKES)
+    concluded: list[OpenRun] = []
+    services: Any = SimpleNamespace(rest=lambda _signals: "")
+    action: Any = CalibrateAction(SimpleNamespace(), {}, services, SimpleNamespace(), dict)  # type: ignore[arg-type]
+    unmoved = SimpleNamespace(run=lambda: pytest.fail("the procedure runs again"))
+    monkeypatch.setattr(action, "_opened", lambda *_: again)
+    monkeypatch.setattr(action, "_procedure", lambda *_: (unmoved, lambda *_: None))
+    monkeypatch.setattr(action, "_conclude", lambda _goal, _plan, _mirror, run, *_: concluded.append(run))
+    handle = SimpleNamespace(request=Calibrate.Goal())
+    action._run_kept(handle, POKES, PlanOptions(), MIRROR, None, Calibrate.Result())
+    assert [run.storing for run in concluded] == [Storing("stored", 1)]
+    assert len(again.outcome.records) == 5

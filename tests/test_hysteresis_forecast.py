@@ -11,6 +11,7 @@ import pytest
 from dm_calibration.procedure.forecast import Forecast, GoodEnough, forecast, map_noise
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
+from linear_mirror import make_mirror
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = pytest.mark.slow
@@ -50,6 +51,18 @@ def test_the_data_sheet_lets_expect_something_of_a_mirror_never_calibrated() -> 
     assert whole.maps == len(plan.steps) - 1 and whole.max_zernike < found.max_zernike * 1.01
 
 
+@pytest.mark.parametrize(("rings", "maps"), [(0, 300), (6, 420), (6, 120)])
+def test_mirrors_of_one_actuator_and_of_many(rings: int, maps: int) -> None:
+    """Parts with fewer maps than actuators promise nothing; neither does a mirror without neighbours."""
+    mirror = make_mirror(rings=rings)
+    plan = make_plan(PlanKind.HYSTERESIS, mirror, PlanOptions(hysteresis_maps=maps, until=1e-3))
+    found = forecast(plan, 0.5, None, mirror=mirror, until=1e-3)
+    assert all(np.isfinite(step.signals).all() for step in plan.steps if step.signals is not None)
+    assert found.duration > 0.0
+    assert (found.max_zernike > 0.0) == (maps == 420)
+    assert found.maps == (sorted(plan.ends)[1] - 1 if maps == 420 else 0)
+
+
 def test_a_run_ends_where_it_is_good_enough() -> None:
     bench = SimulatedBench(SIMULATION)
     plan = make_plan(PlanKind.HYSTERESIS, bench.mirror, PlanOptions(hysteresis_maps=240, until=200e-9))
@@ -70,7 +83,7 @@ def test_a_run_that_stands_still_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     enough = GoodEnough(1e-9)
     outcome: Any = SimpleNamespace(maps=lambda: None)
     assert [enough(outcome) for _ in range(4)] == [False, False, False, True]
-    assert "more maps did not help; part by part 9, 5, 4.9, 5 nm" in enough.sentence(4.9e-9)
+    assert "more maps did not help (part by part 9, 5, 4.9, 5 nm)" in enough.sentence(4.9e-9)
 
 
 def test_plans_without_check_moves_promise_nothing() -> None:

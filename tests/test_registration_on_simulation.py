@@ -33,7 +33,11 @@ CAMERA = InterferometerConfig(pixels=260, field_diameter=26e-3, specks=20, blobs
 class MountedMirror:
     """The simulated plate in front of the simulated instrument; `channel` (N,) of each actuator, truly."""
 
-    def __init__(self, plate: PlateConfig, camera: InterferometerConfig, channel: np.ndarray) -> None:
+    def __init__(
+        self, plate: PlateConfig, camera: InterferometerConfig, channel: np.ndarray, tells_pitch: bool = True
+    ) -> None:
+        """Maps that do not tell their pitch show the mirror's aperture and nothing beside it."""
+        self.tells_pitch = tells_pitch
         self.camera = Interferometer(camera, Plate(plate), np.random.default_rng(1), np.random.default_rng(2))
         self.channel = channel
         self.ingest = Ingest(300)
@@ -50,8 +54,12 @@ class MountedMirror:
         return check_fit(calibrate(maps, signals, mirror=MIRROR).fit, MIRROR), maps[-1]
 
     def _map(self, bases: np.ndarray, settings: IngestSettings) -> Measurement:
-        sag = self.camera.measure(bases)
-        return self.ingest.measure(SurfaceMap(sag, CAMERA.wavelength, self.camera.pitch, "simulation"), settings)[1]
+        sag, pitch = self.camera.measure(bases), self.camera.pitch
+        if not self.tells_pitch:
+            away = (np.arange(len(sag)) - 0.5 * (len(sag) - 1)) * pitch
+            sag = np.where(np.hypot(away, away[:, None]) <= RADIUS, sag, np.nan)
+        surface = SurfaceMap(sag, CAMERA.wavelength, pitch if self.tells_pitch else None, "simulation")
+        return self.ingest.measure(surface, settings)[1]
 
 
 def settings_from(values: dict[str, object]) -> IngestSettings:
@@ -60,6 +68,7 @@ def settings_from(values: dict[str, object]) -> IngestSettings:
         orientation=orientation,
         aperture_radius=float(values["aperture.radius"]),  # type: ignore[arg-type]
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),  # type: ignore[arg-type]
+        pitch=float(values.get("pitch", 0.0)),  # type: ignore[arg-type]
     )
 
 
@@ -98,6 +107,19 @@ def test_what_is_found_puts_it_right(
     assert second.registration is not None
     assert abs(second.registration.turn) < np.radians(0.2) and np.hypot(*second.registration.shift) < 1e-4
     assert second.registration.scale == pytest.approx(float(camera.get("mount_scale", 1.0)), abs=0.01)  # type: ignore[arg-type]
+
+
+def test_maps_that_do_not_tell_their_lateral_resolution_are_not_refused_with_the_cure() -> None:
+    wiring = np.arange(37)
+    mounted = MountedMirror(PlateConfig(), replace(CAMERA, mount_angle=0.5), wiring, tells_pitch=False)
+    found, last = mounted.check(IngestSettings(), wiring)
+    assert found.turned and last.pitch == 0.0
+    changes, beyond = poke_cure(found, MIRROR, last, [])
+    assert not beyond
+    cure = yaml.safe_load(parameter_text(changes))["/**/interferometer"]["ros__parameters"]
+    assert cure["pitch"] == pytest.approx(mounted.camera.pitch, rel=0.02)
+    again, _ = mounted.check(settings_from(cure), wiring)
+    assert again.passed, again.findings
 
 
 def test_a_mirror_as_configured_passes() -> None:

@@ -39,7 +39,6 @@ _PHASES = {
     StepKind.CHECK: Calibrate.Feedback.PHASE_HYSTERESIS,
 }
 
-
 #: How long a goal waits for a driver that was started together with this node.
 START_GRACE_S = 5.0
 
@@ -100,7 +99,8 @@ class CalibrateAction:
         run = self._opened(handle.request, plan, options, mirror, runs)
         procedure, report = self._procedure(handle, plan, mirror, run)
         try:
-            procedure.run()
+            if run.storing is None:  # else all is measured, and what may be stored already must stay as it is
+                procedure.run()
             report(Calibrate.Feedback.PHASE_FIT, "fit", len(plan.steps))
             self._conclude(handle.request, plan, mirror, run, runs, report, result)
         except EXPECTED as error:

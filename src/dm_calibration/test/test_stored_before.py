@@ -80,6 +80,7 @@ def test_what_later_maps_changed(store: CalibrationStore) -> None:
     assert manager.begin(calibration) == ""
     updates, fit = manager.updates, manager.changed_fit()
     assert updates is not None
+    assert updates.trust == 1.0  # all of it was used then
     assert fit is not None
     put_updates(message, updates, fit, [], False, 0.0)
     check(message, "updated")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dm_calibration.hysteresis.candidate_fit import PREISACH_AND_DUHEM
 from dm_calibration.hysteresis.features import crept, fading_feature, play_features, relaxation
 from dm_calibration.hysteresis.segments import without
+from dm_calibration.influence.regression import TooFewMapsError
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.optics.zernike import PISTON_TILT
 
@@ -68,15 +69,15 @@ def expected_accuracy(
             seen by itself.
 
     Raises:
-        ValueError: no check moves, or fewer other maps than actuators and features.
+        TooFewMapsError: no check moves, or fewer other maps than actuators and features.
     """
     if not check.any():
-        raise ValueError("check: the run has no moves that test the law")
+        raise TooFewMapsError("check: the run has no moves that test the law")
     start = float(time[0]) - 1.0
     settled = relaxation(time, start)
     gains = np.column_stack((np.ones(len(time)), settled, (time - start) / np.ptp(time), signals))
     if (~check).sum() <= gains.shape[1]:
-        raise ValueError(f"{(~check).sum()} maps: must be more than {gains.shape[1]} to tell gains and figure")
+        raise TooFewMapsError(f"{(~check).sum()} maps: must be more than {gains.shape[1]} to tell gains and figure")
     share = _leverage(gains[~check], gains[check]).mean()
     response = np.eye(signals.shape[1]) if influence is None else influence[PISTON_TILT:].T
     scale, floor = (1.0, 0.0) if influence is None else (noise, FLOOR)

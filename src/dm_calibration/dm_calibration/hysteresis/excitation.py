@@ -94,7 +94,7 @@ def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
     """`shapes` (M, N) drawn to a bowl in the first half of the rows, to its inverse in the second."""
     middle, half_range = mirror.limits.middle, mirror.limits.half_range
     squares = mirror.x**2 + mirror.y**2
-    bowl = 2.0 * squares / squares.max() - 1.0
+    bowl = 2.0 * squares / (squares.max() or 1.0) - 1.0
     share = float(_gentle(mirror, bowl))
     bowl = share * bowl - (1.0 - share)  # its middle at the end of the range
     sign = np.where(np.arange(len(shapes)) < len(shapes) // 2, 1.0, -1.0)
@@ -104,7 +104,7 @@ def _bowls(mirror: Mirror, shapes: Floats) -> Floats:
 def _as_in_use(mirror: Mirror, count: int, rng: np.random.Generator) -> Floats:
     """(count, N) bowls with some astigmatism, coma and scatter about any common level, inside the limits."""
     middle, half_range = mirror.limits.middle, mirror.limits.half_range
-    reach = float(np.hypot(mirror.x, mirror.y).max())
+    reach = float(np.hypot(mirror.x, mirror.y).max()) or 1.0
     x, y = mirror.x / reach, mirror.y / reach
     patterns = np.stack((2.0 * (x**2 + y**2) - 1.0, x**2 - y**2, 2.0 * x * y, x * (3.0 * (x**2 + y**2) - 2.0)))
     size = rng.uniform(-1.0, 1.0, (count, len(patterns))) * np.array([0.7, 0.1, 0.1, 0.05])

@@ -42,6 +42,7 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
             "orientation.flip_y": orientation.flip_y,
             "orientation.rotate_deg": round(orientation.rotate_deg, 2),
         }
+        # Without a lateral resolution of its own the valid region counts as the mirror's aperture.
         metres = last.pitch or (mirror.working_radius / last.radius_px if last.radius_px else 0.0)
         middle = 0.5 * (np.array(last.camera) - 1.0)
         aperture = complex(last.centre[0] - middle[0], middle[1] - last.centre[1]) * metres
@@ -51,7 +52,9 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
         if found.mirrored:
             centre = -centre.conjugate()
         reach = np.abs((seen.real, seen.imag)) + (1.0 - OVERHANG) * mirror.working_radius
-        if (reach > (middle + 0.5) * metres).any():
+        if not metres:
+            beyond = "the lateral resolution of the maps is not known, so the aperture stays as it is: set pitch"
+        elif (reach > (middle + 0.5) * metres).any():
             beyond = (
                 "the maps end before the working aperture does when it is centred on the mirror: move the mirror or "
                 f"the camera by {-1e3 * seen.real:+.2f} mm in x and {-1e3 * seen.imag:+.2f} mm in y of the maps"
@@ -62,6 +65,8 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
                 "aperture.centre_x": round(centre.real, 6),
                 "aperture.centre_y": round(centre.imag, 6),
             }
+            if not last.pitch:  # a map without one is refused when the aperture is given in m
+                changes["interferometer"]["pitch"] = float(metres)
     own = np.arange(check.place.size)
     if len(channels) == own.size and (check.place != own).any():
         # The channel that is configured for actuator i moves the one at place[i].
@@ -86,4 +91,4 @@ def _literal(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     # Always with a point and without an exponent: else YAML 1.1 makes a string, or ROS 2 an integer, of it.
-    return f"{value:.6f}" if isinstance(value, float) else str(value)
+    return np.format_float_positional(value, precision=12, min_digits=6) if isinstance(value, float) else str(value)

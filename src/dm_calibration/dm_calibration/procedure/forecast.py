@@ -77,13 +77,20 @@ def forecast(
         noise, influence = map_noise(earlier.maps), earlier.fit.influence_zernike
     else:
         assert mirror is not None
+        if mirror.x.size < 2:  # no neighbour whose distance tells the width of a bump
+            return Forecast(duration, 0.0)
         noise, influence = TYPICAL_NOISE, typical_influence(mirror)
     parts = [*(end - 1 for end in sorted(plan.ends)), len(steps)]  # the degauss is no step here
+    expected = Forecast(duration, 0.0)
     for part in parts:
-        found = expected_accuracy(np.array(signals[:part]), time[:part], check[:part], noise, influence)
+        try:
+            found = expected_accuracy(np.array(signals[:part]), time[:part], check[:part], noise, influence)
+        except TooFewMapsError:  # nor does the run end there
+            continue
+        expected = Forecast(float(time[part - 1]), found.max_zernike, part)
         if found.max_zernike <= until:
             break
-    return Forecast(float(time[part - 1]), found.max_zernike, part)
+    return expected
 
 
 def typical_influence(mirror: Mirror) -> Floats:
@@ -126,11 +133,12 @@ class GoodEnough:
 
     def sentence(self, found: float) -> str:
         """What a run that ended at `found` (m) has reached of what was asked."""
-        if found <= self._until:
-            return f"{self._until * 1e9:.2g} nm is reached: {found * 1e9:.2g} nm"
         way = ", ".join(f"{value * 1e9:.2g}" for value in self.reached)
-        why = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
-        return f"{self._until * 1e9:.2g} nm is not reached, {found * 1e9:.2g} nm is: {why}; part by part {way} nm"
+        parts = f" (part by part {way} nm)" if way else ""
+        if found <= self._until:
+            return f"{self._until * 1e9:.2g} nm is reached: {found * 1e9:.2g} nm{parts}"
+        reason = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
+        return f"{self._until * 1e9:.2g} nm is not reached, {found * 1e9:.2g} nm is: {reason}{parts}"
 
 
 def map_noise(maps: MapSet) -> float:

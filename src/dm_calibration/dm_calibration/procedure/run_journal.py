@@ -160,6 +160,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     identity = content.get("identity")
     if isinstance(identity, dict) and "memory_maps" in identity.get("plan_options", ()):  # its name before 0.2
         identity["plan_options"]["hysteresis_maps"] = identity["plan_options"].pop("memory_maps")
+        identity["plan_options"].setdefault("until", 0.0)  # no run ended early then
         if identity.get("plan") == "MEMORY":
             identity["plan"] = "HYSTERESIS"
     return content

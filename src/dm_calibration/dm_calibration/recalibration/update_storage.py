@@ -18,9 +18,8 @@ SCHEMA_VERSION = 1
 
 _ARRAYS = ("gain", "offset", "covariance")
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
-#: Not in files of before there were such figures: what they hold was used, and is.
-_EVIDENCE = ("foretold", "borne_out")
-_BEFORE = 100.0
+#: Not in files of before there were such figures: what they hold was used whole, and is: a trust of exactly 1.
+_EVIDENCE = {"foretold": 100.0, "borne_out": 110.0}
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
 
@@ -83,7 +82,7 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         shape = getattr(like, name).shape
         if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
-    evidence = {name: attributes.get(name, _BEFORE) for name in _EVIDENCE}
+    evidence = {name: attributes.get(name, before) for name, before in _EVIDENCE.items()}
     for name, number in evidence.items():
         if not isinstance(number, float) or not np.isfinite(number):
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")

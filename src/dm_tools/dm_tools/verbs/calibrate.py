@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from enum import StrEnum
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +14,9 @@ import typer
 from dm_common.errors import ErrorCode
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, progress_bar, write_json
 from dm_tools.running_suite import promise, running_suite
+
+#: What tells the sentence of a result on what --until asked for.
+REACHED = re.compile(r"^\S+ nm is (not )?reached")
 
 
 class CalibrationPlan(StrEnum):
@@ -52,19 +57,19 @@ def run_calibration(client: Any, goal: Any) -> Any:
 
 
 def metres(text: str) -> float:
-    """A length with its unit, such as 2nm, in m.
+    """A length above 0 with its unit, such as 2nm, in m.
 
     Raises:
-        typer.BadParameter: another form, or a unit that is none of a surface.
+        typer.BadParameter: another form, 0, or a unit that is none of a surface.
     """
     found = re.fullmatch(r"\s*(\d+|\d*\.\d+)\s*(pm|nm|um)\s*", text)
-    if found is None:
-        raise typer.BadParameter(f"--until {text!r}: must be a number with pm, nm or um, such as 2nm")
+    if found is None or float(found[1]) == 0.0:
+        raise typer.BadParameter(f"--until {text!r}: must be a number above 0 with pm, nm or um, such as 2nm")
     return float(found[1]) * {"pm": 1e-12, "nm": 1e-9, "um": 1e-6}[found[2]]
 
 
-def start_fresh(client: Any) -> None:
-    """Have the next goal begin anew.
+def start_fresh(client: Any, fresh: bool = True) -> None:
+    """Have the next goal begin anew, or not.
 
     Raises:
         DeformableMirrorError: the node does not answer, or refuses.
@@ -80,9 +85,9 @@ def start_fresh(client: Any) -> None:
         raise DeformableMirrorError(
             ErrorCode.INTERNAL, "the node `calibration` does not answer: is it running (./dm up)?"
         )
-    answer = parameters.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, True)])
+    answer = parameters.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, fresh)])
     if not client.wait(answer.done) or not all(each.successful for each in answer.result().results):
-        raise DeformableMirrorError(ErrorCode.INTERNAL, "the node `calibration` did not take start_fresh = true")
+        raise DeformableMirrorError(ErrorCode.INTERNAL, "the node `calibration` did not take start_fresh")
 
 
 def show_result(result: Any) -> None:
@@ -108,8 +113,8 @@ def show_result(result: Any) -> None:
         console.print("poke check: wiring and orientation are as configured")
 
 
-def write_parameters(parameters: str, target: Path, config: Path | None, serial: str) -> None:
-    """Write the parameter file `target` with the `parameters` that a poke check found; comments are kept.
+def source_of(target: Path, config: Path | None, serial: str) -> Path:
+    """The parameter file from which :func:`write_parameters` makes `target`.
 
     Args:
         config: the file that the nodes run with; None = `target` where there is one, else that of the virtual bench.
@@ -117,11 +122,7 @@ def write_parameters(parameters: str, target: Path, config: Path | None, serial:
 
     Raises:
         ConfigError: the file cannot be used, or is of another mirror.
-        OSError: it cannot be written.
     """
-    import yaml
-
-    from dm_bringup.config_edit import edited
     from dm_bringup.suite import ConfigError, load_config
     from dm_tools.verbs.up import shared_config
 
@@ -129,14 +130,38 @@ def write_parameters(parameters: str, target: Path, config: Path | None, serial:
     written = str(load_config(source).get("pdm_driver", {}).get("mirror.serial", ""))
     if written != serial:
         raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
+    return source
+
+
+def write_parameters(parameters: str, target: Path, source: Path) -> None:
+    """Write the parameter file `target`: `source` with the `parameters` that a poke check found; comments are kept.
+
+    What stood at `target` is kept beside it, and nothing that was kept so before is lost.
+
+    Raises:
+        ConfigError: `source` cannot be changed without losing its form.
+        OSError: it cannot be written; what stood at `target` still does.
+    """
+    import yaml
+
+    from dm_bringup.config_edit import edited
+    from dm_calibration.store.atomic_write import write_whole
+
+    if not parameters:
+        console.print(f"no parameter has to be changed: {target} is not written")
+        return
     changes = yaml.safe_load(parameters) or {}
     plain = {key.rsplit("/", 1)[-1]: section["ros__parameters"] for key, section in changes.items()}
     text = edited(source.read_text(), plain)
     if target.exists():
         before = target.with_name(target.name + ".before")
-        before.write_text(target.read_text())
+        for number in count(2):
+            if not before.exists():
+                break
+            before = target.with_name(f"{target.name}.before{number}")
+        write_whole(before, target.read_bytes())
         console.print(f"{target} as it was is kept as {before}")
-    target.write_text(text)
+    write_whole(target.resolve(), text.encode())
     console.print(f"{target} is written from {source}: start the nodes with it, then check again")
 
 
@@ -228,6 +253,7 @@ def calibrate(
         note=note,
     )
     with running_suite(namespace) as client:
+        source = source_of(write, config, client.mirror_info.serial) if write is not None and not dry_run else None
         if fresh and not dry_run:
             start_fresh(client)
         try:
@@ -235,11 +261,12 @@ def calibrate(
         except DeformableMirrorError as error:
             if error.response is not None:
                 show_result(error.response)
-                if write is not None and error.response.parameters:
-                    write_parameters(error.response.parameters, write, config, client.mirror_info.serial)
+                if write is not None and source is not None and error.response.parameters:
+                    write_parameters(error.response.parameters, write, source)
+            if fresh and not dry_run:  # refused before it began, it would hold for somebody else's goal
+                with suppress(DeformableMirrorError):
+                    start_fresh(client, False)
             raise
-        if write is not None and result.parameters:
-            write_parameters(result.parameters, write, config, client.mirror_info.serial)
     if dry_run:
         console.print(result.message)
     else:
@@ -247,8 +274,10 @@ def calibrate(
             console.print(result.message.partition(";")[0])
         show_result(result)
         if until:
-            console.print(next(part for part in result.message.split("; ") if "reached" in part))
+            console.print(next((part for part in result.message.split("; ") if REACHED.search(part)), ""))
     write_json(json, {"calibration": figures_of(result)})
+    if write is not None and source is not None:
+        write_parameters(result.parameters, write, source)
     if dry_run:
         next_step("the same without --dry-run measures")
     elif result.id:
