@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 import typer
-from dm_msgs.msg import FocusState
+from dm_msgs.msg import ActuatorState, FocusState
 from typer.testing import CliRunner
 
 from dm_client import DeformableMirrorError
@@ -20,7 +21,7 @@ from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import Standing, holder, naming_holder, standing, verdict
 from dm_tools.verbs.focus import _show
-from dm_tools.verbs.report import newest_store
+from dm_tools.verbs.report import folder_with, newest_store
 from test_console_external_goals import EXECUTING, FakeNode, Goal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,9 +113,13 @@ class FakeClient:
     def __init__(self, busy: bool) -> None:
         self.node: Any = FakeNode()
         self._busy = busy
+        state = (
+            ActuatorState(holder="calibration", holding="calibration has held the mirror for 12 s") if busy else None
+        )
+        self.messages = {"actuator_state": state or ActuatorState()}
 
     def wait(self, condition: Any, _timeout_s: float) -> bool:
-        if self._busy:
+        if self._busy and "calibrate/_action/status" in self.node.callbacks:
             goal = Goal(self.node, 1)
             goal.tell(EXECUTING)
             feedback = SimpleNamespace(step=12, steps=86, residual_rms=0.0)
@@ -124,10 +129,13 @@ class FakeClient:
 
 def test_who_holds_the_mirror_is_named() -> None:
     client: Any = FakeClient(busy=True)
-    refusal = DeformableMirrorError(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
-    with pytest.raises(DeformableMirrorError, match=r"a calibration \(step 12 of 86\) has the mirror"):
+    busy = DeformableMirrorError(ErrorCode.BUSY, "refused")
+    with pytest.raises(DeformableMirrorError, match=r"has held the mirror for 12 s \(step 12 of 86\): wait"):
         with naming_holder(client):
-            raise refusal
+            raise busy
+    refusal = DeformableMirrorError(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
+    with pytest.raises(DeformableMirrorError, match="no calibration is in use"), naming_holder(client):
+        raise refusal
     idle: Any = FakeClient(busy=False)
     assert holder(idle) is None
     with pytest.raises(DeformableMirrorError, match="no calibration is in use"), naming_holder(idle):
@@ -137,6 +145,9 @@ def test_who_holds_the_mirror_is_named() -> None:
 def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixture[str]) -> None:
     assert "promised 97 nm (95 % bound, λ/7), measured 1.3 nm: " in verdict(97e-9, 1.3e-9)
     assert "inside" in verdict(97e-9, 1.3e-9) and "outside" in verdict(1e-9, 1.3e-9)
+    assert "promised 153 nm (95 % bound, λ/4), measured 100 nm: " in verdict(153.2e-9, 99.7e-9)
+    assert "1266 nm (95 % bound, 2 λ)" in verdict(1265.6e-9, 1e-9)
+    assert verdict(0.0, 1e-9) == "promised not known, measured 1 nm"
     _show(FocusState(curvature=0.02, power=0.04, predicted_max_zernike_upper=1.3e-9, history_known=True))
     said = capsys.readouterr().out
     assert "promised 1.3 nm (95 % bound, λ/487)" in said and "0.00 nm" not in said
@@ -156,3 +167,8 @@ def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> Non
     newer.mkdir()
     (newer / "c.h5").touch()
     assert newest_store((older, newer)) == newer
+    older.mkdir()
+    (older / "b.h5").touch()
+    os.utime(older / "b.h5", (0, 0))
+    assert folder_with("b", (newer, older)) == older
+    assert folder_with("", (older, newer)) == folder_with("d", (older, newer)) == newer

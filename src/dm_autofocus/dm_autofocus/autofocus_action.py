@@ -71,6 +71,7 @@ class AutofocusAction:
         optics: FocusOptics,
         publish: Callable[[Phase, SharpnessSample], None],
     ) -> None:
+        self._log = node.get_logger()
         self._probe = probe
         self._values = values
         self._optics = optics
@@ -91,12 +92,14 @@ class AutofocusAction:
         try:
             config, region = self._config(goal_handle.request)
             with self._probe.held():
-                peak, config = self._search(goal_handle, config, region)
+                peak, config, swept = self._search(goal_handle, config, region)
                 self._fill(result, peak)
                 if goal_handle.request.track:
                     self._track(goal_handle, config, region, peak, result)
             outcome, result.error_code = "succeed", ErrorCode.OK
             result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}"
+            if swept:
+                result.message += f"; the range was swept: {swept}"
             if peak.at_limit:
                 result.message += "; at the end of the range: the object may lie beyond it"
         except Refusal as error:
@@ -138,11 +141,14 @@ class AutofocusAction:
         except ValueError as error:
             raise Refusal(ErrorCode.OUT_OF_RANGE, str(error)) from error
 
-    def _search(self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region) -> tuple[Peak, SearchConfig]:
+    def _search(
+        self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region
+    ) -> tuple[Peak, SearchConfig, str]:
         """Search from beginning to end and stand on the peak; without one, where the mirror stood before.
 
         Returns:
-            The peak, and the search with the range that was possible: it depends on the actuators' history too.
+            The peak; the search with the range that was possible, which depends on the actuators' history too; the
+            reason why the range was swept, "" = it was not.
         """
         before = self._probe.curvature
         approach = self._values["search.approach"]
@@ -165,6 +171,8 @@ class AutofocusAction:
             phase, sample = search.phase, self._measure(goal_handle, region)
             search.feed(sample.sharpness, sample.regions)
             self._report(goal_handle, phase, sample, step.curvature, search.measured, search.steps)
+        if search.reason:
+            self._log.info(f"the range was swept: {search.reason}")
         if search.peak is None:
             if math.isfinite(before):
                 self._go(goal_handle, before)
@@ -174,25 +182,29 @@ class AutofocusAction:
                 "the range; the mirror is back where it was",
             )
         self._go(goal_handle, search.step.curvature)
-        return search.peak, search.config
+        return search.peak, search.config, search.reason
 
-    def _model(self, config: SearchConfig, region: Region) -> DefocusModel | None:
-        """How images of the region are blurred; None = not known."""
+    def _model(self, config: SearchConfig, region: Region) -> DefocusModel | str:
+        """How images of the region are blurred, or the reason why that is not known."""
         values, capabilities = self._values, ready_capabilities(self._probe)
         image, info = self._probe.newest, self._probe.camera_info
+        if not values["search.few_images"]:
+            return "search.few_images is false"
+        if image is None:
+            return "there was no image yet to show its size"
         focal_length = values["optics.focal_length_px"]
         if focal_length == 0 and info is not None:
             focal_length = info.k[0] / max(info.binning_x, 1)
-        if not (values["search.few_images"] and focal_length > 0 and image is not None):
-            return None
+        if not focal_length > 0:
+            return f"optics.focal_length_px is 0, and camera_info {'came not yet' if info is None else 'holds no fx'}"
         # Behind a relay that widens the beam m times, angles are m times smaller.
         focal_length *= values["optics.relay_magnification"]
         lens = FocusLens(capabilities.aperture_radius, values["optics.wavelength"], focal_length)
         try:
             shape = cut(np.empty((image.height, image.width), np.uint8), region).shape
             return DefocusModel(shape, lens, config.high - config.low + BEYOND * config.tolerance)
-        except ValueError:  # too small, and what measures the image says so where it matters
-            return None
+        except ValueError as error:  # too small
+            return str(error)
 
     def _stands_where_sent(self) -> bool:
         """Whether the mirror has the curvature that was asked for, by what the controller answered last."""
@@ -227,7 +239,7 @@ class AutofocusAction:
             self._report(goal_handle, Phase.TRACK, sample, wanted, 0, 0)
             if tracker.lost:
                 try:
-                    peak, config = self._search(goal_handle, config, region)
+                    peak, config, _swept = self._search(goal_handle, config, region)
                     position = peak.curvature
                 except Refusal as error:
                     if error.error_code != ErrorCode.NOT_CONVERGED:

@@ -32,6 +32,15 @@ SAMPLES, NODES, STEP = 5, 96, 0.25
 #: A real pupil's transfer lies anywhere below the largest of the ideal one over defocuses that differ by this share.
 SPREAD = 0.17
 
+#: Relative error of the transfer; of the noise, between images; leakage of power from lower bands.
+TRANSFER_ERROR, NOISE_ERROR, LEAKAGE = 0.25, 0.05, 0.002
+#: The same between images that are nearly alike, on either side of the focus.
+TRANSFER_ERROR_NEAR = 0.1
+#: Images differ in their noise by this factor at most, as their brightness flickers.
+NOISE_RATIO = 1.1
+#: Power that is none.
+TINY = 1e-18
+
 
 @dataclass(frozen=True)
 class FocusLens:
@@ -129,6 +138,48 @@ class DefocusModel:
             table[first] * (1 - rest) + table[first + 1] * rest for table in (self._transfer, self._envelope)
         )
         return transfer, envelope
+
+    def judge(self, grid: Floats, places: Floats, powers: Floats, error: float) -> tuple[Floats, float]:
+        """What images say about where the object is.
+
+        Args:
+            grid: places of the object that are thought of [1/m], (G,).
+            places: where the images were taken [1/m], (I,).
+            powers: of the images, (I, K).
+            error: relative, of the transfer.
+
+        Returns:
+            The misfit of each place of the grid, (G,): twice the negative logarithm of its likelihood; and by how much
+            the best place explains the images better than a scene that focus does not change.
+        """
+        lowest = powers[:, -3:].min(1)
+        noise = np.minimum(lowest, NOISE_RATIO * lowest.min())[:, None]
+        signal = powers - noise
+        leaked = np.maximum.accumulate(np.maximum(signal, 0), axis=1)
+        leaked = LEAKAGE * np.pad(leaked, ((0, 0), (1, 0)))[:, :-1]
+        floor = noise**2 * (1 / self.modes + NOISE_ERROR**2) + leaked**2 + TINY
+        shares, envelopes = self.transfer(grid[:, None] - places)
+        misfit = self._misfit(signal, noise, floor, shares, envelopes, error)
+        flat = np.ones((1, *powers.shape))
+        return misfit, float(self._misfit(signal, noise, floor, flat, flat, error)[0] - misfit.min())
+
+    def _misfit(
+        self, signal: Floats, noise: Floats, floor: Floats, shares: Floats, envelopes: Floats, error: float
+    ) -> Floats:
+        """Twice the negative log likelihood (G,) of the signals (I, K) where shares (G, I, K) of the texture pass.
+
+        The texture's power in each band is the one that fits best. Its variance follows from itself: a few rounds.
+        """
+        modes = self.modes
+        guess = np.maximum(signal, 0)
+        variance = floor + 2 * noise * guess / modes + (error * guess) ** 2
+        for _round in range(4):
+            weight = shares / variance
+            texture = np.sum(weight * signal, 1) / np.maximum(np.sum(weight * shares, 1), 1e-300)
+            texture = np.maximum(texture, 0)[:, None]
+            expected = texture * shares
+            variance = floor + (2 * noise + expected) * expected / modes + (error * texture * envelopes) ** 2
+        return np.sum((signal - expected) ** 2 / variance + np.log(variance), axis=(1, 2))
 
 
 def _band_edges(side: int) -> Floats:

@@ -4,31 +4,24 @@ A state machine as `search.PeakSearch`, for a mirror that stands where it is sen
 every possible place of the object (`DefocusModel`): the texture's own power in each band is taken as whatever explains
 the images best, so only ratios between images count (depth from defocus [31, 32]). The next image is taken at the most
 probable place, or in the widest gap while nothing was seen that changes with focus. An image on either side then
-confirms it: the top must stand above both, and the parabola through them gives the place.
+confirms it: the top must stand above both. The place is the mean of the probability that the images near it leave.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_autofocus.defocus_model import DefocusModel, Floats
-from dm_autofocus.search import RETREAT, Peak, PeakSearch, Phase, SearchConfig, Step
+from dm_autofocus.defocus_model import TRANSFER_ERROR, TRANSFER_ERROR_NEAR, DefocusModel, Floats
+from dm_autofocus.search import MOST_REFUSALS, RETREAT, Peak, PeakSearch, Phase, SearchConfig, Step
 
-#: Relative error of the transfer; of the noise, between images; leakage of power from lower bands.
-TRANSFER_ERROR, NOISE_ERROR, LEAKAGE = 0.25, 0.05, 0.002
-#: The same between images that are nearly alike, on either side of the focus.
-TRANSFER_ERROR_NEAR = 0.1
-#: Images differ in their noise by this factor at most, as their brightness flickers.
-NOISE_RATIO = 1.1
 #: How much better than a scene that does not change with focus a place must explain the images (twice a log ratio).
 EVIDENCE = 25.0
-#: Power that is none.
-TINY = 1e-18
-#: Images at most, and in most searches.
+#: Images at most from where they change with focus on, and in most searches.
 MOST_IMAGES, EXPECTED_IMAGES = 15, 6
 #: Step to either side of the focus, and how far beyond the range objects are thought of, in depths of focus.
 SIDE, BEYOND = 4.5, 10.0
@@ -66,6 +59,7 @@ class DefocusSearch:
         self._powers: list[Floats] = []
         self._sharpness: list[float] = []
         self._refusals = 0
+        self._blind = 0  # images until the last that left it open whether focus changes anything
         quarter = (config.high - config.low) / 4
         below, above = config.low + quarter, config.high - quarter
         self._first = (above, below) if abs(start - above) < abs(start - below) else (below, above)
@@ -87,19 +81,27 @@ class DefocusSearch:
         if self.measured < 2:
             self.step = Step(self._first[1])
             return
-        self._aim(*self._judge(self._grid, np.full(self.measured, True), TRANSFER_ERROR))
+        places, powers = np.array(self._places), np.array(self._powers)
+        self._aim(*self._model.judge(self._grid, places, powers, TRANSFER_ERROR))
 
     def refuse(self) -> None:
-        """Report that the mirror cannot take `step`: the range ends before it."""
-        self._refusals += 1
+        """Report that the mirror cannot take `step`: the range ends before it.
+
+        Raises:
+            ValueError: hardly anything of the range is left.
+        """
         config, here = self.config, self.step.curvature
         step = RETREAT * (config.high - config.low)
         if here < (config.low + config.high) / 2:
             self.config = replace(config, low=here + step)
         else:
             self.config = replace(config, high=here - step)
-        self.step = Step(float(np.clip(here, self.config.low, self.config.high)))
-        if self._refusals > MOST_IMAGES:
+        low, high = self.config.low, self.config.high
+        if high - low < 2 * config.tolerance:
+            raise ValueError(f"range = {low:+.4f} to {high:+.4f} 1/m: too little of it is left")
+        self.step = Step(float(np.clip(here, low, high)))
+        self._refusals += 1
+        if self._refusals > MOST_REFUSALS:
             self._give_up("the mirror refuses too much of the range")
 
     def _aim(self, misfit: Floats, evidence: float) -> None:
@@ -110,15 +112,19 @@ class DefocusSearch:
             evidence: by how much the best place explains the images better than a scene that focus does not change.
         """
         config, tolerance = self.config, self.config.tolerance
-        places, sharpness = np.array(self._places), np.array(self._sharpness)
+        places = np.array(self._places)
+        # Where the range was drawn in since, an image may lie beyond it: nothing is sought there.
+        inside = (places >= config.low) & (places <= config.high)
+        sharpness = np.where(inside, self._sharpness, -np.inf)
         if evidence < EVIDENCE:
+            self._blind = self.measured
             self._fill_gap(places)
             return
         _place, spread = _mean_and_spread(self._grid, misfit)
         best = float(np.clip(self._grid[misfit.argmin()], config.low, config.high))
         side = float(np.clip(2 * spread, SIDE * tolerance, 2 * SIDE * tolerance))
         near = np.abs(places - best) < 2 * side
-        if np.abs(places - best).min() > 0.4 * side:
+        if np.where(inside, np.abs(places - best), np.inf).min() > 0.4 * side:
             self._go(best)
         else:
             self.phase = Phase.FINE
@@ -129,7 +135,7 @@ class DefocusSearch:
         tolerance, offset = self.config.tolerance, places - places[top]
         three = [top]
         for sign in (-1, 1):
-            within = (sign * offset > 0.4 * side) & (sign * offset < 2 * side)
+            within = np.isfinite(sharpness) & (sign * offset > 0.4 * side) & (sign * offset < 2 * side)
             if within.any():
                 three.append(int(np.where(within, np.abs(np.abs(offset) - side), np.inf).argmin()))
                 continue
@@ -144,9 +150,9 @@ class DefocusSearch:
         near = np.abs(offset) < 2 * side
         grid = places[top] + tolerance * np.arange(-SIDE, SIDE, 0.125)
         grid = grid[(grid >= self.config.low) & (grid <= self.config.high)]
-        misfit, _evidence = self._judge(grid, near, TRANSFER_ERROR_NEAR)
+        misfit, _evidence = self._model.judge(grid, places[near], np.array(self._powers)[near], TRANSFER_ERROR_NEAR)
         place, spread = _mean_and_spread(grid, misfit)
-        if spread > PRECISION * tolerance and self.measured < MOST_IMAGES:
+        if spread > PRECISION * tolerance and self._more:
             for wanted in (place - side, place + side, place):
                 if self.config.low <= wanted <= self.config.high and np.abs(places - wanted).min() > 0.3 * side:
                     self.step = Step(wanted)
@@ -157,17 +163,30 @@ class DefocusSearch:
         self.done = True
 
     def _fill_gap(self, places: Floats) -> None:
-        """Next the middle of the widest gap; the end where none is wide enough to hide a focus."""
-        ends = np.sort([self.config.low, *places, self.config.high])
+        """Next the middle of the widest gap; the end where none is wide enough to hide a focus.
+
+        Gaps are divided into equal parts, not halved: so no more images are needed than a sweep takes.
+        """
+        low, high, points = self.config.low, self.config.high, self.config.coarse_points
+        ends = np.sort([low, *np.clip(places, low, high), high])
         gap = int(np.diff(ends).argmax())
-        if np.diff(ends)[gap] <= (self.config.high - self.config.low) / (self.config.coarse_points - 1):
+        width = float(np.diff(ends)[gap])
+        parts = math.ceil(width * (points - 1) / (high - low) - 1e-6)
+        if parts < 2:
             self.done = True
             self.step = Step(float(places[-1]))
+        elif self.measured >= points:
+            self._give_up("so many images do not say whether focus changes them")
         else:
-            self.step = Step(float(ends[gap : gap + 2].mean()))
+            self.step = Step(float(ends[gap]) + width * (parts // 2) / parts)
+
+    @property
+    def _more(self) -> bool:
+        """Whether another image may be taken."""
+        return self.measured - self._blind < MOST_IMAGES
 
     def _go(self, place: float) -> None:
-        if self.measured < MOST_IMAGES:
+        if self._more:
             self.step = Step(place)
         else:
             self._give_up("the optics do not explain how the images change with focus")
@@ -175,57 +194,25 @@ class DefocusSearch:
     def _give_up(self, reason: str) -> None:
         self.gave_up, self.done = reason, True
 
-    def _judge(self, grid: Floats, taken: NDArray[np.bool_], error: float) -> tuple[Floats, float]:
-        """Misfit of each place of a grid (G,), and the evidence that focus changes anything, by the images `taken`."""
-        powers = np.array(self._powers)[taken]
-        lowest = powers[:, -3:].min(1)
-        noise = np.minimum(lowest, NOISE_RATIO * lowest.min())[:, None]
-        signal = powers - noise
-        leaked = np.maximum.accumulate(np.maximum(signal, 0), axis=1)
-        leaked = LEAKAGE * np.pad(leaked, ((0, 0), (1, 0)))[:, :-1]
-        floor = noise**2 * (1 / self._model.modes + NOISE_ERROR**2) + leaked**2 + TINY
-        shares, envelopes = self._model.transfer(grid[:, None] - np.array(self._places)[taken])
-        misfit = self._misfit(signal, noise, floor, shares, envelopes, error)
-        flat = np.ones((1, *powers.shape))
-        return misfit, float(self._misfit(signal, noise, floor, flat, flat, error)[0] - misfit.min())
-
-    def _misfit(
-        self, signal: Floats, noise: Floats, floor: Floats, shares: Floats, envelopes: Floats, error: float
-    ) -> Floats:
-        """Twice the negative log likelihood (G,) of the signals (I, K) where shares (G, I, K) of the texture pass.
-
-        The texture's power in each band is the one that fits best. Its variance follows from itself: a few rounds.
-        """
-        modes = self._model.modes
-        guess = np.maximum(signal, 0)
-        variance = floor + 2 * noise * guess / modes + (error * guess) ** 2
-        for _round in range(4):
-            weight = shares / variance
-            texture = np.sum(weight * signal, 1) / np.maximum(np.sum(weight * shares, 1), 1e-300)
-            texture = np.maximum(texture, 0)[:, None]
-            expected = texture * shares
-            variance = floor + (2 * noise + expected) * expected / modes + (error * texture * envelopes) ** 2
-        return np.sum((signal - expected) ** 2 / variance + np.log(variance), axis=(1, 2))
-
 
 class FocusSearch:
     """A search from a few images where that is possible, and else, or when it gives up, a `PeakSearch`.
 
     Args:
         config: of both.
-        model: of the camera; None = it is not known.
+        model: of the camera, or the reason why there is none.
         start: where the mirror stands [1/m]; NaN = not known.
 
     Attributes:
         reason: why the range is swept; "" = it is not.
     """
 
-    def __init__(self, config: SearchConfig, model: DefocusModel | None, start: float) -> None:
+    def __init__(self, config: SearchConfig, model: DefocusModel | str, start: float) -> None:
         self.reason = ""
         self._before = 0
         self._search: DefocusSearch | PeakSearch
-        if model is None:
-            self._search, self.reason = PeakSearch(config), "optics.focal_length_px is not known"
+        if isinstance(model, str):
+            self._search, self.reason = PeakSearch(config), model
         else:
             self._search = DefocusSearch(config, model, start)
 
@@ -272,17 +259,21 @@ class FocusSearch:
             return
         assert sharpness is not None
         self._search.feed(sharpness, images)
-        if self._search.gave_up:
-            self.sweep(self._search.gave_up, 0.0)
+        self._sweep_after_all()
 
     def refuse(self) -> None:
         """Report that the mirror cannot take `step`. Raises ValueError when hardly anything of the range is left."""
         self._search.refuse()
+        self._sweep_after_all()
 
     def sweep(self, reason: str, approach: float) -> None:
         """Sweep the range instead, each sweep from `approach` [1/m] below it."""
         self.reason, self._before = reason, self.measured
         self._search = PeakSearch(replace(self.config, approach=approach))
+
+    def _sweep_after_all(self) -> None:
+        if isinstance(self._search, DefocusSearch) and self._search.gave_up:
+            self.sweep(self._search.gave_up, 0.0)
 
 
 def _mean_and_spread(grid: Floats, misfit: Floats) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -87,7 +88,31 @@ def test_nothing_to_see_ends_without_a_focus_and_without_a_sweep(model: DefocusM
     search = FocusSearch(CONFIG, model, 0.0)
     visited = run(search, DefocusedCamera(np.ones((2 * SIDE, 2 * SIDE)), 0.0, noise))
     assert (search.peak, search.reason) == (None, "")
-    assert np.diff(np.sort([LOW, *visited, HIGH])).max() <= 0.1 * (HIGH - LOW)
+    assert np.diff(np.sort([LOW, *visited, HIGH])).max() <= 0.1001 * (HIGH - LOW)
+
+
+@pytest.mark.parametrize("points", [11, 14, 18])
+def test_nothing_to_see_takes_no_more_images_than_a_sweep(model: DefocusModel, points: int) -> None:
+    search = FocusSearch(replace(CONFIG, coarse_points=points), model, 0.0)
+    visited = run(search, DefocusedCamera(np.ones((2 * SIDE, 2 * SIDE)), 0.0, 0.01))
+    assert search.done and len(visited) <= points
+
+
+def test_what_is_seen_only_after_many_images_is_searched_and_not_swept(
+    model: DefocusModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Images count from where they change with focus; those that leave it open send no search away."""
+    monkeypatch.setattr(defocus_search, "MOST_IMAGES", 6)
+    search = FocusSearch(replace(CONFIG, coarse_points=18), model, 0.0)
+    camera = DefocusedCamera(clouds(), 0.0)
+    monkeypatch.setattr(defocus_search, "EVIDENCE", math.inf)
+    for _image in range(10):
+        image = camera.expose(search.step.curvature)
+        search.feed(tenengrad(image), (image,))
+    monkeypatch.setattr(defocus_search, "EVIDENCE", 25.0)
+    run(search, camera)
+    assert search.peak is not None and search.peak.curvature == pytest.approx(0.0, abs=DEPTH / 2)
+    assert search.reason == ""
 
 
 def test_what_the_mirror_refuses_is_left_out(model: DefocusModel) -> None:
@@ -95,6 +120,26 @@ def test_what_the_mirror_refuses_is_left_out(model: DefocusModel) -> None:
     run(search, DefocusedCamera(clouds(), 0.01), reach=0.017)
     assert search.peak is not None and search.peak.curvature == pytest.approx(0.01, abs=DEPTH / 2)
     assert search.config.low > -0.021 and search.config.high < 0.021
+
+
+@pytest.mark.parametrize("fed", [0, 3])
+def test_a_mirror_that_refuses_all_ends_a_search_with_that_reason(model: DefocusModel, fed: int) -> None:
+    search, camera = FocusSearch(CONFIG, model, 0.0), DefocusedCamera(clouds(), 0.01)
+    for _image in range(fed):
+        search.feed(1.0, (camera.expose(search.step.curvature),))
+    with pytest.raises(ValueError, match="range = "):
+        while True:
+            search.refuse()
+
+
+def test_an_image_that_the_range_was_drawn_in_past_is_no_top(model: DefocusModel) -> None:
+    """What the mirror took at first it may refuse later: its reach depends on its history."""
+    search, camera = FocusSearch(CONFIG, model, 0.0), DefocusedCamera(clouds(), -0.0185)
+    for _image in range(2):
+        image = camera.expose(search.step.curvature)
+        search.feed(tenengrad(image), (image,))
+    run(search, camera, reach=0.012)
+    assert search.peak is not None and search.peak.at_limit and search.peak.curvature > -0.013
 
 
 def test_where_the_optics_do_not_explain_the_images_the_range_is_swept(
@@ -121,7 +166,7 @@ def test_images_of_another_size_are_swept(model: DefocusModel) -> None:
 
 
 def test_without_optics_or_a_mirror_to_trust_every_sweep_begins_below(model: DefocusModel) -> None:
-    assert "focal_length_px" in FocusSearch(CONFIG, None, 0.0).reason
+    assert FocusSearch(CONFIG, "the focal length is not known", 0.0).reason == "the focal length is not known"
     search = FocusSearch(CONFIG, model, 0.0)
     search.sweep("the mirror's hysteresis is not known", math.inf)
     visited = run(search, DefocusedCamera(clouds(), 0.01))

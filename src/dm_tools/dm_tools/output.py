@@ -102,6 +102,13 @@ def nanometres(length: float) -> float:
     return length * 1e9
 
 
+def rounded(value: float) -> str:
+    """Two significant digits, more only where they stand before the point: 1.3, 97, 153."""
+    return f"{value:.0f}" if abs(value) >= 99.5 else f"{value:.2g}"
+
+
 def as_wavelengths(length: float) -> str:
-    """A length as a fraction of the wavelength, such as λ/50."""
+    """A length as a fraction of the wavelength, such as λ/50, or as a multiple where it is longer, such as 2 λ."""
+    if length > WAVELENGTH:
+        return f"{rounded(length / WAVELENGTH)} λ"
     return f"λ/{WAVELENGTH / length:.0f}" if length > 0 else "0"

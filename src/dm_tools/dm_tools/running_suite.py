@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dm_bringup.nodes import NAMES
-from dm_tools.output import NotRunningError, as_wavelengths, errors, nanometres
+from dm_common.errors import ErrorCode
+from dm_tools.output import NotRunningError, as_wavelengths, errors, nanometres, rounded
 
 if TYPE_CHECKING:
     from dm_client import DeformableMirrorClient
@@ -19,8 +20,8 @@ FIND_S = 1.2
 BUSY_S = 5.0
 #: Time in which every node reports its health, and an action what it is doing, s.
 REPORT_S = 1.5
-#: What has the mirror for itself while it runs, by the name of the action.
-HOLDERS = {"calibrate": "a calibration", "converge": "the closed loop", "build_recipes": "the building of recipes"}
+#: Actions that hold the mirror and say how far they are.
+STEPPED = ("calibrate", "converge", "build_recipes")
 
 
 def nodes_of_suite(client: DeformableMirrorClient) -> Counter[str]:
@@ -56,7 +57,7 @@ def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
 
 def promise(bound: float) -> str:
     """A 95 % bound on the largest coefficient error (m) in the one way all verbs put it."""
-    return f"{nanometres(bound):.2g} nm (95 % bound, {as_wavelengths(bound)})" if bound > 0.0 else "not known"
+    return f"{rounded(nanometres(bound))} nm (95 % bound, {as_wavelengths(bound)})" if bound > 0.0 else "not known"
 
 
 def ago(seconds: float) -> str:
@@ -68,26 +69,27 @@ def ago(seconds: float) -> str:
 
 
 def verdict(promised: float, measured: float) -> str:
-    """Promised and measured largest coefficient error (m), and whether the promise was kept, as a sentence."""
+    """Promised (0 = not known) and measured largest coefficient error (m), and whether the promise was kept."""
     kept = "[green]inside[/]" if measured <= promised else "[red]outside[/]"
-    return f"promised {promise(promised)}, measured {nanometres(measured):.2g} nm: {kept}"
+    found = f"promised {promise(promised)}, measured {rounded(nanometres(measured))} nm"
+    return f"{found}: {kept}" if promised > 0.0 else found
 
 
 class Holder(NamedTuple):
-    """An operation that has the mirror for itself.
+    """Who has the mirror for itself.
 
     Attributes:
-        name: such as "a calibration".
+        holding: since when and what for, as the driver says it.
         step, steps: how far it is; 0 = not known.
     """
 
-    name: str
+    holding: str
     step: int = 0
     steps: int = 0
 
     def __str__(self) -> str:
         far = f" (step {self.step} of {self.steps})" if self.steps else f" (step {self.step})" if self.step else ""
-        return f"{self.name}{far}"
+        return f"{self.holding}{far}"
 
 
 def holder(client: DeformableMirrorClient) -> Holder | None:
@@ -95,25 +97,29 @@ def holder(client: DeformableMirrorClient) -> Holder | None:
     from dm_client.client import INTERFACES
     from dm_tools.console.external_goals import ExternalGoals
 
-    goals = {name: ExternalGoals(client.node, INTERFACES[name], name) for name in HOLDERS}
-    if not client.wait(lambda: any(each.running for each in goals.values()), 0.5):
+    client.wait(lambda: "actuator_state" in client.messages, REPORT_S)
+    state = client.messages.get("actuator_state")
+    if state is None or not state.holder:
         return None
-    name, goal = next((name, each) for name, each in goals.items() if each.running)
-    client.wait(lambda: goal.feedback, REPORT_S)
-    feedback = goal.feedback
-    return Holder(HOLDERS[name], *(getattr(feedback, field, 0) for field in ("step", "steps")))
+    goals = [ExternalGoals(client.node, INTERFACES[name], name) for name in STEPPED]
+    client.wait(lambda: any(goal.running for goal in goals), 0.5)
+    running = next((goal for goal in goals if goal.running), None)
+    if running is None:
+        return Holder(state.holding)
+    client.wait(lambda: running.feedback, REPORT_S)
+    return Holder(state.holding, *(getattr(running.feedback, field, 0) for field in ("step", "steps")))
 
 
 @contextmanager
 def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
-    """Say of a request that is refused within who has the mirror for itself, if somebody has."""
+    """Say of a request that is refused within as BUSY who has the mirror for itself, and how to end that."""
     from dm_client import DeformableMirrorError
 
     try:
         yield
     except DeformableMirrorError as error:
-        if by := holder(client):
-            text = f"{by} has the mirror: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
+        if error.error_code == ErrorCode.BUSY and (by := holder(client)):
+            text = f"{by}: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
             raise DeformableMirrorError(error.error_code, text, error.response) from error
         raise
 

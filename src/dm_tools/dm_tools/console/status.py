@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration
 
 from dm_tools.console.view_models import QUALITIES
+from dm_tools.output import rounded
 from dm_tools.running_suite import ago, standing
 
 #: What each node does for the console, in words, when it is missing.
@@ -168,8 +169,9 @@ def now_text(snapshot: Any) -> str:
         return "now: moving"
     if shape is None:
         return "now: not at a curvature that was asked for"
-    return f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {shape.bound * 1e9:.2g} nm (95 %)" + (
-        ", held" if shape.held else ""
+    return (
+        f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {rounded(shape.bound * 1e9)} nm (95 %)"
+        + (", held" if shape.held else "")
     )
 
 
@@ -181,7 +183,7 @@ def calibration_step(feedback: Any) -> str:
     """Feedback of the action `calibrate`: phase, what is measured, what was dropped."""
     dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
     if feedback.reached_max_zernike > 0.0:
-        dropped += f", right to {feedback.reached_max_zernike * 1e9:.2g} nm so far"
+        dropped += f", right to {rounded(feedback.reached_max_zernike * 1e9)} nm so far"
     phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
     return f"{phase} {feedback.label}{dropped}"
 

@@ -17,16 +17,18 @@ from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, ne
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
 
 
-def running_store(namespace: str) -> Path | None:
-    """Folder of the calibration that the running suite uses; None = nothing runs, or it has none."""
-    from dm_tools.running_suite import running_suite
+def running_calibration(namespace: str) -> Path | None:
+    """File of the calibration that the running suite uses; None = nothing runs, it has none, or it runs elsewhere."""
+    from dm_client import DeformableMirrorClient
+    from dm_tools.running_suite import FIND_S, nodes_of_suite
 
-    try:
-        with running_suite(namespace) as client:
-            file = Path(client.latest("calibration", 2.0).file)
-    except RuntimeError:  # not running, or not calibrated
-        return None
-    return file.parent if file.name and file.is_file() else None
+    with DeformableMirrorClient(namespace) as client:
+        if not client.wait(lambda: nodes_of_suite(client), FIND_S):
+            return None
+        client.wait(lambda: "calibration" in client.messages, FIND_S)
+        message = client.messages.get("calibration")
+    file = Path(message.file if message is not None else "")
+    return file if file.name and file.is_file() else None
 
 
 def newest_store(folders: Sequence[Path]) -> Path:
@@ -36,6 +38,14 @@ def newest_store(folders: Sequence[Path]) -> Path:
         return max((file.stat().st_mtime for file in folder.expanduser().glob("*.h5")), default=0.0)
 
     return max(folders, key=youngest)
+
+
+def folder_with(name: str, folders: Sequence[Path]) -> Path:
+    """The first folder with a calibration of that id, else that of the youngest file."""
+    named = (
+        folder for folder in folders if name and (folder.expanduser() / f"{name.removesuffix('.h5')}.h5").is_file()
+    )
+    return next(named, None) or newest_store(folders)
 
 
 def find_calibration(name: str, store: Any) -> tuple[Any, Path]:
@@ -64,12 +74,14 @@ def find_calibration(name: str, store: Any) -> tuple[Any, Path]:
 
 def report(
     calibration: Annotated[
-        str, typer.Argument(help="Id in the store, or a calibration file; empty = the newest.", metavar="[ID|FILE]")
+        str,
+        typer.Argument(
+            help="Id in the store, or a calibration file; empty = the one in use, else the newest.",
+            metavar="[ID|FILE]",
+        ),
     ] = "",
     out: Annotated[Path, typer.Option(help="Folder for the two files.")] = Path("runs/report"),
-    store: Annotated[
-        Path | None, typer.Option(help="Folder of the calibration files; none = the running suite's, else the usual.")
-    ] = None,
+    store: Annotated[Path | None, typer.Option(help="Folder of the calibration files; none = the usual ones.")] = None,
     operator: Annotated[
         str, typer.Option(help="Who answers for the calibration; on the first page, kept for later.")
     ] = "",
@@ -90,7 +102,9 @@ def report(
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {out}: is a file; name a folder, which need not exist yet")
     if store is None:
-        store = running_store(namespace) or newest_store(STORES)
+        file_in_use = None if calibration else running_calibration(namespace)
+        calibration = str(file_in_use or calibration)
+        store = folder_with(calibration, STORES)
     found, file = find_calibration(calibration, CalibrationStore(store))
     names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
     if console.is_terminal and sys.stdin.isatty():

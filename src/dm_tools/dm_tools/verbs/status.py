@@ -62,7 +62,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
 
 def _now(by: Any, shape: Standing | None, state: Any) -> str:
     if by is not None:
-        return f"{by} has the mirror"
+        return str(by)
     if shape is not None:
         return (
             f"{shape.curvature:+.4f} 1/m ({2 * shape.curvature:+.3f} dioptre) for {ago(shape.seconds)}, within "
