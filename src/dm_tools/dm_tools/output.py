@@ -12,6 +12,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from dm_common.figures import rounded
+
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 errors = Console(stderr=True, highlight=False)
 
@@ -100,11 +102,6 @@ def write_json(path: Path | None, figures: dict[str, Any]) -> None:
 def nanometres(length: float) -> float:
     """A length in nm, for screens and reports."""
     return length * 1e9
-
-
-def rounded(value: float) -> str:
-    """Two significant digits, more only where they stand before the point: 1.3, 97, 153."""
-    return f"{value:.0f}" if abs(value) >= 99.5 else f"{value:.2g}"
 
 
 def as_wavelengths(length: float) -> str:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dm_bringup.nodes import NAMES
 from dm_common.errors import ErrorCode
-from dm_tools.output import NotRunningError, as_wavelengths, errors, nanometres, rounded
+from dm_common.figures import rounded
+from dm_tools.output import NotRunningError, as_wavelengths, errors, nanometres
 
 if TYPE_CHECKING:
     from dm_client import DeformableMirrorClient

@@ -16,6 +16,7 @@ from dm_calibration.influence.registration import bumps
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, StepKind
+from dm_common.figures import rounded
 from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.piston_tilt import weighted_fit
@@ -133,12 +134,12 @@ class GoodEnough:
 
     def sentence(self, found: float) -> str:
         """What a run that ended at `found` (m) has reached of what was asked."""
-        way = ", ".join(f"{value * 1e9:.2g}" for value in self.reached)
+        way = ", ".join(rounded(value * 1e9) for value in self.reached)
         parts = f" (part by part {way} nm)" if way else ""
         if found <= self._until:
-            return f"{self._until * 1e9:.2g} nm is reached: {found * 1e9:.2g} nm{parts}"
+            return f"{rounded(self._until * 1e9)} nm is reached: {rounded(found * 1e9)} nm{parts}"
         reason = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
-        return f"{self._until * 1e9:.2g} nm is not reached, {found * 1e9:.2g} nm is: {reason}{parts}"
+        return f"{rounded(self._until * 1e9)} nm is not reached, {rounded(found * 1e9)} nm is: {reason}{parts}"
 
 
 def map_noise(maps: MapSet) -> float:

@@ -10,8 +10,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration
 
+from dm_common.figures import rounded
 from dm_tools.console.view_models import QUALITIES
-from dm_tools.output import rounded
 from dm_tools.running_suite import ago, standing
 
 #: What each node does for the console, in words, when it is missing.
