@@ -59,7 +59,7 @@ class SuiteNode:
         )
 
 
-#: In the order of their start. They stop in reverse, so that the bench outlives the driver's last ramp.
+#: In the order of their start. They stop together, the bench after the others: it outlives the driver's last ramp.
 NODES = (
     SuiteNode(
         "virtual_bench", "dm_simulation", "VirtualBenchNode", "parameters", "parameters.check_bench", optional=True

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import yaml
 
@@ -167,7 +167,7 @@ class Suite:
                 if now - restart.started > SETTLED_S:
                     restart.pause = RESTART_S
                 elif status == NOT_MADE and restart.first:
-                    self.check()
+                    self._raise_ended(name)
                 restart.due, restart.first = now + restart.pause, False
                 reason = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
                 say(f"the node {self._namespace}{name} {reason}; it is started again in {restart.pause:g} s")
@@ -193,9 +193,12 @@ class Suite:
     def check(self) -> None:
         """Raise RuntimeError with the end of its log when a node has ended."""
         for name in self.ended():
-            status = self._processes[name].returncode
-            tail = "" if self._echo else "\n" + "\n".join(self.log(name).read_text(errors="replace").splitlines()[-8:])
-            raise RuntimeError(f"the node {name} ended with status {status}{tail}")
+            self._raise_ended(name)
+
+    def _raise_ended(self, name: str) -> NoReturn:
+        status = self._processes[name].returncode
+        tail = "" if self._echo else "\n" + "\n".join(self.log(name).read_text(errors="replace").splitlines()[-8:])
+        raise RuntimeError(f"the node {name} ended with status {status}{tail}")
 
     def stop(self, timeout_s: float = 15.0) -> None:
         """Stop all nodes, the emulated hardware last; a node that does not end in time is killed."""

@@ -53,3 +53,17 @@ def test_a_node_that_cannot_be_made_is_not_tried_again(run: Callable[[str], Suit
     with run("import sys; sys.exit('ParameterError: mirror.serial is missing')") as suite:
         with pytest.raises(RuntimeError, match=r"calibration ended with status 1\nParameterError: mirror.serial"):
             revived(suite, 1)
+
+
+def test_the_node_that_could_not_be_made_is_named_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    codes = {"calibration": "import os; os.kill(os.getpid(), 9)", "focus_controller": "import sys; sys.exit('wrong')"}
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    for name, code in codes.items():
+        (tmp_path / f"{name}_of_a_test.py").write_text(code)
+        monkeypatch.setitem(suite_module.MODULES, name, f"{name}_of_a_test")
+    with Suite({name: {} for name in codes}, tmp_path / "run", nodes=tuple(codes)) as suite:
+        deadline = time.monotonic() + 30.0
+        while len(suite.ended()) < len(codes) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        with pytest.raises(RuntimeError, match="focus_controller ended with status 1\nwrong"):
+            suite.revive(lambda _text: None)
