@@ -24,6 +24,8 @@ from dm_controller.planning.target import Request
 _ACTIVE = ActuatorState.STATE_ACTIVE
 #: States from which a driver does not come back by itself, as it does from a lost link.
 _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
+#: Longest wait until the driver confirms a command where `driver_timeout` sets none, s.
+CONFIRM_S = 3.0
 #: Moves over which the latency is taken.
 MOVES = 20
 #: A first write later than this is of another clock, or of a report that came too late, s.
@@ -200,10 +202,9 @@ class DriverMonitor:
         None = there is none. A command that went out later is the one that counts: the latest wins at the driver too.
         """
         self._trust()  # the parameter may have changed
-        limit = self._values["driver_timeout"]
-        if self.shape is None or not (limit or self.gone):
+        if self.shape is None:
             return None
-        sent = self.shape.sent
+        limit, sent = self._values["driver_timeout"] or CONFIRM_S, self.shape.sent
         if sent.confirmed or sent.given_up or (now - sent.steady <= limit and not self.gone):
             return None
         sent.given_up = True
@@ -216,4 +217,6 @@ class DriverMonitor:
         assert report is not None  # else the check had refused
         if report.error_code != ErrorCode.OK:
             return sent.order, Refusal(report.error_code, f"{text}: {report.message}")
+        if self._heard < sent.steady:
+            return sent.order, Refusal(ErrorCode.TIMEOUT, f"{text} and has not reported since: is it running?")
         return sent.order, Refusal(ErrorCode.PREEMPTED, f"{text}: it follows another one")

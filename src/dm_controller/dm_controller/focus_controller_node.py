@@ -17,7 +17,7 @@ from dm_msgs.srv import Flatten, SetFocus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
@@ -25,6 +25,7 @@ from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare, frame_id
 from dm_common.ros.qos import GONE, Liveliness
 from dm_common.ros.worker import WorkerService
+from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_actions import DegaussClient, LoopHost, MoveFocusAction, serve_loops
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
 from dm_controller.focus_messages import capabilities_message, driver_report_from, health, state_message
@@ -46,9 +47,8 @@ from dm_controller.planning.target import Request
 STEADY_PERIOD_S = 0.5
 #: How often what the actuators have crept to is put on disk, s of wall time.
 RECORD_PERIOD_S = 30.0
-#: Longest wait of a service for the driver's confirmation where `driver_timeout` sets none, s, and how often it is
-#: looked for.
-CONFIRM_S, POLL_S = 3.0, 0.001
+#: How often a service looks for the driver's confirmation, s.
+POLL_S = 0.001
 
 
 class FocusControllerNode(Node):
@@ -138,21 +138,30 @@ class FocusControllerNode(Node):
         """In a worker thread, for the driver's confirmation is waited for."""
         order = self.order(request, dry_run)
         deadline = time.monotonic() + 1.0 + (self._values["driver_timeout"] or CONFIRM_S)
-        while not (dry_run or order.pending or order.outcome.applied or order.outcome.refusal):
+        while waits := not (dry_run or order.pending or order.outcome.applied or order.outcome.refusal):
             if time.monotonic() > deadline:
                 break
             time.sleep(POLL_S)
         response.state = self.state(order.outcome)
         response.error_code, response.message = response.state.error_code, response.state.message
+        if waits:
+            response.error_code, response.message = (
+                ErrorCode.TIMEOUT,
+                "the driver has not confirmed the command in time",
+            )
         return response
 
     def _on_driver_life(self) -> None:
-        with self.controller() as (controller, now):
-            self._do(controller.driver_lost(f"pdm_driver {GONE}" if self._driver.lost else "", now), now)
+        if not self._driver.lost:  # a loss counts once it is sure, in `_tick`
+            with self.controller() as (controller, now):
+                self._do(controller.driver_lost("", now), now)
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):
-            self._do(controller.tick(now), now)
+            if self._driver.missing(lambda: True) and not controller.monitor.gone:
+                self._do(controller.driver_lost(f"pdm_driver {GONE}", now), now)
+            else:
+                self._do(controller.tick(now), now)
             self._degauss.retry(controller.conditioning.run)
 
     def _degauss_ended(self, number: int, duration: float, refusal: Refusal | None) -> None:

@@ -20,7 +20,7 @@ from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
 
 #: What to do about an unknown history.
-CURE = "a degauss over the full range (service degauss) makes it known"
+CURE = "a degauss over the full range (action degauss, `./dm degauss`) makes it known"
 
 
 def driver_report_from(message: ActuatorState) -> DriverReport:

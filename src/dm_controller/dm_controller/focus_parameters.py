@@ -59,7 +59,7 @@ PARAMETERS: Final = (
         "driver_timeout",
         real(3.0, 0.0, 600.0, "s"),
         "silence of pdm_driver after which requests are refused, and longest wait until it confirms a command; longer "
-        "than its state_period; 0 = never",
+        "than its state_period; 0 = never, and 3 s for a command",
         live=True,
     ),
     Parameter(

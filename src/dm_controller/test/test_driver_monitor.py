@@ -10,7 +10,7 @@ from dm_msgs.msg import ActuatorState
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.observer import Applied
-from dm_controller.driver_monitor import DriverMonitor
+from dm_controller.driver_monitor import CONFIRM_S, DriverMonitor
 from dm_controller.focus_types import CommandedShape, DriverReport, Order, Outcome, SendCommand, Sent
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import FocusTarget, Request
@@ -91,6 +91,18 @@ def test_a_command_that_is_not_confirmed_is_told_of_once(last: DriverReport | No
     assert refusal.error_code == code
     assert text in str(refusal)
     assert driver.untaken(later) is None
+
+
+def test_a_command_that_is_not_confirmed_is_told_of_where_silence_counts_for_nothing() -> None:
+    driver = monitor(timeout=0.0)
+    assert driver.untaken(BEGAN + 0.9 * CONFIRM_S) is None
+    untaken = driver.untaken(BEGAN + 1.1 * CONFIRM_S)
+    assert untaken is not None and untaken[1].error_code == ErrorCode.PREEMPTED
+    driver = monitor(timeout=0.0)
+    assert driver.shape is not None
+    driver.shape.sent.steady = BEGAN + 1.0  # no report has come since
+    untaken = driver.untaken(BEGAN + 1.0 + 1.1 * CONFIRM_S)
+    assert untaken is not None and untaken[1].error_code == ErrorCode.TIMEOUT
 
 
 def test_a_driver_that_was_started_anew_is_noticed() -> None:
