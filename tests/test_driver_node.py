@@ -263,8 +263,14 @@ def test_one_owner_of_the_mirror_at_a_time(driver: Driver) -> None:
     assert driver.set_signals(np.zeros(37), wait=True, holder="calibration").error_code == ErrorCode.OK
     busy = driver.set_signals(np.full(37, 0.5))
     assert busy.error_code == ErrorCode.BUSY and "cancel calibrate" in busy.message
-    degauss = driver.observer.run_goal(Degauss, "degauss", Degauss.Goal(steps=6)).result
-    assert degauss.error_code == ErrorCode.BUSY
+    _, ours = driver.observer.send_goal(
+        Degauss, "degauss", Degauss.Goal(steps=60, end_signals=[0.0] * 37, holder="calibration")
+    )
+    driver.wait_for_state(lambda state: state.moving, "the degauss of the holder")
+    strange = driver.observer.run_goal(Degauss, "degauss", Degauss.Goal(steps=6)).result
+    assert strange.error_code == ErrorCode.BUSY and not ours.done()
+    wait_until(ours.done)
+    assert ours.result().result.error_code == ErrorCode.OK
     driver.command(np.full(37, 0.5))
     state = driver.wait_for_refusal(ErrorCode.BUSY, "actuator_command refused: calibration has held")
     assert list(state.applied) == pytest.approx([0.0] * 37, abs=CODE) and state.holder == "calibration"
@@ -390,6 +396,7 @@ def test_lifecycle_by_hand(start: Start, observer: Observer, unit: Edac40TcpUnit
         ({"limits__step": 5.0}, ["limits.step", "5.0"]),
         ({"limits__neighbour_differnce": 2.0}, ["limits.neighbour_differnce", "did you mean limits.neighbour_diff"]),
         ({"electronics__address": ""}, ["electronics.address is empty"]),
+        ({"limits__slew_rate": 0.5}, ["degauss.steps = 100", "limits.slew_rate = 0.5", "degauss.duration_max"]),
     ],
 )
 def test_wrong_configurations_are_refused_in_words(

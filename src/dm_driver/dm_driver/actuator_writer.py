@@ -96,18 +96,21 @@ class ActuatorWriter(WriterThread):
                 return None
             return self.command(shape)
 
-    def degauss(self, amplitude: float, steps: int, end: Shape, duration_max: float = math.inf) -> Move:
+    def degauss(
+        self, amplitude: float, steps: int, end: Shape, duration_max: float = math.inf, name: str = "steps"
+    ) -> Move:
         """Run the decaying cycle about mid range, then go to `end` (checked, as for `command`).
 
         Args:
             amplitude: first half-swing; 0 = the largest inside the limits.
             steps: half-swings.
             duration_max: s, longest time that it may take.
+            name: of what gave `steps`, for the refusal.
 
         Raises:
             Refusal: OUT_OF_RANGE, DRIVER_INACTIVE or ELECTRONICS_UNREACHABLE.
         """
-        return self._submit(degauss_move(self._limiter.limits, amplitude, steps, end, duration_max))
+        return self._submit(degauss_move(self._limiter.limits, amplitude, steps, end, duration_max, name))
 
     def turn_back(self, move: Move) -> Move | None:
         """Leave `move` for the shape that was requested before it; None = something else was asked for since."""

@@ -38,7 +38,12 @@ def degauss_waypoints(actuators: int, middle: float, amplitude: float, steps: in
 
 
 def degauss_move(
-    limits: DriverLimits, amplitude: float, steps: int, end: Shape, duration_max: float = math.inf
+    limits: DriverLimits,
+    amplitude: float,
+    steps: int,
+    end: Shape,
+    duration_max: float = math.inf,
+    name: str = "steps",
 ) -> Move:
     """The decaying cycle about mid range, then the way to `end` (a legal shape).
 
@@ -48,6 +53,7 @@ def degauss_move(
         steps: half-swings.
         end: (N,) signals to end in.
         duration_max: s, longest time that it may take.
+        name: of what gave `steps`, for the refusal.
 
     Raises:
         Refusal: NOT_FINITE or OUT_OF_RANGE.
@@ -55,14 +61,15 @@ def degauss_move(
     middle = limits.middle
     largest = limits.half_range
     real(0.0, 0.0, largest).check("amplitude", amplitude)
-    whole(0, 1, STEPS_MAX).check("steps", steps)
+    whole(0, 1, STEPS_MAX).check(name, steps)
     swing = amplitude or largest
     # The swings add up to steps * swing; the ways there and to the end are no longer than the whole range each.
     duration = (steps * swing + 4.0 * largest) / limits.slew_rate
     if not duration <= duration_max:
         raise Refusal(
             ErrorCode.OUT_OF_RANGE,
-            f"steps = {steps}: would take {duration:.0f} s, must be at most {duration_max:g} s (degauss.duration_max)",
+            f"{name} = {steps}: would take {duration:.0f} s at limits.slew_rate = {limits.slew_rate:g} 1/s, "
+            f"must be at most {duration_max:g} s (degauss.duration_max)",
         )
     waypoints = degauss_waypoints(limits.actuators, middle, swing, steps, end)
     # A smaller cycle leaves what wider swings have written.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dm_common.errors import Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_driver.degauss import degauss_move
 from dm_driver.electronics import DriveElectronics, ElectronicsSettings, make_electronics
 from dm_driver.electronics.frame_format import FrameFormat
 from dm_driver.output.output_stage import OutputStage
@@ -102,6 +103,8 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
     limiter = SafetyLimiter(limits)
     try:
         safe_shape = limiter.check_shape(values["safe_signals"] or np.full(actuators, -1.0), "safe_signals")
+        steps, longest = values["degauss.steps"], values["degauss.duration_max"]
+        degauss_move(limits, 0.0, steps, safe_shape, longest, "degauss.steps")
     except Refusal as refusal:
         raise ValueError(str(refusal)) from refusal
     doubt = math.floor(limits.step / scale.resolution) if values["electronics.await_arrival"] else 0

@@ -46,10 +46,13 @@ class MoveQueue:
 
     def put(self, move: Move) -> None:
         """Let `move` be the next."""
+        newest = self.newest
+        # The mirror never held the end of a degauss that is left.
+        left = newest is not None and newest.kind is Kind.DEGAUSS
+        move.before = newest.before if newest is not None and left else self.requested
         if self.pending is not None:
             self.pending.finish(Outcome.SUPERSEDED)
-        self.pending = move
-        move.before, self.requested = self.requested, move.target
+        self.pending, self.requested = move, move.target
 
     def begin(self, move: Move, shape: Shape, applied: Shape | None) -> None:
         """Leave the current move for `move`.

@@ -40,7 +40,8 @@ class Move:
         wipes: a degauss over the full range, which wipes the hysteresis.
         steps, duration: of a degauss: its half-swings, and how long they take, s.
         begun: waypoints that the mirror is past, or on its way to.
-        before: (N,) where the last accepted move led when this one was put in its place; None before the first.
+        before: (N,) where the last accepted move led when this one was put in its place; where that was a degauss, what
+            it would have turned back to; None before the first.
     """
 
     def __init__(

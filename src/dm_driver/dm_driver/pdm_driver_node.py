@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
 from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
@@ -59,7 +58,7 @@ class PdmDriverNode(LifecycleNode):
         self._info_publisher = self.create_publisher(MirrorInfo, "mirror_info", qos.with_lease(qos.LATCHED))
         self.create_subscription(ActuatorCommand, "actuator_command", self._on_command, qos.COMMAND)
         WorkerService(self, SetSignals, "set_signals", self._on_set_signals)
-        DegaussAction(self, self._begin_degauss)
+        DegaussAction(self, self._gate, self._values)
         answer = never_silent(self, "hold_mirror", self._on_hold_mirror)
         self.create_service(HoldMirror, "hold_mirror", answer, qos_profile=qos.SERVICE)
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
@@ -203,22 +202,6 @@ class PdmDriverNode(LifecycleNode):
             response.applied.frombytes(applied.tobytes())
         return response
 
-    def _begin_degauss(self, goal: Any) -> tuple[ActuatorWriter, Move] | Refusal:
-        """The move of a goal, which has begun; or its refusal."""
-        used: list[ActuatorWriter] = []
-
-        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
-            limits = configuration.limiter.limits
-            middle = np.full(limits.actuators, limits.middle)
-            end = configuration.limiter.check_shape(goal.end_signals or middle, "end_signals")
-            used.append(writer)
-            steps, longest = goal.steps or self._values["degauss.steps"], self._values["degauss.duration_max"]
-            return writer.degauss(goal.amplitude, steps, end, longest)
-
-        move = self._gate.attempt("degauss", goal, carry_out)
-        assert move is not None
-        return move if isinstance(move, Refusal) else (used[0], move)
-
     def _on_hold_mirror(self, request: Any, response: Any) -> Any:
         before = self._hold.holder
         try:
@@ -231,9 +214,12 @@ class PdmDriverNode(LifecycleNode):
                 self._publish_state()
         return response
 
-    def _on_gate(self, text: str) -> None:
-        """A command was refused, or took the mirror over."""
-        self.get_logger().warning(text, throttle_duration_sec=1.0)
+    def _on_gate(self, text: str, took_over: bool) -> None:
+        """A command was refused, or took the mirror over, which no flood of refusals may hide."""
+        if took_over:
+            self.get_logger().warning(text)
+        else:
+            self.get_logger().warning(text, throttle_duration_sec=1.0)
         self._publish_state()
 
     @staticmethod

@@ -243,6 +243,11 @@ def test_a_degauss_turns_back_to_the_shape_before_unless_something_newer_came(un
         assert back is not None and back.wait(5) is Outcome.REACHED
         assert signals_of(unit.frames)[-1] == pytest.approx(0.3, abs=CODE)
         assert not writer.state().history_known
+        first = writer.degauss(0.0, 100, shape(0.0))
+        wait_until(lambda: first.begun > 2)
+        back = writer.turn_back(writer.degauss(0.0, 100, shape(0.1)))
+        assert back is not None and back.target == pytest.approx(shape(0.3))  # no degauss has ended
+        assert back.wait(5) is Outcome.REACHED
         move = writer.degauss(0.0, 100, shape(0.0))
         newer = writer.command(shape(-0.2))
         assert writer.turn_back(move) is None and newer.wait(5) is Outcome.REACHED
@@ -250,7 +255,9 @@ def test_a_degauss_turns_back_to_the_shape_before_unless_something_newer_came(un
 
 def test_a_degauss_is_bounded(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=20.0) as (writer, _told):
-        with pytest.raises(Refusal, match=r"steps = 9000: would take 450 s, must be at most 180 s") as caught:
+        with pytest.raises(
+            Refusal, match=r"steps = 9000: would take 450 s at limits.slew_rate = 20 1/s, must be at most 180 s"
+        ) as caught:
             writer.degauss(0.0, 9000, shape(0.0), duration_max=180.0)
         assert caught.value.error_code == ErrorCode.OUT_OF_RANGE
         assert refused(lambda: writer.degauss(1e-4, 100_000, shape(0.0))) == ErrorCode.OUT_OF_RANGE

@@ -87,3 +87,25 @@ def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) ->
 def test_fields_that_cannot_be(clock: Clock, code: ErrorCode, fields: dict[str, object]) -> None:
     with refused(code):
         MirrorHold(clock).ask(**{"operation": Operation.HOLD, "holder": "operator"} | fields)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("between", ["nobody", "command", "hold"])
+def test_a_hold_that_lapsed_is_renewed_only_where_nobody_moved_the_mirror(
+    hold: MirrorHold, clock: Clock, between: str
+) -> None:
+    clock.now += 1.1 * LEASE_S
+    if between == "command":
+        assert not hold.check("", take_over=False)
+        hold.evict("")
+    elif between == "hold":
+        hold.ask(Operation.HOLD, "autofocus")
+        hold.ask(Operation.RELEASE, "autofocus")
+    if between == "nobody":
+        hold.ask(Operation.RENEW, "calibration")
+        hold.evict("calibration")
+        assert hold.holder == "calibration"
+    else:
+        with refused(ErrorCode.PREEMPTED):
+            hold.ask(Operation.RENEW, "calibration")
+        hold.ask(Operation.HOLD, "calibration")
+        hold.ask(Operation.RENEW, "calibration")

@@ -132,7 +132,7 @@ class WorkerActionServer(ActionServer):
     Args:
         exclusive: "refuse" refuses a goal while another runs; "preempt" asks the running goal to stop and starts the
             newest one after it.
-        fields: of the goal; one that may not be as it is aborts the goal, and no other goal hears of it.
+        fields, admit: of the goal, and what raises the Refusal of one; that aborts it, and no other goal hears of it.
     """
 
     def __init__(
@@ -144,12 +144,13 @@ class WorkerActionServer(ActionServer):
         *,
         exclusive: str = "refuse",
         fields: Fields = NO_FIELDS,
+        admit: Callable[[Any], object] = lambda _request: None,
     ) -> None:
         if exclusive not in ("refuse", "preempt"):
             raise ValueError(f"exclusive = {exclusive!r}: must be 'refuse' or 'preempt'")
         self._worker_node = node
         self._body = body
-        self._exclusive, self._fields = exclusive, fields
+        self._exclusive, self._fields, self._admit = exclusive, fields, admit
         self._turn = threading.Lock()  # held by the goal that runs
         self._bookkeeping = threading.Lock()
         self._newest: ServerGoalHandle | None = None
@@ -190,6 +191,7 @@ class WorkerActionServer(ActionServer):
         """Run the body in a thread; rclpy's own execution only publishes the outcome, when it is there."""
         try:
             self._fields.check(goal_handle.request)
+            self._admit(goal_handle.request)
         except Refusal as refusal:
             self._worker_node.get_logger().warning(f"goal refused: {refusal}")
             with self._bookkeeping:
@@ -284,7 +286,7 @@ def sleep(clock: Clock, seconds: float, cancelled: Callable[[], bool] = lambda: 
     """Sleep in ROS time (which may run faster than the wall clock) in a worker thread.
 
     Returns True, or False as soon as `cancelled()` is true. When ROS time stands still (a simulator that ended), it
-    gives up after 10 s plus ten times `seconds` of wall time and raises TimeoutError.
+    raises TimeoutError after 10 s plus ten times `seconds` of wall time.
     """
     wait_for_clock(clock)
     end = clock.now() + Duration(nanoseconds=round(seconds * 1e9))

@@ -18,7 +18,7 @@ class CommandGate:
 
     Args:
         hold: who holds the mirror.
-        report: called after each refusal, and when the mirror was taken over, with a line for the log.
+        report: called with a line for the log after each refusal, and, with True, when the mirror was taken over.
 
     Attributes:
         writer, configuration: of the configured driver; None = it is not.
@@ -26,7 +26,7 @@ class CommandGate:
         refused: number of refused commands by the name of their code.
     """
 
-    def __init__(self, hold: MirrorHold, report: Callable[[str], None]) -> None:
+    def __init__(self, hold: MirrorHold, report: Callable[[str, bool], None]) -> None:
         self.hold, self._report = hold, report
         self.writer: ActuatorWriter | None = None
         self.configuration: DriverConfiguration | None = None
@@ -56,15 +56,17 @@ class CommandGate:
                 )
             takes_over = not dry_run and self.hold.check(request.holder, getattr(request, "take_over", False))
             move = carry_out(writer, configuration)
-            if takes_over:
+            if move is not None:
                 holder = self.hold.holder
                 self.hold.evict(request.holder)
-                self._report(f"{source} of {request.holder or 'nobody in particular'} took the mirror from {holder}")
+                if takes_over:
+                    by = request.holder or "nobody in particular"
+                    self._report(f"{source} of {by} took the mirror from {holder}", True)
             return move
         except Refusal as refusal:
             if not dry_run:
                 self.refused[ErrorCode(refusal.error_code).name] += 1
                 text = f"{source} refused: {refusal}"
                 self.refusal = Refusal(refusal.error_code, text, refusal.actuators)
-                self._report(text)
+                self._report(text, False)
             return refusal

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from dm_msgs.action import Degauss
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
@@ -13,6 +14,9 @@ from rclpy.node import Node
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import WorkerActionServer
 from dm_driver.actuator_writer import ActuatorWriter
+from dm_driver.commands.command_gate import CommandGate
+from dm_driver.degauss import degauss_move
+from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Move, Outcome
 
 #: How often a degauss is looked after, s, and how often its feedback is published.
@@ -29,16 +33,47 @@ CODE_OF_OUTCOME = {
 
 
 class DegaussAction:
-    """Serves `degauss` in worker threads; the newest goal pre-empts, a cancelled one slews back.
+    """Serves `degauss` in worker threads; the newest goal that may be pre-empts, a cancelled one slews back.
 
     Args:
         node: hosts the action.
-        begin: a goal's move and its writer. Raises or returns Refusal.
+        gate: carries out what may be carried out.
+        values: parameters `degauss.steps` and `degauss.duration_max`.
     """
 
-    def __init__(self, node: Node, begin: Callable[[Any], tuple[ActuatorWriter, Move] | Refusal]) -> None:
-        self._begin = begin
-        self._server = WorkerActionServer(node, Degauss, "degauss", self._run, exclusive="preempt")
+    def __init__(self, node: Node, gate: CommandGate, values: Mapping[str, Any]) -> None:
+        self._gate, self._values = gate, values
+        self._server = WorkerActionServer(node, Degauss, "degauss", self._run, exclusive="preempt", admit=self._admit)
+
+    def _cycle(self, goal: Any, configuration: DriverConfiguration) -> tuple[Any, ...]:
+        """Arguments of `ActuatorWriter.degauss` for a goal."""
+        limits = configuration.limiter.limits
+        middle = np.full(limits.actuators, limits.middle)
+        end = configuration.limiter.check_shape(goal.end_signals or middle, "end_signals")
+        name = "steps" if goal.steps else "degauss.steps"
+        steps = goal.steps or self._values["degauss.steps"]
+        return goal.amplitude, steps, end, self._values["degauss.duration_max"], name
+
+    def _admit(self, goal: Any) -> None:
+        """Raise the Refusal of a goal that may not be: it must not end the one that runs."""
+
+        def judge(_writer: ActuatorWriter, configuration: DriverConfiguration) -> None:
+            degauss_move(configuration.limiter.limits, *self._cycle(goal, configuration))
+
+        if isinstance(refusal := self._gate.attempt("degauss", goal, judge), Refusal):
+            raise refusal
+
+    def _begin(self, goal: Any) -> tuple[ActuatorWriter, Move] | Refusal:
+        """The move of a goal, which has begun; or its refusal: things may have changed since it was admitted."""
+        used: list[ActuatorWriter] = []
+
+        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
+            used.append(writer)
+            return writer.degauss(*self._cycle(goal, configuration))
+
+        move = self._gate.attempt("degauss", goal, carry_out)
+        assert move is not None
+        return move if isinstance(move, Refusal) else (used[0], move)
 
     def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
         began, result = time.monotonic(), Degauss.Result()
@@ -50,6 +85,8 @@ class DegaussAction:
         """Outcome, ErrorCode and message of a goal."""
         if handle.is_cancel_requested:
             return "canceled", ErrorCode.CANCELED, "cancelled before anything moved"
+        if self._server.preempted(handle):
+            return "abort", ErrorCode.PREEMPTED, "a newer goal took over before anything moved"
         begun = self._begin(handle.request)
         if isinstance(begun, Refusal):
             return "abort", begun.error_code, str(begun)
@@ -57,7 +94,9 @@ class DegaussAction:
         began, next_feedback = time.monotonic(), 0.0
         while (ended := move.wait(POLL_S)) is None:
             if handle.is_cancel_requested:
-                return "canceled", ErrorCode.CANCELED, _slew_back(writer, move)
+                if text := self._slew_back(writer, move, handle.request.holder):
+                    return "canceled", ErrorCode.CANCELED, text
+                continue
             if self._server.preempted(handle):
                 return "abort", ErrorCode.PREEMPTED, "a newer goal took over"
             now = time.monotonic()
@@ -74,13 +113,20 @@ class DegaussAction:
             return "abort", CODE_OF_OUTCOME[ended], ended.value
         return "succeed", ErrorCode.OK, f"{move.steps} half-swings in {time.monotonic() - began:.1f} s"
 
+    def _slew_back(self, writer: ActuatorWriter, move: Move, holder: str) -> str:
+        """Leave a degauss for the shape that the mirror held before.
 
-def _slew_back(writer: ActuatorWriter, move: Move) -> str:
-    """Leave a degauss for the shape that the mirror held before; returns what became of it."""
-    back = writer.turn_back(move)
-    if back is None:
-        return "cancelled; the mirror follows a newer command"
-    ended = back.wait(writer.ramp_time(back.target) + MARGIN_S)
-    if ended is Outcome.REACHED:
-        return "cancelled; the mirror is back in the shape it held before, its history is not known"
-    return f"cancelled; the way back to the shape held before: {ended.value if ended else 'not ended in time'}"
+        Returns what became of it; "" = the degauss had ended by itself.
+        """
+        try:
+            self._gate.hold.check(holder, take_over=False)
+        except Refusal as refusal:
+            return f"cancelled; the mirror is not slewed back, for it is somebody else's: {refusal}"
+        back = writer.turn_back(move)
+        if back is None:
+            superseded = move.wait(MARGIN_S) in (None, Outcome.SUPERSEDED)
+            return "cancelled; the mirror follows a newer command" if superseded else ""
+        ended = back.wait(writer.ramp_time(back.target) + MARGIN_S)
+        if ended is Outcome.REACHED:
+            return "cancelled; the mirror is back in the shape it held before, its history is not known"
+        return f"cancelled; the way back to the shape held before: {ended.value if ended else 'not ended in time'}"

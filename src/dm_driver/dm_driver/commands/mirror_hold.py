@@ -40,6 +40,7 @@ class MirrorHold:
         self._clock = clock
         self._lock = threading.Lock()
         self._holder = self._purpose = ""
+        self._lapsed = ""  # whose hold ended without being given back, as long as nobody else has moved the mirror
         self._since = self._until = self._duration = 0.0
         self._evicted = self._evicted_by = ""  # whose hold was taken over last, and by whom
 
@@ -74,13 +75,14 @@ class MirrorHold:
             current = self._current()
             if operation == Operation.RENEW:
                 self._check_evicted(holder)
-            if current not in ("", holder):
-                if operation != Operation.TAKE_OVER:
-                    raise Refusal(ErrorCode.BUSY, self._sentence())
-                self._evict(holder)
+            if current not in ("", holder) and operation != Operation.TAKE_OVER:
+                raise Refusal(ErrorCode.BUSY, self._sentence())
             if operation == Operation.RELEASE:
                 self._holder = ""
+                if holder == self._lapsed:
+                    self._lapsed = ""
                 return
+            self._evict(holder, holder)
             if holder == self._evicted:
                 self._evicted = ""
             now = self._clock()
@@ -104,9 +106,12 @@ class MirrorHold:
             return other
 
     def evict(self, by: str) -> None:
-        """Whoever holds the mirror does so no longer: a command of `by` ("" = nobody in particular) is carried out."""
+        """A command of `by` ("" = nobody in particular) is carried out: whoever else has the mirror loses it.
+
+        So does a holder whose hold has lapsed: the mirror is no longer as it was left, and RENEW must say so.
+        """
         with self._lock:
-            self._evict(by or "a command with take_over")
+            self._evict(by, by or ("a command with take_over" if self._current() else "a command"))
 
     def _check_evicted(self, holder: str) -> None:
         if holder and holder == self._evicted:
@@ -114,11 +119,15 @@ class MirrorHold:
 
     def _current(self) -> str:
         if self._holder and self._clock() > self._until:
-            self._holder = ""
+            self._holder, self._lapsed = "", self._holder
         return self._holder
 
-    def _evict(self, by: str) -> None:
-        self._evicted, self._evicted_by, self._holder = self._holder, by, ""
+    def _evict(self, holder: str, by: str) -> None:
+        """Whoever else than `holder` has the mirror, or let its hold lapse, hears that `by` has taken it over."""
+        loser = self._current() or self._lapsed
+        if loser not in ("", holder):
+            self._evicted, self._evicted_by, self._holder = loser, by, ""
+        self._lapsed = ""
 
     def _sentence(self) -> str:
         if not self._current():

@@ -1,0 +1,78 @@
+"""What becomes of degauss goals that come, or are cancelled, at a bad moment."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dm_common.errors import ErrorCode
+from dm_driver.commands import degauss_action
+from dm_driver.commands.command_gate import CommandGate
+from dm_driver.commands.mirror_hold import MirrorHold, Operation
+from dm_driver.moves import Kind, Move, Outcome
+
+
+class Writer:
+    """Its degauss ends as soon as it is to be left for another move."""
+
+    def __init__(self, end: Outcome) -> None:
+        self.end, self.turned_back, self.begun = end, False, False
+
+    def turn_back(self, move: Move) -> None:
+        self.turned_back = True
+        move.finish(self.end)
+
+
+@pytest.fixture
+def hold() -> MirrorHold:
+    return MirrorHold(lambda: 0.0)
+
+
+def carried_out(
+    hold: MirrorHold, writer: Writer, monkeypatch: pytest.MonkeyPatch, overtaken: bool = False
+) -> tuple[str, int, str]:
+    """What the goal of the calibration ends in, which is cancelled as soon as it has begun."""
+    goal = SimpleNamespace(holder="calibration")
+    handle: Any = SimpleNamespace(request=goal, is_cancel_requested=False)
+    server = SimpleNamespace(preempted=lambda _handle: overtaken)
+    monkeypatch.setattr(degauss_action, "WorkerActionServer", lambda *_arguments, **_keywords: server)
+    none: Any = None
+    action = degauss_action.DegaussAction(none, CommandGate(hold, lambda _text, _took_over: None), {})
+
+    def begin(_goal: Any) -> Any:
+        writer.begun = handle.is_cancel_requested = True
+        return writer, Move(Kind.DEGAUSS, [], none)
+
+    monkeypatch.setattr(action, "_begin", begin)
+    return action._carry_out(handle)
+
+
+def test_a_goal_that_was_overtaken_moves_nothing(hold: MirrorHold, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = Writer(Outcome.REACHED)
+    assert carried_out(hold, writer, monkeypatch, overtaken=True)[:2] == ("abort", ErrorCode.PREEMPTED)
+    assert not writer.begun
+
+
+@pytest.mark.parametrize(
+    ("end", "expected"),
+    [
+        (Outcome.REACHED, ("succeed", ErrorCode.OK)),
+        (Outcome.LINK_LOST, ("abort", ErrorCode.ELECTRONICS_UNREACHABLE)),
+        (Outcome.SUPERSEDED, ("canceled", ErrorCode.CANCELED)),
+    ],
+)
+def test_a_cancel_that_comes_too_late_reports_how_the_degauss_ended(
+    hold: MirrorHold, monkeypatch: pytest.MonkeyPatch, end: Outcome, expected: tuple[str, int]
+) -> None:
+    assert carried_out(hold, Writer(end), monkeypatch)[:2] == expected
+
+
+def test_who_lost_the_mirror_does_not_move_it_by_a_cancel(hold: MirrorHold, monkeypatch: pytest.MonkeyPatch) -> None:
+    hold.ask(Operation.HOLD, "calibration")
+    hold.ask(Operation.TAKE_OVER, "operator")
+    writer = Writer(Outcome.REACHED)
+    outcome, code, text = carried_out(hold, writer, monkeypatch)
+    assert (outcome, code) == ("canceled", ErrorCode.CANCELED) and "operator" in text
+    assert not writer.turned_back
