@@ -158,6 +158,8 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
     assert hysteresis is not None
     surface = TrueSurface(bench)
     low, high = active.reachable_range(FocusTarget(0.0), REACHABLE_TOLERANCE)
+    if not low <= high:
+        raise ValueError("no curvature is reachable: the figure takes the whole range")
     groups: dict[str, Requests] = {}
     book, unreachable = NO_RECIPES, list[str]()
     if options.recipes:
