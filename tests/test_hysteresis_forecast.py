@@ -70,7 +70,7 @@ def test_a_run_ends_where_it_is_good_enough() -> None:
     outcome = Procedure(plan, bench.mirror, bench, enough=enough).run()
     assert len(plan.ends) == 2 and len(enough.reached) == 1
     assert len(outcome.records) == min(plan.ends) - 1
-    assert "2e+02 nm is reached" in enough.sentence(enough.reached[0])
+    assert "200 nm is reached" in enough.sentence(enough.reached[0])
 
 
 def test_a_run_that_stands_still_ends(monkeypatch: pytest.MonkeyPatch) -> None:
