@@ -53,6 +53,7 @@ class Answer:
         """The message without what differs from run to run."""
         text = re.sub(r"PDM30-37_\S+?Z|/\S+/|\S+\.dat\b", "…", self.message)
         text = re.sub(r"inside [-+]0\.\d{4} to [-+]0\.\d{4}", "inside … to …", text)  # what the calibration reaches
+        text = re.sub(r"; the range was swept: .*", "", text)  # which search serves depends on the images
         return text if self.code in EXACT else re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
 
 

@@ -87,6 +87,7 @@ class DriverMonitor:
     def observe(self, report: DriverReport, now: float) -> bool:
         """Take the driver's next report; returns whether the latency is known from now on."""
         before, self.latest, self._heard = self.latest, report, now
+        self.gone = ""  # who reports lives, whatever a lease that lapsed on a busy machine says
         if before is not None and report.sequence < before.sequence:
             self.starts += 1
         self._trust()
@@ -104,12 +105,16 @@ class DriverMonitor:
         active = self.latest is not None and self.latest.driver_state == _ACTIVE and not self.gone
         self.trusted_until = self._heard + (self._values["driver_timeout"] or math.inf) if active else -math.inf
 
+    def age(self, now: float) -> float:
+        """s since the driver's last report."""
+        return now - self._heard
+
     def silent(self, now: float) -> str:
         """That the driver does not report any more, as a sentence; "" = it does, or never did."""
         if self.gone:
             return self.gone
         limit = self._values["driver_timeout"]
-        age = now - self._heard
+        age = self.age(now)
         if self.latest is None or not limit or age <= limit:
             return ""
         return f"pdm_driver has not reported for {age:.1f} s (driver_timeout {limit:g} s): is it running?"

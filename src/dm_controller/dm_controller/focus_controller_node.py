@@ -23,7 +23,7 @@ from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare, frame_id
-from dm_common.ros.qos import GONE, Liveliness
+from dm_common.ros.qos import GONE, LEASE_S, Liveliness
 from dm_common.ros.worker import WorkerService
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_actions import DegaussClient, LoopHost, MoveFocusAction, serve_loops
@@ -158,7 +158,8 @@ class FocusControllerNode(Node):
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):
-            if self._driver.missing(lambda: True) and not controller.monitor.gone:
+            silent = controller.monitor.age(now.steady) > LEASE_S
+            if silent and self._driver.missing(lambda: True) and not controller.monitor.gone:
                 self._do(controller.driver_lost(f"pdm_driver {GONE}", now), now)
             else:
                 self._do(controller.tick(now), now)

@@ -121,3 +121,13 @@ def test_the_latency_is_from_the_command_to_its_first_write() -> None:
     command(driver, HERE, None)
     assert not driver.observe(report(HERE, stamp_ns=10**9 + 4_000_000), BEGAN)
     assert driver.latency == pytest.approx(3e-3)
+
+
+def test_who_reports_after_a_lease_lapsed_is_not_dead() -> None:
+    driver = monitor()
+    driver.lost("pdm_driver has died")
+    assert driver.silent(BEGAN + 0.5) == "pdm_driver has died"
+    driver.observe(report(), BEGAN + 1.0)
+    assert driver.silent(BEGAN + 1.5) == ""
+    assert driver.age(BEGAN + 1.5) == 0.5
+    driver.check(BEGAN + 1.5)
