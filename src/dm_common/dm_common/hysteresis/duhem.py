@@ -61,28 +61,26 @@ class DuhemOperator:
         steps = 0.5 * (1.0 / f[:, 1:] + 1.0 / f[:, :-1]) * np.diff(z)
         travel = np.hstack((np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)))
         travel -= travel[:, [middle]]
-        self._ends = z[begin], z[end], travel[rows, end]
         # All tables in one, each moved out of the others' way, so that one look-up serves all actuators.
-        self._z_apart, self._travel_apart = 2.0 * np.ptp(z) * rows, 2.0 * np.abs(travel).max() * rows
+        self._apart = 2.0 * float(np.ptp(z))
+        travel += 2.0 * np.abs(travel).max() * rows[:, None]
+        self._end = travel[rows, end]
         self._z, self._travel = np.tile(z, len(rows)), travel.ravel()
-        self._z_rows = (z + self._z_apart[:, None]).ravel()
-        self._travel_rows = (travel + self._travel_apart[:, None]).ravel()
+        self._z_apart = (z + self._apart * rows[:, None]).ravel()
 
-    def _rows(self, way: Floats) -> NDArray[np.intp]:
+    def _rows(self, way: Floats) -> NDArray[np.intp] | int:
         """The table of each element of `way`: actuators are along the only axis, or the last but one."""
         if not self._own:
-            return np.zeros(way.shape, dtype=np.intp)
+            return 0
         actuators = np.arange(len(self.slope))
         return np.asarray(2 * (actuators if way.ndim == 1 else actuators[:, None]) + (way < 0.0))
 
     def move(self, z: Floats, change: Floats) -> Floats:
-        """The state z (N,) or (..., N, P) after signals changed by `change` on a straight way."""
-        way = np.where(np.broadcast_to(change, np.broadcast_shapes(np.shape(z), np.shape(change))) < 0.0, -1.0, 1.0)
+        """The state after signals changed by `change` (N,) or (..., N, P) from `z` on, which may repeat."""
+        way = np.where(change < 0.0, -1.0, 1.0)
         rows = self._rows(way)
-        low, high, far = self._ends
-        along = np.minimum(np.maximum(way * z, low[rows]), high[rows]) + self._z_apart[rows]
-        travelled = np.minimum(np.interp(along, self._z_rows, self._travel) + np.abs(change), far[rows])
-        return np.asarray(way * np.interp(travelled + self._travel_apart[rows], self._travel_rows, self._z))
+        travelled = np.interp(way * z + self._apart * rows, self._z_apart, self._travel) + np.abs(change)
+        return np.asarray(way * np.interp(np.minimum(travelled, self._end[rows]), self._travel, self._z))
 
     def rise(self, z: Floats, way: Floats) -> Floats:
         """dz/du at the state z, on a way that rises (`way` 1) or falls (-1); shapes as in :meth:`move`."""
