@@ -46,21 +46,19 @@ class DuhemOperator:
         self._polynomial = np.vstack((np.ones(len(rows)), -slope.reshape(len(rows), -1).T, np.zeros(len(rows))))
         z = np.linspace(-REACH, REACH, KNOTS)
         f = np.polynomial.polynomial.polyval(z, self._polynomial)  # (rows, KNOTS)
-        # A rise ends where the slope does, or where a full swing leads; a fall at the opposite value.
+        passable = np.maximum(f, SLOPE_MIN)
+        steps = 0.5 * (1.0 / passable[:, 1:] + 1.0 / passable[:, :-1]) * np.diff(z)
+        travel = np.hstack((np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)))
         middle = KNOTS // 2
-        onward = np.maximum(f[:, middle:], SLOPE_MIN)
-        travel = np.cumsum(0.5 * (1.0 / onward[:, 1:] + 1.0 / onward[:, :-1]) * np.diff(z[middle:]), axis=1)
-        over = (f[:, middle + 1 :] < SLOPE_MIN) | (travel >= FULL_SWING)
+        travel -= travel[:, [middle]]
+        # A rise ends where the slope does, or where a full swing leads; a fall at the opposite value.
+        over = ((f < SLOPE_MIN) | (travel >= FULL_SWING))[:, middle + 1 :]
         end = middle + np.where(over.any(axis=1), over.argmax(axis=1), KNOTS)
         begin = KNOTS - 1 - (end.reshape(-1, 2)[:, ::-1].ravel() if self._own else end)
         met = (np.arange(KNOTS) >= begin[:, None]) & (np.arange(KNOTS) <= end[:, None])
         if end.max() >= KNOTS - 1 or end.min() < middle + 1 or f[met].min() <= 0.0:
             raise ValueError(f"duhem_slope = {slope.tolist()}: the state does not stay within +-{REACH:g}")
         self.slope_range = float(f[met].min()), float(f[met].max())
-        f = np.maximum(f, SLOPE_MIN)
-        steps = 0.5 * (1.0 / f[:, 1:] + 1.0 / f[:, :-1]) * np.diff(z)
-        travel = np.hstack((np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)))
-        travel -= travel[:, [middle]]
         # All tables in one, each moved out of the others' way, so that one look-up serves all actuators.
         self._apart = 2.0 * float(np.ptp(z))
         travel += 2.0 * np.abs(travel).max() * rows[:, None]
