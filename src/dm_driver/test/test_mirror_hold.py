@@ -89,12 +89,14 @@ def test_fields_that_cannot_be(clock: Clock, code: ErrorCode, fields: dict[str, 
         MirrorHold(clock).ask(**{"operation": Operation.HOLD, "holder": "operator"} | fields)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("between", ["nobody", "command", "hold"])
+@pytest.mark.parametrize("between", ["nobody", "command", "own command, then another", "hold"])
 def test_a_hold_that_lapsed_is_renewed_only_where_nobody_moved_the_mirror(
     hold: MirrorHold, clock: Clock, between: str
 ) -> None:
     clock.now += 1.1 * LEASE_S
-    if between == "command":
+    if between.startswith("own"):
+        hold.evict("calibration")
+    if between.endswith(("command", "another")):
         assert not hold.check("", take_over=False)
         hold.evict("")
     elif between == "hold":

@@ -39,8 +39,8 @@ class MirrorHold:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._lock = threading.Lock()
+        # The holder stays until somebody else moves the mirror, also when the lease has run out: see `_current`.
         self._holder = self._purpose = ""
-        self._lapsed = ""  # whose hold ended without being given back, as long as nobody else has moved the mirror
         self._since = self._until = self._duration = 0.0
         self._evicted = self._evicted_by = ""  # whose hold was taken over last, and by whom
 
@@ -78,9 +78,8 @@ class MirrorHold:
             if current not in ("", holder) and operation != Operation.TAKE_OVER:
                 raise Refusal(ErrorCode.BUSY, self._sentence())
             if operation == Operation.RELEASE:
-                self._holder = ""
-                if holder == self._lapsed:
-                    self._lapsed = ""
+                if holder == self._holder:
+                    self._holder = ""
                 return
             self._evict(holder, holder)
             if holder == self._evicted:
@@ -118,16 +117,12 @@ class MirrorHold:
             raise Refusal(ErrorCode.PREEMPTED, f"{self._evicted_by} has taken the mirror over")
 
     def _current(self) -> str:
-        if self._holder and self._clock() > self._until:
-            self._holder, self._lapsed = "", self._holder
-        return self._holder
+        return self._holder if self._clock() <= self._until else ""
 
     def _evict(self, holder: str, by: str) -> None:
         """Whoever else than `holder` has the mirror, or let its hold lapse, hears that `by` has taken it over."""
-        loser = self._current() or self._lapsed
-        if loser not in ("", holder):
-            self._evicted, self._evicted_by, self._holder = loser, by, ""
-        self._lapsed = ""
+        if self._holder not in ("", holder):
+            self._evicted, self._evicted_by, self._holder = self._holder, by, ""
 
     def _sentence(self) -> str:
         if not self._current():
