@@ -7,12 +7,12 @@ renewed all the time and ends soon after its holder has died. Taking it over is 
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 from enum import IntEnum
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.values import real, whole
 
 #: A hold that is not renewed ends after this time, s, where its holder names no other.
 LEASE_S = 3.0
@@ -27,6 +27,11 @@ class Operation(IntEnum):
     RENEW = 1
     TAKE_OVER = 2
     RELEASE = 3
+
+
+_OPERATION = whole(0, choices={int(operation): operation.name for operation in Operation})
+_DURATION = real(0.0, 0.0, unit="s")
+_LEASE = real(0.0, 0.0, LEASE_MAX_S, "s")
 
 
 class MirrorHold:
@@ -62,15 +67,11 @@ class MirrorHold:
         Raises:
             Refusal: BUSY, PREEMPTED when the hold to be renewed was taken over, or a field that cannot be.
         """
-        if not 0 <= operation <= max(Operation):
-            raise Refusal(ErrorCode.OUT_OF_RANGE, f"operation = {operation}: must be 0 to {max(Operation)}")
+        _OPERATION.check("operation", operation)
         if not holder.strip():
             raise Refusal(ErrorCode.INVALID_ARGUMENT, "holder is empty: must say who holds the mirror")
-        for name, value, high in (("duration", duration, math.inf), ("lease", lease, LEASE_MAX_S)):
-            if not math.isfinite(value):
-                raise Refusal(ErrorCode.NOT_FINITE, f"{name} = {value}: must be a finite number")
-            if not 0.0 <= value <= high:
-                raise Refusal(ErrorCode.OUT_OF_RANGE, f"{name} = {value:g} s: must be 0 to {high:g} s")
+        _DURATION.check("duration", duration)
+        _LEASE.check("lease", lease)
         with self._lock:
             current = self._current()
             if operation == Operation.RENEW:
