@@ -48,8 +48,7 @@ class MoveQueue:
         """Let `move` be the next."""
         newest = self.newest
         # The mirror never held the end of a degauss that is left.
-        left = newest is not None and newest.kind is Kind.DEGAUSS
-        move.before = newest.before if newest is not None and left else self.requested
+        move.before = newest.before if newest is not None and newest.kind is Kind.DEGAUSS else self.requested
         if self.pending is not None:
             self.pending.finish(Outcome.SUPERSEDED)
         self.pending, self.requested = move, move.target

@@ -24,8 +24,8 @@ from dm_common.ros import diagnostics, parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.worker import WorkerService, never_silent
 from dm_driver.actuator_writer import ActuatorWriter
-from dm_driver.commands.command_gate import CommandGate
-from dm_driver.commands.degauss_action import CODE_OF_OUTCOME, DegaussAction
+from dm_driver.commands.command_gate import CODE_OF_OUTCOME, MARGIN_S, CommandGate
+from dm_driver.commands.degauss_action import DegaussAction
 from dm_driver.commands.mirror_hold import MirrorHold
 from dm_driver.driver_configuration import DriverConfiguration, build_configuration
 from dm_driver.driver_health import LinkLog, driver_health
@@ -36,8 +36,6 @@ from dm_driver.moves import Move, Outcome, WriterState
 
 #: Shortest time between two state messages in the middle of a ramp.
 STATE_INTERVAL_S = 0.02
-#: Time for the electronics beyond what a ramp takes.
-MARGIN_S = 2.0
 
 
 class PdmDriverNode(LifecycleNode):

@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.commands.mirror_hold import MirrorHold
 from dm_driver.driver_configuration import DriverConfiguration
-from dm_driver.moves import Move
+from dm_driver.moves import Outcome
+
+Result = TypeVar("Result")
+
+#: Time for the electronics beyond what a ramp takes, s.
+MARGIN_S = 2.0
+
+CODE_OF_OUTCOME = {
+    Outcome.REACHED: ErrorCode.OK,
+    Outcome.SUPERSEDED: ErrorCode.PREEMPTED,
+    Outcome.LINK_LOST: ErrorCode.ELECTRONICS_UNREACHABLE,
+    Outcome.STOPPED: ErrorCode.DRIVER_INACTIVE,
+}
 
 
 class CommandGate:
@@ -37,14 +49,15 @@ class CommandGate:
         self,
         source: str,
         request: Any,
-        carry_out: Callable[[ActuatorWriter, DriverConfiguration], Move | None],
+        carry_out: Callable[[ActuatorWriter, DriverConfiguration], Result],
         dry_run: bool = False,
-    ) -> Move | Refusal | None:
+    ) -> Result | Refusal:
         """Carry out a request, or return and report its refusal. A refused dry run is the caller's business only.
 
         Args:
             source: what the request came by, for the log.
             request: its fields `holder` and, where it has one, `take_over` are judged here.
+            carry_out: returns what has begun to move; None = nothing has, and whoever holds the mirror keeps it.
         """
         writer, configuration = self.writer, self.configuration
         if not dry_run:
@@ -55,14 +68,14 @@ class CommandGate:
                     ErrorCode.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first"
                 )
             takes_over = not dry_run and self.hold.check(request.holder, getattr(request, "take_over", False))
-            move = carry_out(writer, configuration)
-            if move is not None:
+            result = carry_out(writer, configuration)
+            if result is not None:
                 holder = self.hold.holder
                 self.hold.evict(request.holder)
                 if takes_over:
                     by = request.holder or "nobody in particular"
                     self._report(f"{source} of {by} took the mirror from {holder}", True)
-            return move
+            return result
         except Refusal as refusal:
             if not dry_run:
                 self.refused[ErrorCode(refusal.error_code).name] += 1

@@ -14,22 +14,13 @@ from rclpy.node import Node
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import WorkerActionServer
 from dm_driver.actuator_writer import ActuatorWriter
-from dm_driver.commands.command_gate import CommandGate
+from dm_driver.commands.command_gate import CODE_OF_OUTCOME, MARGIN_S, CommandGate
 from dm_driver.degauss import degauss_move
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Move, Outcome
 
 #: How often a degauss is looked after, s, and how often its feedback is published.
 POLL_S, FEEDBACK_S = 0.02, 0.1
-#: Time for the electronics beyond what the way back takes.
-MARGIN_S = 2.0
-
-CODE_OF_OUTCOME = {
-    Outcome.REACHED: ErrorCode.OK,
-    Outcome.SUPERSEDED: ErrorCode.PREEMPTED,
-    Outcome.LINK_LOST: ErrorCode.ELECTRONICS_UNREACHABLE,
-    Outcome.STOPPED: ErrorCode.DRIVER_INACTIVE,
-}
 
 
 class DegaussAction:
@@ -65,15 +56,11 @@ class DegaussAction:
 
     def _begin(self, goal: Any) -> tuple[ActuatorWriter, Move] | Refusal:
         """The move of a goal, which has begun; or its refusal: things may have changed since it was admitted."""
-        used: list[ActuatorWriter] = []
 
-        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move:
-            used.append(writer)
-            return writer.degauss(*self._cycle(goal, configuration))
+        def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> tuple[ActuatorWriter, Move]:
+            return writer, writer.degauss(*self._cycle(goal, configuration))
 
-        move = self._gate.attempt("degauss", goal, carry_out)
-        assert move is not None
-        return move if isinstance(move, Refusal) else (used[0], move)
+        return self._gate.attempt("degauss", goal, carry_out)
 
     def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
         began, result = time.monotonic(), Degauss.Result()
