@@ -35,8 +35,6 @@ SETTLED = 1e-8
 SOLVABLE = 1e-13
 #: Evaluations of the Gauss-Newton iteration at most, from a guess and from a fit to other rows.
 EVALUATIONS, EVALUATIONS_AGAIN = 20, 8
-#: Least uncertainty of a response, m, that of data without noise.
-SCATTER_MIN = 1e-11
 #: Creep that explains less than so many squared standard deviations of the maps is none, and, of actuators without
 #: hysteresis, less than this share of what is left without it: slow drift of the figure looks like it.
 CREEP_SHOWN, CREEP_SHARE = 10.0, 0.03

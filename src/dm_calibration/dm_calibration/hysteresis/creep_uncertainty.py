@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Run
+from dm_calibration.hysteresis.candidate_fit import Run
 from dm_calibration.hysteresis.features import creep_states, follow, spectrum_prior
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
@@ -51,8 +51,7 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     design = np.hstack((figure, (features[:, 0] + creep)[keep]))
     solution = np.linalg.lstsq(design, values[keep], rcond=1e-10)[0]
     left = values[keep] - design @ solution
-    scatter = np.maximum(np.sqrt(np.square(left).sum(axis=0) / max(len(left) - design.shape[1], 1)), SCATTER_MIN)
-    scatter[: run.responses.coefficients] = np.median(scatter[: run.responses.coefficients])
+    scatter = run.responses.scatter(np.sqrt(np.square(left).sum(axis=0) / max(len(left) - design.shape[1], 1)))
     gains = solution[figure.shape[1] :] / scatter
     seen = without(features[keep], basis_of(figure))
 

@@ -14,17 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import (
-    CANDIDATES,
-    PREISACH,
-    SCATTER_MIN,
-    Candidate,
-    CandidateProblem,
-    LawFit,
-    Run,
-)
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, CandidateProblem, LawFit, Run
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_calibration.influence.screening import MAD_TO_SIGMA
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -165,7 +158,5 @@ def _scatter(rich: CandidateProblem, keep: Rows) -> Floats:
     for _ in range(2):
         left = rich.scaled(scatter).fit(keep, evaluations=4).residual[keep]
         # Robust: maps that no law explains must not set the scale.
-        size = 1.4826 * np.median(np.abs(left), axis=0)
-        scatter = np.maximum(size, SCATTER_MIN)
-        scatter[: responses.coefficients] = max(float(np.median(size[: responses.coefficients])), SCATTER_MIN)
+        scatter = responses.scatter(MAD_TO_SIGMA * np.median(np.abs(left), axis=0))
     return scatter

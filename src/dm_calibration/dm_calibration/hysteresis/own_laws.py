@@ -21,7 +21,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.candidate_fit import SCATTER_MIN, Candidate, LawFit, Run
+from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Run
 from dm_calibration.hysteresis.features import (
     PER_ELEMENT,
     creep_states,
@@ -35,6 +35,7 @@ from dm_calibration.hysteresis.features import (
     weights_of,
 )
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
+from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
@@ -56,8 +57,6 @@ SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD = 0.5, 12.0, 0.3
 #: Rounds of the three solutions in turn. With 6 the slow creep is a third less true and held-out errors up to four
 #: times as large, with 60 hardly better.
 ROUNDS = 20
-#: Standard deviation of a normal distribution by the median of its absolute values.
-MEDIAN_TO_SIGMA = 1.4826
 #: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
 #: times of it errors change by less than a tenth.
 SPREAD = 0.1
@@ -212,12 +211,10 @@ class OwnLaws:
 
     def _scatter_of(self, residual: Floats) -> Floats:
         """(D,) m, one value for all coefficients; maps that no law explains do not set it."""
-        count, coefficients = len(residual), self.run.responses.coefficients
+        count = len(residual)
         freedom = max(count - self._figure.shape[1] - self._plain.shape[2], 1)
-        size = MEDIAN_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
-        scatter = np.maximum(size, SCATTER_MIN)
-        scatter[:coefficients] = np.median(scatter[:coefficients])
-        return np.asarray(scatter)
+        size = MAD_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
+        return self.run.responses.scatter(size)
 
     def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats, prior: Floats) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior."""

@@ -19,6 +19,8 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 
 Floats = NDArray[np.float64]
 
+#: Least uncertainty of a response, m, that of data without noise.
+SCATTER_MIN = 1e-11
 #: Patterns weaker than this share of the strongest are noise.
 WEAKEST_PATTERN = 0.03
 
@@ -36,6 +38,12 @@ class Responses:
     values: Floats
     coefficients: int
     usable: NDArray[np.bool_]
+
+    def scatter(self, size: Floats) -> Floats:
+        """(D,) m, uncertainty of each response where a fit leaves `size` (D,) of it: one value for all coefficients."""
+        scatter = np.maximum(size, SCATTER_MIN)
+        scatter[: self.coefficients] = np.median(scatter[: self.coefficients])
+        return np.asarray(scatter)
 
 
 def responses_of(maps: MapSet) -> Responses:
