@@ -134,8 +134,11 @@ class Fields:
 
     def __init__(self, table: Mapping[str, Value]) -> None:
         self._table = dict(table)
-        # Each with the range in which a number is right without another look.
-        self._rules = [(name, attrgetter(name), value, *_quick(value)) for name, value in table.items()]
+        # Each with what is right without another look: a choice, an empty array, or a number within a range.
+        self._rules = [
+            (name, attrgetter(name), value, value.many, 0 in value.sizes, *_quick(value))
+            for name, value in table.items()
+        ]
 
     def within(self, name: str) -> dict[str, Value]:
         """The table for a message that holds this one as its field `name`."""
@@ -143,20 +146,22 @@ class Fields:
 
     def check(self, message: Any) -> None:
         """Raise Refusal naming the first field that may not be as it is, its value and what is allowed."""
-        for name, get, value, low, high in self._rules:
+        for name, get, value, many, may_be_empty, low, high in self._rules:
             given = get(message)
-            # A request on its way to the mirror waits for this.
-            if low <= high:
-                if low <= given <= high:
-                    continue
-            elif value.many and not len(given) and 0 in value.sizes:
-                continue
-            value.check(name, given)
+            # Most are right, and a request on its way to the mirror waits for this.
+            if many:
+                right = may_be_empty and not len(given)
+            elif value.choices:
+                right = given in value.choices
+            else:
+                right = low <= high and low <= given <= high
+            if not right:
+                value.check(name, given)
 
 
 def _quick(value: Value) -> tuple[float, float]:
-    """Between these a value is right without another look; nothing is where the first is above the second."""
-    if value.kind not in (int, float) or value.choices:
+    """Between these a value without choices is right; nothing is where the first is above the second."""
+    if value.kind not in (int, float):
         return 1.0, 0.0
     if value.infinite:
         return value.low, value.high

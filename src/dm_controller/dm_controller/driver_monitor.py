@@ -119,25 +119,22 @@ class DriverMonitor:
             return ""
         return f"pdm_driver has not reported for {age:.1f} s (driver_timeout {limit:g} s): is it running?"
 
-    def check(self, now: float) -> None:
-        """Raise Refusal when the driver, by its last report and the age of that, takes no commands."""
+    def refusal(self, now: float) -> Refusal | None:
+        """The reason why the driver, by its last report and the age of that, takes no commands; None = it does."""
         report = self.latest
         if report is None:
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "no actuator_state from pdm_driver yet: is the driver running?")
-        if self.gone:
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, self.gone)
-        if report.driver_state != _ACTIVE:
-            raise _not_active(report)
+            text = "no actuator_state from pdm_driver yet: is the driver running?"
+            return Refusal(ErrorCode.DRIVER_UNAVAILABLE, text)
+        if report.driver_state != _ACTIVE and not self.gone:
+            return _not_active(report)
         if silent := self.silent(now):
-            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
-
-    def refusal(self, now: float) -> Refusal | None:
-        """What `check` raises; None = the driver takes commands."""
-        try:
-            self.check(now)
-        except Refusal as refusal:
-            return refusal
+            return Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
         return None
+
+    def check(self, now: float) -> None:
+        """Raise what `refusal` gives."""
+        if (refusal := self.refusal(now)) is not None:
+            raise refusal
 
     def check_holder(self, request: Request) -> None:
         """Raise Refusal when somebody else holds the mirror and `request` does not take it over."""
@@ -214,12 +211,10 @@ class DriverMonitor:
             return None
         sent.given_up = True
         text = "the driver has not confirmed the command"
-        try:
-            self.check(now)
-        except Refusal as refusal:
+        if (refusal := self.refusal(now)) is not None:
             return sent.order, Refusal(refusal.error_code, f"{text}: {refusal}")
         report = self.latest
-        assert report is not None  # else the check had refused
+        assert report is not None  # else there had been a refusal
         if report.error_code != ErrorCode.OK:
             return sent.order, Refusal(report.error_code, f"{text}: {report.message}")
         if self._heard < sent.steady:
