@@ -79,7 +79,7 @@ def shared_memory() -> Finding | None:
     if free < SHARED_MEMORY_MIN:
         return Finding(
             f"/dev/shm has {free / 1e6:.0f} MB free; each node takes 17 MB",
-            "remove stale fastrtps_* files from /dev/shm (fastdds shm clean); in a container raise --shm-size",
+            "./dm exec fastdds shm clean removes what killed processes left; in a container raise --shm-size",
         )
     return None
 
@@ -115,7 +115,7 @@ def messages() -> Finding | None:
             publisher.publish(String(data="?"))
             if not first.wait(lambda: received, 2.0):
                 return Finding(
-                    "a message between two nodes did not arrive", "fastdds shm clean; then ./dm doctor again"
+                    "a message between two nodes did not arrive", "./dm exec fastdds shm clean; then ./dm doctor again"
                 )
         except DeformableMirrorError as error:
             return Finding(str(error), "run ./dm again")
