@@ -113,6 +113,8 @@ PARSED = {
     "./dm demo --camera": _LONG + "its parts run in test_autofocus_node.py",
     "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
+    "./dm up --camera": "test_many_mirrors.py checks what it adds; test_autofocus_node.py runs such nodes",
+    "./dm exec python examples/camera_focus.py": "test_autofocus_node.py runs it",
     "./dm test": "would run this test again",
     "./dm test --fast": "would run tests within a test",
     "./dm test src/dm_common/test/test_zernike_terms.py": "would run tests within a test",

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from dm_autofocus.optics import FocusOptics
-from dm_tools.demo.demo_camera import REST_DISTANCE
+from dm_tools.verbs.up import REST_DISTANCE
 from documentation import ELSEWHERE, PAGES, ROOT, classified
 
 DOCS = ROOT / "docs"

@@ -14,6 +14,7 @@ import pytest
 from dm_bringup.suite import save_config
 from dm_client import DeformableMirrorClient
 from dm_tools.demo.demo_bench import bench_config
+from dm_tools.doctor.bench import parameters
 from dm_tools.verbs.up import configurations
 
 pytestmark = pytest.mark.processes
@@ -36,6 +37,15 @@ def test_virtual_mirrors_share_neither_ports_nor_folders() -> None:
 
 def test_one_mirror_is_as_shipped() -> None:
     assert list(configurations([], [""]).values()) == list(configurations([], ["a"]).values())
+
+
+def test_a_camera_comes_with_an_autofocus_that_knows_its_optics(tmp_path: Path) -> None:
+    (config,) = configurations([], [""], camera=True).values()
+    assert parameters(config) is None
+    assert config["virtual_bench"]["camera.rate"] > 0
+    assert config["virtual_bench"]["camera.rest_distance"] == config["autofocus"]["optics.rest_distance"]
+    with pytest.raises(ValueError, match="--camera is for the virtual bench that ships"):
+        configurations([tmp_path / "config.yaml"], [""], camera=True)
 
 
 @pytest.mark.parametrize(

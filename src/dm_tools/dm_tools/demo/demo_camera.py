@@ -15,15 +15,12 @@ from numpy.typing import NDArray
 
 from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
 from dm_tools.output import console, progress_bar, write_json
+from dm_tools.verbs.up import DISTANCES, RATE, add_camera
 
 if TYPE_CHECKING:  # both are slow to import, and `dm --help` needs neither
     from dm_autofocus import CameraFocusClient
     from dm_tools.demo.demo import Hysteresis
 
-#: The scene, from left to right [m]. Rest distance and range: between 5 m and infinity for +-0.05 1/m.
-DISTANCES = (6.0, 15.0, 100.0)
-REST_DISTANCE = 10.0
-RATE = 30.0
 #: Of the calibration: fewer and smaller maps than a bench would take, for a quick demonstration.
 MAPS, PIXELS = 120, 472
 
@@ -61,13 +58,8 @@ class Focused:
 def camera_config(folder: Path, law: str, creep: float, seed: int) -> dict[str, dict[str, Any]]:
     """The bench in real time, with the camera and the node `autofocus`; the calibration is the newest in `folder`."""
     config = bench_config(folder, law, creep, seed, speed=0.0)
-    config["virtual_bench"] |= {
-        "camera.rate": RATE,
-        "camera.rest_distance": REST_DISTANCE,
-        "camera.distances": list(DISTANCES),
-    }
+    add_camera(config)
     config["calibration"]["load_on_start"] = "newest"
-    config["autofocus"] = {"optics.rest_distance": REST_DISTANCE}
     return config
 
 

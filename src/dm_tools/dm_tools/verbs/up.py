@@ -24,6 +24,12 @@ LOG_FORMAT = "{date_time_with_ms} {severity} {name}: {message}"
 #: Between the ports of two virtual benches.
 PORTS_APART = 10
 
+#: Of the virtual camera: objects from left to right [m]; what is in focus while the mirror is flat [m], so that
+#: +-0.05 1/m reach from 5 m to infinity; images per second.
+DISTANCES = (6.0, 15.0, 100.0)
+REST_DISTANCE = 10.0
+RATE = 30.0
+
 
 def shared_config(name: str) -> Path:
     """A file of the package's config folder."""
@@ -43,6 +49,10 @@ def up(
     namespace: Annotated[
         list[str] | None, typer.Option(help="Namespace of the mirror; several times for as many mirrors.")
     ] = None,
+    camera: Annotated[
+        bool,
+        typer.Option("--camera", help="With a virtual camera behind the mirror of the virtual bench, and autofocus."),
+    ] = False,
     logs: Annotated[Path | None, typer.Option(help="Write the nodes' output to files in this folder instead.")] = None,
 ) -> None:
     """Start the nodes and keep them running until Ctrl-C or SIGTERM; the mirror is then ramped to its safe shape.
@@ -53,7 +63,7 @@ def up(
     from dm_tools.doctor.bench import effective
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
-    mirrors = configurations(config or [], namespace or [""])
+    mirrors = configurations(config or [], namespace or [""], camera)
     stop = threading.Event()
     # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
     # because a shell starts commands in the background with SIGINT ignored.
@@ -116,15 +126,18 @@ def say_when_ready(namespace: str, stop: threading.Event) -> None:
     next_step(f"in another terminal: ./dm {verb}{option}; ./dm status{option} says how things are")
 
 
-def configurations(files: list[Path], namespaces: list[str]) -> dict[str, Config]:
+def configurations(files: list[Path], namespaces: list[str], camera: bool = False) -> dict[str, Config]:
     """The configuration of the mirror in each namespace.
 
-    Several mirrors on virtual benches get ports and folders of their own.
+    Several mirrors on virtual benches get ports and folders of their own; with `camera` each has one behind it.
 
     Raises:
         ConfigError: a file cannot be used.
-        ValueError: the numbers do not match, a namespace comes twice, or a section is missing.
+        ValueError: the numbers do not match, a namespace comes twice, a section is missing, or a file has the say on
+            the camera.
     """
+    if camera and files:
+        raise ValueError("--camera is for the virtual bench that ships; a file of yours says itself what camera it has")
     names = [namespace.strip("/") for namespace in namespaces]
     if len(set(names)) < len(names):
         raise ValueError(f"--namespace {', '.join(namespaces)}: each mirror needs one of its own")
@@ -135,6 +148,8 @@ def configurations(files: list[Path], namespaces: list[str]) -> dict[str, Config
         configuration = load_config(files[number] if files else shared_config("bench.yaml"))
         if "pdm_driver" not in configuration:
             raise ValueError(f"{files[number]}: no section for pdm_driver: its required parameters must be given")
+        if camera:
+            add_camera(configuration)
         result[name] = configuration if files or len(names) == 1 else virtual_mirror(configuration, name, number)
     return result
 
@@ -163,3 +178,13 @@ def move_trigger(config: Config, port: int) -> None:
     bench["trigger.port"] = port
     command = interferometer.get("trigger_command", [])
     interferometer["trigger_command"] = [str(port) if part == old else part for part in command]
+
+
+def add_camera(config: Config) -> None:
+    """Put a camera behind the mirror of a virtual bench, and the node `autofocus`."""
+    config["virtual_bench"] |= {
+        "camera.rate": RATE,
+        "camera.rest_distance": REST_DISTANCE,
+        "camera.distances": list(DISTANCES),
+    }
+    config["autofocus"] = {"optics.rest_distance": REST_DISTANCE}
