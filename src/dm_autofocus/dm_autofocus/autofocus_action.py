@@ -14,14 +14,16 @@ from dm_msgs.msg import Capabilities
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from dm_autofocus.defocus_model import DefocusModel, FocusLens
+from dm_autofocus.autofocus_parameters import focus_lens, search_config
+from dm_autofocus.defocus_model import DefocusModel
 from dm_autofocus.defocus_search import BEYOND, FocusSearch
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
-from dm_autofocus.search import NOISE_POINTS, Peak, Phase, SearchConfig
+from dm_autofocus.search import Peak, Phase, SearchConfig
 from dm_autofocus.sharpness import Region, check_region, cut
 from dm_autofocus.tracking import TrackConfig, Tracker
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerActionServer
 from dm_common.values import Fields, real, reals
 
@@ -39,12 +41,6 @@ def ready_capabilities(probe: FocusProbe) -> Capabilities:
     if capabilities.quality == Capabilities.UNCALIBRATED:
         raise Refusal(capabilities.error_code or ErrorCode.NOT_CALIBRATED, capabilities.message)
     return capabilities
-
-
-def tolerance_of(values: Mapping[str, Any], capabilities: Capabilities) -> float:
-    """Finest step of curvature [1/m]: as configured, else the depth of focus of the calibrated aperture."""
-    configured = float(values["search.tolerance"])
-    return configured or depth_of_focus(capabilities.aperture_radius, values["optics.wavelength"])
 
 
 AUTOFOCUS = Fields(
@@ -113,7 +109,6 @@ class AutofocusAction:
 
     def _config(self, goal: Any) -> tuple[SearchConfig, Region]:
         """The search that a goal asks for. Raises Refusal."""
-        values = self._values
         capabilities = ready_capabilities(self._probe)
         margin = MARGIN * (capabilities.curvature_max - capabilities.curvature_min)
         low, high = capabilities.curvature_min + margin, capabilities.curvature_max - margin
@@ -127,17 +122,8 @@ class AutofocusAction:
                 )
             low, high = max(wanted[0], low), min(wanted[1], high)
         try:
-            region = check_region(goal.region if len(goal.region) else values["region"])
-            tolerance = tolerance_of(values, capabilities)
-            return SearchConfig(
-                low,
-                high,
-                tolerance,
-                max(NOISE_POINTS, 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance))),
-                values["search.fine_points"],
-                0.0,
-                values["search.least_contrast"],
-            ), region
+            region = check_region(goal.region if len(goal.region) else self._values["region"])
+            return search_config(self._values, capabilities.aperture_radius, low, high), region
         except ValueError as error:
             raise Refusal(ErrorCode.OUT_OF_RANGE, str(error)) from error
 
@@ -186,34 +172,25 @@ class AutofocusAction:
 
     def _model(self, config: SearchConfig, region: Region) -> DefocusModel | str:
         """How images of the region are blurred, or the reason why that is not known."""
-        values, capabilities = self._values, ready_capabilities(self._probe)
-        image, info = self._probe.newest, self._probe.camera_info
-        if not values["search.few_images"]:
+        radius, image = ready_capabilities(self._probe).aperture_radius, self._probe.newest
+        if not self._values["search.few_images"]:
             return "search.few_images is false"
         if image is None:
             return "there was no image yet to show its size"
-        focal_length = values["optics.focal_length_px"]
-        if focal_length == 0 and info is not None:
-            focal_length = info.k[0] / max(info.binning_x, 1)
-        if not focal_length > 0:
-            return f"optics.focal_length_px is 0, and camera_info {'came not yet' if info is None else 'holds no fx'}"
-        # Behind a relay that widens the beam m times, angles are m times smaller.
-        focal_length *= values["optics.relay_magnification"]
-        lens = FocusLens(capabilities.aperture_radius, values["optics.wavelength"], focal_length)
         try:
+            lens = focus_lens(self._values, radius, self._probe.camera_info)
             shape = cut(np.empty((image.height, image.width), np.uint8), region).shape
             return DefocusModel(shape, lens, config.high - config.low + BEYOND * config.tolerance)
-        except ValueError as error:  # too small
+        except ValueError as error:  # no focal length, or too small
             return str(error)
 
     def _stands_where_sent(self) -> bool:
         """Whether the mirror has the curvature that was asked for, by what the controller answered last."""
-        answer, capabilities = self._probe.answer, ready_capabilities(self._probe)
+        answer, radius = self._probe.answer, ready_capabilities(self._probe).aperture_radius
         if answer is None or not answer.history_known:
             return False
-        # A coefficient z of defocus over the radius a, z (2 r^2 / a^2 - 1), is the curvature 4 z / a^2.
-        uncertainty = 4 * answer.predicted_max_zernike_upper / capabilities.aperture_radius**2
-        return uncertainty < TRUSTED * depth_of_focus(capabilities.aperture_radius, self._values["optics.wavelength"])
+        uncertainty = curvature_of_defocus(answer.predicted_max_zernike_upper, radius)
+        return uncertainty < TRUSTED * depth_of_focus(radius, self._values["optics.wavelength"])
 
     def _draw_in(self, search: FocusSearch, error: Refusal) -> None:
         try:

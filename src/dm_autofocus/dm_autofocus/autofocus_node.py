@@ -11,8 +11,8 @@ from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities, tolerance_of
-from dm_autofocus.autofocus_parameters import PARAMETERS, focus_optics
+from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities
+from dm_autofocus.autofocus_parameters import PARAMETERS, focus_optics, tolerance_of
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import dioptre_of, distance_of
 from dm_autofocus.search import Phase
@@ -86,7 +86,7 @@ class AutofocusNode(Node):
         response.dioptre_min, response.dioptre_max = self._dioptres(capabilities)
         response.distance_far = distance_of(response.dioptre_min)
         response.distance_near = distance_of(response.dioptre_max) if response.dioptre_max > 0 else math.nan
-        response.curvature_tolerance = tolerance_of(self._values, capabilities)
+        response.curvature_tolerance = tolerance_of(self._values, capabilities.aperture_radius)
         response.message = self._range_text(capabilities)
         return response
 

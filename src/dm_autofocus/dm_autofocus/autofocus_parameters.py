@@ -1,4 +1,4 @@
-"""Parameters of the node `autofocus`."""
+"""Parameters of the node `autofocus`, and what is made from their values."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-from dm_autofocus.optics import FocusOptics
+from dm_autofocus.defocus_model import FocusLens
+from dm_autofocus.optics import FocusOptics, depth_of_focus
+from dm_autofocus.search import NOISE_POINTS, SearchConfig
 from dm_autofocus.sharpness import METRICS, check_region
 from dm_common.ros.parameters import Parameter, real, reals, switch, text, whole
 
@@ -100,3 +102,46 @@ def focus_optics(values: Mapping[str, Any]) -> FocusOptics:
         values["optics.incidence"],
         values["optics.pupil_offset"],
     )
+
+
+def tolerance_of(values: Mapping[str, Any], aperture_radius: float) -> float:
+    """Finest step of curvature [1/m]: as configured, else the depth of focus of the calibrated aperture."""
+    return float(values["search.tolerance"]) or depth_of_focus(aperture_radius, values["optics.wavelength"])
+
+
+def search_config(values: Mapping[str, Any], aperture_radius: float, low: float, high: float) -> SearchConfig:
+    """The search of a range of curvatures [1/m].
+
+    Raises:
+        ValueError: there is nothing between `low` and `high`, or the aperture has no radius.
+    """
+    tolerance = tolerance_of(values, aperture_radius)
+    coarse_points = 1 + math.ceil((high - low) / (values["search.coarse_step"] * tolerance))
+    return SearchConfig(
+        low,
+        high,
+        tolerance,
+        coarse_points=max(NOISE_POINTS, coarse_points),
+        fine_points=values["search.fine_points"],
+        least_contrast=values["search.least_contrast"],
+    )
+
+
+def focus_lens(values: Mapping[str, Any], aperture_radius: float, camera_info: Any) -> FocusLens:
+    """What defocus looks like in the camera.
+
+    Args:
+        aperture_radius: of the beam on the mirror [m].
+        camera_info: a sensor_msgs/CameraInfo; None = none came yet.
+
+    Raises:
+        ValueError: the focal length is not known.
+    """
+    focal_length = values["optics.focal_length_px"]
+    if focal_length == 0 and camera_info is not None:
+        focal_length = camera_info.k[0] / max(camera_info.binning_x, 1)
+    if not focal_length > 0:
+        reason = "came not yet" if camera_info is None else "holds no fx"
+        raise ValueError(f"optics.focal_length_px is 0, and camera_info {reason}")
+    # Behind a relay that widens the beam m times, angles are m times smaller.
+    return FocusLens(aperture_radius, values["optics.wavelength"], focal_length * values["optics.relay_magnification"])

@@ -124,7 +124,12 @@ def curvature_of(coefficients: ArrayLike, radius: float) -> float:
     Args:
         radius: of the aperture, m.
     """
-    return 4.0 * float(_checked(coefficients)[_DEFOCUS]) / radius**2
+    return curvature_of_defocus(float(_checked(coefficients)[_DEFOCUS]), radius)
+
+
+def curvature_of_defocus(coefficient: float, radius: float) -> float:
+    """Curvature (1/m) of the paraboloid c r^2 / 2 whose defocus over an aperture's radius (m) is `coefficient` (m)."""
+    return 4.0 * coefficient / radius**2
 
 
 def _checked(coefficients: ArrayLike) -> NDArray[np.float64]:
