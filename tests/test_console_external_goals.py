@@ -7,7 +7,7 @@ from typing import Any
 
 from dm_msgs.action import Calibrate
 
-from dm_tools.console.external_goals import ExternalGoals
+from dm_tools.long_actions import ExternalGoals
 
 EXECUTING, SUCCEEDED = 2, 4
 

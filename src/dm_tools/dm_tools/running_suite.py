@@ -21,8 +21,6 @@ FIND_S = 1.2
 BUSY_S = 5.0
 #: Time in which every node reports its health, and an action what it is doing, s.
 REPORT_S = 1.5
-#: Actions that hold the mirror and say how far they are.
-STEPPED = ("calibrate", "converge", "build_recipes")
 
 
 def nodes_of_suite(client: DeformableMirrorClient) -> Counter[str]:
@@ -96,13 +94,13 @@ class Holder(NamedTuple):
 def holder(client: DeformableMirrorClient) -> Holder | None:
     """Who has the mirror for itself; None = nobody."""
     from dm_client.client import INTERFACES
-    from dm_tools.console.external_goals import ExternalGoals
+    from dm_tools.long_actions import LONG, ExternalGoals
 
     client.wait(lambda: "actuator_state" in client.messages, REPORT_S)
     state = client.messages.get("actuator_state")
     if state is None or not state.holder:
         return None
-    goals = [ExternalGoals(client.node, INTERFACES[name], name) for name in STEPPED]
+    goals = [ExternalGoals(client.node, INTERFACES[name], name) for name in LONG]
     client.wait(lambda: any(goal.running for goal in goals), 0.5)
     running = next((goal for goal in goals if goal.running), None)
     if running is None:

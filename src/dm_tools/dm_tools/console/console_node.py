@@ -24,8 +24,8 @@ from dm_common.messages import seconds
 from dm_common.ros import qos
 from dm_common.ros.diagnostics import hear_log
 from dm_common.ros.worker import answers_arrive
-from dm_tools.console.external_goals import ExternalGoals
 from dm_tools.console.state_observer import StateObserver
+from dm_tools.long_actions import LONG, ExternalGoals
 
 TOPICS = client.TOPICS | {
     "focus_state": (FocusState, qos.STATE),
@@ -38,9 +38,6 @@ NOT_OFFERED = ("ingest_file", "update_calibration")
 INTERFACES = {name: interface for name, interface in client.INTERFACES.items() if name not in NOT_OFFERED}
 #: Lines of the log that are kept.
 LOG_LINES = 200
-#: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
-WATCHED = ("build_recipes", "calibrate", "converge")
-
 #: A node whose diagnostics were not heard for so long counts as missing, s. Nodes publish once a second.
 SILENCE_S = 5.0
 #: Time for an answer that comes at once, s.
@@ -98,7 +95,7 @@ class ConsoleNode:
         self.lines_logged = 0
         hear_log(self.node, LOG_LINES, self.take_log)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
-        self.watched = {name: ExternalGoals(self.node, INTERFACES[name], name) for name in WATCHED}
+        self.watched = {name: ExternalGoals(self.node, INTERFACES[name], name) for name in LONG}
         self._connection.start()
 
     def _take(self, topic: str, message: Any) -> None:

@@ -13,8 +13,8 @@ from dm_msgs.srv import Flatten, LoadCalibration, Measure, SetFocus, SetSignals
 from dm_common.errors import ErrorCode, Refusal
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
-from dm_tools.console.status import calibration_step, converge_step, recipe_step
 from dm_tools.console.view_models import NM, poke_signals, prediction_text
+from dm_tools.long_actions import calibration_step, converge_step, recipe_step
 
 #: What the plans of a calibration are called.
 PLANS = {

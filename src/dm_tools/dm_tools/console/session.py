@@ -12,7 +12,7 @@ from typing import Any
 from dm_common.errors import Refusal
 from dm_tools.console.console_node import ConsoleNode, Snapshot
 from dm_tools.console.loops import Loop
-from dm_tools.console.status import calibration_step, converge_step, recipe_step
+from dm_tools.long_actions import calibration_step, converge_step, recipe_step
 
 #: Messages are shown so long, s of wall time, unless somebody dismisses them before; the log keeps failures.
 SHOWN_S = 120.0

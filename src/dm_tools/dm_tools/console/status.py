@@ -173,26 +173,3 @@ def now_text(snapshot: Any) -> str:
         f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {rounded(shape.bound * 1e9)} nm (95 %)"
         + (", held" if shape.held else "")
     )
-
-
-#: Phases of the action `calibrate`, by their number.
-PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
-
-
-def calibration_step(feedback: Any) -> str:
-    """Feedback of the action `calibrate`: phase, what is measured, what was dropped."""
-    dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
-    if feedback.reached_max_zernike > 0.0:
-        dropped += f", right to {rounded(feedback.reached_max_zernike * 1e9)} nm so far"
-    phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
-    return f"{phase} {feedback.label}{dropped}"
-
-
-def converge_step(feedback: Any) -> str:
-    """Feedback of the action `converge`: the map and how far off it was."""
-    return f"map {feedback.step}: largest coefficient {feedback.max_zernike * 1e9:.1f} nm"
-
-
-def recipe_step(feedback: Any) -> str:
-    """Feedback of the action `build_recipes`: the curvature, the map and how far off it was."""
-    return f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"

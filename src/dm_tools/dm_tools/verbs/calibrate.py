@@ -32,7 +32,7 @@ class CalibrationPlan(StrEnum):
 
 def run_calibration(client: Any, goal: Any) -> Any:
     """Run a Calibrate goal with a progress bar; returns the action's result."""
-    from dm_tools.console.status import calibration_step
+    from dm_tools.long_actions import calibration_step
 
     with progress_bar() as progress:
         task = progress.add_task("calibration", total=None)

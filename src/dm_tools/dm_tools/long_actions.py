@@ -1,4 +1,7 @@
-"""Goals of an action that somebody else sent: the console shows them, can cancel them and does not get in their way."""
+"""Actions that take long: goals that somebody else sent, and what the feedback says.
+
+The console shows such goals, can cancel them and does not get in their way; commands name them as what has the mirror.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,17 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from rclpy.task import Future
 
+from dm_common.figures import rounded
 from dm_common.ros import qos
 
+#: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
+LONG = ("build_recipes", "calibrate", "converge")
 #: action_msgs/GoalStatus: accepted, executing, canceling.
 RUNNING = (1, 2, 3)
 #: A goal that says nothing for so long has lost its node, s. Nodes wait 60 s for a map.
 SILENCE_S = 150.0
+#: Phases of the action `calibrate`, by their number.
+PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
 
 
 class ExternalGoals:
@@ -113,3 +121,22 @@ class ExternalGoals:
     def _begin(self, identity: bytes) -> None:
         self._running, self._feedback = identity, None
         self.goals += 1
+
+
+def calibration_step(feedback: Any) -> str:
+    """Feedback of the action `calibrate`: phase, what is measured, what was dropped."""
+    dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
+    if feedback.reached_max_zernike > 0.0:
+        dropped += f", right to {rounded(feedback.reached_max_zernike * 1e9)} nm so far"
+    phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
+    return f"{phase} {feedback.label}{dropped}"
+
+
+def converge_step(feedback: Any) -> str:
+    """Feedback of the action `converge`: the map and how far off it was."""
+    return f"map {feedback.step}: largest coefficient {feedback.max_zernike * 1e9:.1f} nm"
+
+
+def recipe_step(feedback: Any) -> str:
+    """Feedback of the action `build_recipes`: the curvature, the map and how far off it was."""
+    return f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"
