@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
 from rclpy.task import Future
 
-from dm_common.figures import rounded
+from dm_common.figures import in_nanometres
 from dm_common.ros import qos
 
 #: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
@@ -124,12 +124,14 @@ class ExternalGoals:
 
 
 def calibration_step(feedback: Any) -> str:
-    """Feedback of the action `calibrate`: phase, what is measured, what was dropped."""
-    dropped = f", {feedback.maps_dropped} dropped" if feedback.maps_dropped else ""
-    if feedback.reached_max_zernike > 0.0:
-        dropped += f", right to {rounded(feedback.reached_max_zernike * 1e9)} nm so far"
+    """Feedback of the action `calibrate`: phase, what is measured, what was dropped, how good it is so far."""
     phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
-    return f"{phase} {feedback.label}{dropped}"
+    text = f"{phase} {feedback.label}"
+    if feedback.maps_dropped:
+        text += f", {feedback.maps_dropped} dropped"
+    if feedback.reached_max_zernike > 0.0:
+        text += f", right to {in_nanometres(feedback.reached_max_zernike)} so far"
+    return text
 
 
 def converge_step(feedback: Any) -> str:

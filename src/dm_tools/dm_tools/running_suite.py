@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dm_bringup.nodes import NAMES
 from dm_common.errors import ErrorCode
-from dm_common.figures import rounded
-from dm_tools.output import NotRunningError, as_wavelengths, errors, nanometres
+from dm_common.figures import in_nanometres
+from dm_tools.output import NotRunningError, as_wavelengths, errors
 
 if TYPE_CHECKING:
     from dm_client import DeformableMirrorClient
@@ -56,7 +56,7 @@ def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
 
 def promise(bound: float) -> str:
     """A 95 % bound on the largest coefficient error (m) in the one way all verbs put it."""
-    return f"{rounded(nanometres(bound))} nm (95 % bound, {as_wavelengths(bound)})" if bound > 0.0 else "not known"
+    return f"{in_nanometres(bound)} (95 % bound, {as_wavelengths(bound)})" if bound > 0.0 else "not known"
 
 
 def ago(seconds: float) -> str:
@@ -70,7 +70,7 @@ def ago(seconds: float) -> str:
 def verdict(promised: float, measured: float) -> str:
     """Promised (0 = not known) and measured largest coefficient error (m), and whether the promise was kept."""
     kept = "[green]inside[/]" if measured <= promised else "[red]outside[/]"
-    found = f"promised {promise(promised)}, measured {rounded(nanometres(measured))} nm"
+    found = f"promised {promise(promised)}, measured {in_nanometres(measured)}"
     return f"{found}: {kept}" if promised > 0.0 else found
 
 

@@ -16,7 +16,7 @@ from dm_calibration.influence.registration import bumps
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, StepKind
-from dm_common.figures import rounded
+from dm_common.figures import in_nanometres, rounded
 from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.piston_tilt import weighted_fit
@@ -137,9 +137,9 @@ class GoodEnough:
         way = ", ".join(rounded(value * 1e9) for value in self.reached)
         parts = f" (part by part {way} nm)" if way else ""
         if found <= self._until:
-            return f"{rounded(self._until * 1e9)} nm is reached: {rounded(found * 1e9)} nm{parts}"
+            return f"{in_nanometres(self._until)} is reached: {in_nanometres(found)}{parts}"
         reason = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
-        return f"{rounded(self._until * 1e9)} nm is not reached, {rounded(found * 1e9)} nm is: {reason}{parts}"
+        return f"{in_nanometres(self._until)} is not reached, {in_nanometres(found)} is: {reason}{parts}"
 
 
 def map_noise(maps: MapSet) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from dm_msgs.msg import ActuatorState, Calibration
 
-from dm_common.figures import rounded
+from dm_common.figures import in_nanometres
 from dm_tools.console.view_models import QUALITIES
 from dm_tools.running_suite import ago, standing
 
@@ -169,7 +169,6 @@ def now_text(snapshot: Any) -> str:
         return "now: moving"
     if shape is None:
         return "now: not at a curvature that was asked for"
-    return (
-        f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {rounded(shape.bound * 1e9)} nm (95 %)"
-        + (", held" if shape.held else "")
+    return f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {in_nanometres(shape.bound)} (95 %)" + (
+        ", held" if shape.held else ""
     )

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_common.errors import ErrorCode
-from dm_common.figures import rounded
+from dm_common.figures import in_nanometres
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, progress_bar, write_json
 from dm_tools.running_suite import promise, running_suite
 
@@ -168,7 +168,7 @@ def write_parameters(parameters: str, target: Path, source: Path) -> None:
 
 def _foretold(result: Any) -> str:
     expected = result.expected_max_zernike
-    return f", expected {rounded(nanometres(expected))} nm" if expected > 0.0 else ""
+    return f", expected {in_nanometres(expected)}" if expected > 0.0 else ""
 
 
 def figures_of(result: Any) -> dict[str, Any]:

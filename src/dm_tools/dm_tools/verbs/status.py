@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from dm_tools.output import JsonOption, NamespaceOption, console, write_json
+from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
 from dm_tools.running_suite import (
     REPORT_S,
     Standing,
@@ -53,9 +53,9 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "mirror": mirror.serial if mirror is not None else None,
         "held_by": str(by) if by else None,
         "curvature": shape.curvature if shape else None,
-        "bound_nm": 1e9 * shape.bound if shape else None,
+        "bound_nm": nanometres(shape.bound) if shape else None,
         "calibration": calibration.id if calibration is not None else None,
-        "error_bound_nm": 1e9 * capabilities.error_bound if calibration is not None and capabilities else None,
+        "error_bound_nm": nanometres(capabilities.error_bound) if calibration and capabilities else None,
     }
     write_json(json, {"status": figures})
 

@@ -116,16 +116,15 @@ class FocusCard:
         return identity, recipes, known, self._session.running
 
     def _take_range(self, snapshot: Snapshot) -> None:
-        found = reachable(snapshot.capabilities)
+        capabilities = snapshot.capabilities
+        found = reachable(capabilities)
         if found is None:
-            capabilities = snapshot.capabilities
             calibrated = capabilities is not None and capabilities.calibration_id
             reason = capabilities.message if calibrated else "not known without a calibration"
             self._text.show(f"Reachable range: {reason}.")
             self._slider.set_enabled(False)
             return
         self._slider.set_enabled(True)
-        capabilities = snapshot.capabilities
         conditioned = capabilities.error_bound_conditioned
         extra = f", conditioned {conditioned * 1e9:.1f} nm" if conditioned > 0 else ""
         self._text.show(
