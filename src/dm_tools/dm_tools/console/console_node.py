@@ -13,7 +13,7 @@ from typing import Any
 
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dm_msgs.msg import FocusState, SurfaceMapInfo, ZernikeCoefficients
+from dm_msgs.msg import SurfaceMapInfo, ZernikeCoefficients
 from rclpy.task import Future
 from sensor_msgs.msg import Image
 
@@ -28,7 +28,6 @@ from dm_tools.console.state_observer import StateObserver
 from dm_tools.long_actions import LONG, ExternalGoals
 
 TOPICS = client.TOPICS | {
-    "focus_state": (FocusState, qos.STATE),
     "surface_map": (Image, qos.MAP),
     "surface_map_info": (SurfaceMapInfo, qos.MAP),
     "zernike": (ZernikeCoefficients, qos.STATE),
@@ -60,7 +59,6 @@ class Snapshot:
     calibration: Any = None
     capabilities: Any = None
     actuator_state: Any = None
-    focus_state: Any = None
     surface_map: Any = None
     surface_map_info: Any = None
     zernike: Any = None

@@ -117,7 +117,7 @@ _DECLARED = (
         "dm_console_*",
         "console",
         subscribe=(
-            *("/diagnostics", "/rosout", "actuator_state", "calibration", "capabilities", "focus_state"),
+            *("/diagnostics", "/rosout", "actuator_state", "calibration", "capabilities"),
             *("mirror_info", "surface_map", "surface_map_info", "zernike"),
         ),
         request=_OPERATION,
