@@ -89,6 +89,7 @@ class StandIn:
             self.hold.ask(request.operation, request.holder, request.purpose, request.duration, request.lease)
         except Refusal as refusal:
             response.error_code, response.message = refusal.error_code, str(refusal)
+        response.holder = self.hold.holder
         self.publish_state()
         return response
 

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import typer
 from dm_msgs.msg import ActuatorState, FocusState
+from dm_msgs.srv import SetFocus
 from typer.testing import CliRunner
 
 from dm_client import DeformableMirrorError
@@ -133,6 +134,9 @@ def test_who_holds_the_mirror_is_named() -> None:
     with pytest.raises(DeformableMirrorError, match=r"has held the mirror for 12 s \(step 12 of 86\): wait"):
         with naming_holder(client):
             raise busy
+    answered = DeformableMirrorError(ErrorCode.BUSY, "refused", SetFocus.Response())
+    with pytest.raises(DeformableMirrorError, match="or end it with --take-over"), naming_holder(client):
+        raise answered
     refusal = DeformableMirrorError(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
     with pytest.raises(DeformableMirrorError, match="no calibration is in use"), naming_holder(client):
         raise refusal

@@ -279,6 +279,10 @@ def test_one_owner_of_the_mirror_at_a_time(driver: Driver) -> None:
     assert driver.set_signals(np.full(37, 0.5), wait=True, take_over=True).error_code == ErrorCode.OK
     assert hold(HoldMirror.Request.RENEW).error_code == ErrorCode.PREEMPTED
     driver.wait_for_state(lambda state: state.holder == "" and state.holding == "", "nobody holds it")
+    assert hold(HoldMirror.Request.HOLD, holder="autofocus").error_code == ErrorCode.OK
+    taking = Degauss.Goal(steps=6, take_over=True)
+    assert driver.observer.run_goal(Degauss, "degauss", taking).result.error_code == ErrorCode.OK
+    assert hold(HoldMirror.Request.RENEW, holder="autofocus").error_code == ErrorCode.PREEMPTED
 
 
 def test_unit_unplugged_during_a_ramp_and_its_return(start: Start, observer: Observer, unit: Edac40TcpUnit) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from dm_msgs.action import Calibrate, Converge
 from dm_msgs.msg import Capabilities, ErrorCode, FocusRequest
-from dm_msgs.srv import SetFocus, SetSignals
+from dm_msgs.srv import HoldMirror, SetFocus, SetSignals
 from std_srvs.srv import SetBool
 
 from dm_bringup.suite import Suite
@@ -167,6 +167,27 @@ def test_taking_over_is_explicit_and_ends_the_run(bench: Bench) -> None:
     result = running.end()
     assert result.error_code == ErrorCode.PREEMPTED and "has taken the mirror over" in result.message
     assert list(bench.client.actuator_state.requested) == pytest.approx(list(taken.state.signals))
+
+
+def test_whoever_holds_the_mirror_has_every_request_carried_out(bench: Bench) -> None:
+    client = bench.client
+    held = HoldMirror.Request(holder="my_stack", purpose="tracking", lease=60.0)
+    client.clients["hold_mirror"] = client.node.create_client(HoldMirror, "hold_mirror")
+    client.call("hold_mirror", held)
+    assert client.wait(lambda: client.actuator_state.holder == "my_stack")
+    for refused in (client.flatten, client.update_calibration, client.degauss, lambda: client.converge(0.01)):
+        with pytest.raises(DeformableMirrorError, match="my_stack has held the mirror") as busy:
+            refused()
+        assert busy.value.error_code == ErrorCode.BUSY
+    assert client.flatten(holder="my_stack").applied
+    assert client.move_focus(0.01, holder="my_stack").state.applied
+    assert client.converge(0.01, tolerance=1e-6, holder="my_stack").maps > 0
+    assert client.actuator_state.holder == "my_stack"
+    assert client.converge(0.01, tolerance=1e-6, take_over=True).maps > 0
+    assert client.wait(lambda: client.actuator_state.holder == "")
+    held.operation = HoldMirror.Request.RENEW
+    with pytest.raises(DeformableMirrorError, match="focus_controller has taken the mirror over"):
+        client.call("hold_mirror", held)
 
 
 def test_a_dead_driver_is_known_and_used_again(bench: Bench) -> None:

@@ -87,7 +87,7 @@ class AutofocusAction:
         self._probe.start()
         try:
             config, region = self._config(goal_handle.request)
-            with self._probe.held():
+            with self._probe.held(goal_handle.request):
                 peak, config, swept = self._search(goal_handle, config, region)
                 self._fill(result, peak)
                 if goal_handle.request.track:

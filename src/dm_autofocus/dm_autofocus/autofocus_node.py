@@ -61,13 +61,14 @@ class AutofocusNode(Node):
                 ErrorCode.INVALID_ARGUMENT,
                 f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
             )
-        if self._action.busy:
+        if self._action.busy and not request.take_over:
             raise Refusal(ErrorCode.BUSY, "a search or tracking (action autofocus) is running; cancel it first")
         response.dioptre = dioptre_of(request.distance) or request.dioptre
         response.distance = distance_of(response.dioptre)
         response.curvature = self._optics.curvature_for(response.dioptre)
         response.power = 2 * response.curvature
-        wanted = SetFocus.Request(request=FocusRequest(curvature=response.curvature), dry_run=request.dry_run)
+        wanted = SetFocus.Request(dry_run=request.dry_run)
+        wanted.request = FocusRequest(curvature=response.curvature, holder=request.holder, take_over=request.take_over)
         try:
             answer = call(self._set_focus, wanted, self._values["move_timeout"])
         except ServiceCallError as error:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 from dm_msgs.action import Autofocus
 from dm_msgs.srv import GetFocusRange, SetFocusDistance
 
-from dm_client import DeformableMirrorClient
+from dm_client import Claim, DeformableMirrorClient
 
 
 class CameraFocusClient(DeformableMirrorClient):
@@ -24,14 +24,18 @@ class CameraFocusClient(DeformableMirrorClient):
         """Between which object distances the camera can focus."""
         return self.call("get_focus_range", GetFocusRange.Request())
 
-    def focus_distance(self, distance: float, *, dry_run: bool = False) -> SetFocusDistance.Response:
+    def focus_distance(
+        self, distance: float, *, dry_run: bool = False, **claim: Unpack[Claim]
+    ) -> SetFocusDistance.Response:
         """Focus on an object at `distance` (m; 0 or inf = infinity)."""
-        request = SetFocusDistance.Request(distance=float(distance), dry_run=dry_run)
+        request = SetFocusDistance.Request(distance=float(distance), dry_run=dry_run, **claim)
         return self.call("set_focus_distance", request)
 
-    def focus_dioptre(self, dioptre: float, *, dry_run: bool = False) -> SetFocusDistance.Response:
+    def focus_dioptre(
+        self, dioptre: float, *, dry_run: bool = False, **claim: Unpack[Claim]
+    ) -> SetFocusDistance.Response:
         """Focus on 1 / distance (1/m; 0 = infinity), as libcamera and Android count."""
-        request = SetFocusDistance.Request(dioptre=float(dioptre), dry_run=dry_run)
+        request = SetFocusDistance.Request(dioptre=float(dioptre), dry_run=dry_run, **claim)
         return self.call("set_focus_distance", request)
 
     def autofocus(
@@ -41,6 +45,7 @@ class CameraFocusClient(DeformableMirrorClient):
         curvature_range: tuple[float, float] = (0.0, 0.0),
         on_feedback: Callable[[Any], None] = lambda feedback: None,
         timeout_s: float = 60.0,
+        **claim: Unpack[Claim],
     ) -> Autofocus.Result:
         """Search the sharpest focus in a region of the image and stand there.
 
@@ -49,7 +54,8 @@ class CameraFocusClient(DeformableMirrorClient):
             curvature_range: search only here [1/m]; (0, 0) = the whole reachable range.
             on_feedback: called after each image that counted.
             timeout_s: longest time the search may take.
+            claim: where somebody holds the mirror.
         """
-        goal = Autofocus.Goal(region=[float(value) for value in region])
+        goal = Autofocus.Goal(region=[float(value) for value in region], **claim)
         goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
         return self.run_action("autofocus", goal, on_feedback, timeout_s)

@@ -129,12 +129,15 @@ class FocusProbe:
     # --- moving and measuring ---
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold the mirror at the driver for the block. Raises Refusal: somebody else does, or there is no driver."""
+    def held(self, asked: Any) -> Iterator[None]:
+        """Hold the mirror at the driver for the block, see `MirrorHolder.held`.
+
+        Raises Refusal: somebody else holds it, or there is no driver.
+        """
         purpose = "a search or tracking (action autofocus); cancel it to end it"
         with ExitStack() as stack:
             try:
-                stack.enter_context(self._hold.held(purpose, 0.0, self._values["move_timeout"]))
+                stack.enter_context(self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]))
             except ServiceCallError as error:
                 raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
             yield

@@ -73,7 +73,8 @@ class CalibrateAction:
             self._services.check_ready()
             self._services.settle_time = handle.request.settle_time or self._values["settle_time"]
             self._services.cancelled = lambda: bool(handle.is_cancel_requested)
-            held = self._services.held("cancel the action calibrate to end it", result.expected_duration)
+            purpose = "cancel the action calibrate to end it"
+            held = self._services.held(handle.request, purpose, result.expected_duration)
             with UnfinishedRuns(self._manager.store.folder) as runs, held:
                 self._run_kept(handle, plan, options, mirror, runs, result)
         except EXPECTED as error:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypedDict, Unpack
 
 from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo, SurfaceMapInfo
@@ -56,6 +56,18 @@ INTERFACES = {
 }
 #: `timeout_s` for nodes that the same program has only just started, s.
 STARTING_S = 60.0
+
+
+class Claim(TypedDict, total=False):
+    """Of every request that moves or holds the mirror, where somebody holds it (service `hold_mirror`).
+
+    Attributes:
+        holder: who asks; the requests of whoever holds the mirror are carried out.
+        take_over: carry it out even if somebody else holds it: they lose it, and their run ends.
+    """
+
+    holder: str
+    take_over: bool
 
 
 class DeformableMirrorClient(Connection):
@@ -129,22 +141,26 @@ class DeformableMirrorClient(Connection):
         zernike: Sequence[float] = (),
         *,
         dry_run: bool = False,
+        **claim: Unpack[Claim],
     ) -> FocusState:
         """Set the surface curvature [1/m] (concave positive) and return the prediction; `dry_run` moves nothing."""
-        request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant), zernike=list(zernike))
+        request = _request(curvature, conic_constant, claim)
+        request.zernike = list(zernike)
         return self.call("set_focus", SetFocus.Request(request=request, dry_run=dry_run)).state
 
-    def focus_power(self, power: float, *, dry_run: bool = False) -> FocusState:
+    def focus_power(self, power: float, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
         """Set the optical power [dioptre] = 2 x surface curvature."""
-        return self.focus(power / 2.0, dry_run=dry_run)
+        return self.focus(power / 2.0, dry_run=dry_run, **claim)
 
-    def flatten(self, *, dry_run: bool = False) -> FocusState:
+    def flatten(self, *, dry_run: bool = False, **claim: Unpack[Claim]) -> FocusState:
         """Make the surface as flat as the mirror can."""
-        return self.call("flatten", Flatten.Request(dry_run=dry_run)).state
+        return self.call("flatten", Flatten.Request(dry_run=dry_run, **claim)).state
 
-    def set_signals(self, signals: Sequence[float], *, wait: bool = True) -> SetSignals.Response:
+    def set_signals(
+        self, signals: Sequence[float], *, wait: bool = True, **claim: Unpack[Claim]
+    ) -> SetSignals.Response:
         """Set all actuator signals (normalised, -1..+1)."""
-        return self.call("set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait))
+        return self.call("set_signals", SetSignals.Request(signals=list(map(float, signals)), wait=wait, **claim))
 
     def degauss(
         self,
@@ -152,9 +168,10 @@ class DeformableMirrorClient(Connection):
         *,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
         timeout_s: float = 200.0,
+        **claim: Unpack[Claim],
     ) -> Degauss.Result:
         """Remove the hysteresis and end at mid range; `steps` half-swings, 0 = as configured in the driver."""
-        return self.run_action("degauss", Degauss.Goal(steps=steps), on_feedback, timeout_s)
+        return self.run_action("degauss", Degauss.Goal(steps=steps, **claim), on_feedback, timeout_s)
 
     def measure(self, label: str = "", timeout_s: float = 60.0) -> Measure.Response:
         """Take one map with the interferometer."""
@@ -191,13 +208,13 @@ class DeformableMirrorClient(Connection):
         return self.call("load_calibration", LoadCalibration.Request(calibration=name))
 
     def update_calibration(
-        self, *, dry_run: bool = False, forget: bool = False, timeout_s: float = 70.0
+        self, *, dry_run: bool = False, forget: bool = False, timeout_s: float = 70.0, **claim: Unpack[Claim]
     ) -> UpdateCalibration.Response:
         """Compare the calibration in use with a map taken now, and let it improve the calibration unless `dry_run`.
 
         `forget` takes no map but drops all earlier updates.
         """
-        request = UpdateCalibration.Request(dry_run=dry_run, forget=forget)
+        request = UpdateCalibration.Request(dry_run=dry_run, forget=forget, **claim)
         return self.call("update_calibration", request, timeout_s)
 
     # --- actions ---
@@ -211,9 +228,10 @@ class DeformableMirrorClient(Connection):
         settle_time: float = 0.0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
         timeout_s: float = 30.0,
+        **claim: Unpack[Claim],
     ) -> MoveFocus.Result:
         """Move to a curvature and return when the shape stands."""
-        request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
+        request = _request(curvature, conic_constant, claim)
         goal = MoveFocus.Goal(request=request, tolerance=float(tolerance), settle_time=float(settle_time))
         return self.run_action("move_focus", goal, on_feedback, timeout_s)
 
@@ -227,9 +245,10 @@ class DeformableMirrorClient(Connection):
         max_maps: int = 0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
         timeout_s: float = 600.0,
+        **claim: Unpack[Claim],
     ) -> Converge.Result:
         """Close the loop on the interferometer until the measured surface is the requested one."""
-        request = FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant))
+        request = _request(curvature, conic_constant, claim)
         goal = Converge.Goal(request=request, method=method, tolerance=float(tolerance), max_maps=max_maps)
         return self.run_action("converge", goal, on_feedback, timeout_s)
 
@@ -242,6 +261,7 @@ class DeformableMirrorClient(Connection):
         max_maps: int = 0,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
         timeout_s: float = 14400.0,
+        **claim: Unpack[Claim],
     ) -> BuildRecipes.Result:
         """Build a recipe for each curvature [1/m] on the bench, and store them with the calibration in use."""
         goal = BuildRecipes.Goal(
@@ -249,6 +269,7 @@ class DeformableMirrorClient(Connection):
             conic_constant=float(conic_constant),
             tolerance=float(tolerance),
             max_maps=max_maps,
+            **claim,
         )
         return self.run_action("build_recipes", goal, on_feedback, timeout_s)
 
@@ -261,3 +282,7 @@ class DeformableMirrorClient(Connection):
         """Measure and store a calibration; by default the full plan, used at once."""
         goal = goal if goal is not None else Calibrate.Goal(activate=True)
         return self.run_action("calibrate", goal, on_feedback, timeout_s)
+
+
+def _request(curvature: float, conic_constant: float, claim: Claim) -> FocusRequest:
+    return FocusRequest(curvature=float(curvature), conic_constant=float(conic_constant), **claim)

@@ -72,10 +72,13 @@ class LoopBench(BenchServices):
         self._goal = threading.Lock()
 
     @contextmanager
-    def reserved(self, text: str, cancelled: Callable[[], bool], waiting: Callable[[str], None]) -> Iterator[None]:
+    def reserved(
+        self, asked: Any, text: str, cancelled: Callable[[], bool], waiting: Callable[[str], None]
+    ) -> Iterator[None]:
         """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
 
         Args:
+            asked: says who asks, see `BenchServices.held`.
             text: what requests of others are told meanwhile.
             waiting: called with what is waited for.
 
@@ -86,7 +89,7 @@ class LoopBench(BenchServices):
             raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
         try:
             self.cancelled, self.waiting = cancelled, waiting
-            with self.held(f"{text}; cancel it to end it"):
+            with self.held(asked, f"{text}; cancel it to end it"):
                 yield
         finally:
             self._goal.release()
@@ -263,10 +266,11 @@ class DegaussClient:
     def _call(self) -> None:
         if self._waiting is None or not answers_arrive(self._client, self._client.server_is_ready):
             return
-        number, steps, holder = self._waiting
+        number, steps, holder, take_over = self._waiting
         self._waiting = None
+        goal = Degauss.Goal(steps=steps, holder=holder, take_over=take_over)
         # By the executor: an answer may be there already, and then this thread would take the node's lock twice.
-        self._client.send_goal_async(Degauss.Goal(steps=steps, holder=holder)).add_done_callback(
+        self._client.send_goal_async(goal).add_done_callback(
             lambda done: self._node.executor.create_task(self._accepted, number, done)
         )
 

@@ -233,7 +233,7 @@ class FocusController:
             effects += self._refuse(before, refusal, now)
         if self.conditioning.run is None:
             number = self.conditioning.begin(move.degauss or 0, self.monitor, now.steady)
-            effects.append(StartDegauss(number, move.degauss or 0, order.request.holder))
+            effects.append(StartDegauss(number, move.degauss or 0, order.request.holder, order.request.take_over))
         return effects
 
     def degauss_answered(

@@ -132,7 +132,8 @@ class FocusControllerNode(Node):
         return self._answer(request.request, request.dry_run, response)
 
     def _on_flatten(self, request: Flatten.Request, response: Flatten.Response) -> Flatten.Response:
-        return self._answer(FocusRequest(take_over=request.take_over), request.dry_run, response)
+        flat = FocusRequest(holder=request.holder, take_over=request.take_over)
+        return self._answer(flat, request.dry_run, response)
 
     def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
         """In a worker thread, for the driver's confirmation is waited for."""

@@ -147,12 +147,13 @@ class SendCommand:
 class StartDegauss(NamedTuple):
     """Have the driver degauss by `steps` half-swings (0 = as it does), and report the end of run `number`.
 
-    `holder` asks for it; "" = nobody in particular.
+    `holder` asks for it, "" = nobody in particular; with `take_over` even if somebody else holds the mirror.
     """
 
     number: int
     steps: int
     holder: str = ""
+    take_over: bool = False
 
 
 class PublishState(NamedTuple):

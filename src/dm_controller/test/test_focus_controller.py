@@ -402,6 +402,15 @@ def test_a_degauss_on_the_way(bench: Bench) -> None:
     assert active is not None and bench.controller.conditioning.duration(0, active) == 2.0
 
 
+def test_a_degauss_on_the_way_takes_the_mirror_over_where_its_request_does(bench: Bench) -> None:
+    bench.history_known, bench.holder = False, "calibration"
+    bench.report()
+    bench.ask(0.01, time_budget=60.0)
+    assert bench.refusal().error_code == ErrorCode.BUSY and not bench.degauss_runs
+    bench.ask(0.01, time_budget=60.0, holder="operator", take_over=True)
+    assert bench.degauss_runs[-1][2:] == ("operator", True)
+
+
 def test_the_newest_request_follows_the_degauss(bench: Bench) -> None:
     bench.history_known = False
     bench.report()

@@ -34,7 +34,7 @@ def carried_out(
     hold: MirrorHold, writer: Writer, monkeypatch: pytest.MonkeyPatch, overtaken: bool = False
 ) -> tuple[str, int, str]:
     """What the goal of the calibration ends in, which is cancelled as soon as it has begun."""
-    goal = SimpleNamespace(holder="calibration")
+    goal = SimpleNamespace(holder="calibration", take_over=False)
     handle: Any = SimpleNamespace(request=goal, is_cancel_requested=False)
     server = SimpleNamespace(preempted=lambda _handle: overtaken)
     monkeypatch.setattr(degauss_action, "WorkerActionServer", lambda *_arguments, **_keywords: server)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
+from dm_msgs.srv import HoldMirror
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros import clients
 from dm_driver.commands.mirror_hold import LEASE_S, MirrorHold, Operation
 
 
@@ -111,3 +116,60 @@ def test_a_hold_that_lapsed_is_renewed_only_where_nobody_moved_the_mirror(
             hold.ask(Operation.RENEW, "calibration")
         hold.ask(Operation.HOLD, "calibration")
         hold.ask(Operation.RENEW, "calibration")
+
+
+class Node:
+    """Of whoever holds a mirror by `hold_mirror`, without ROS between."""
+
+    def create_client(self, _kind: Any, _name: str) -> None:
+        return None
+
+    def create_timer(self, *_arguments: Any, **_keywords: Any) -> Any:
+        return SimpleNamespace(reset=lambda: None, cancel=lambda: None)
+
+
+@pytest.fixture
+def run(hold: MirrorHold, monkeypatch: pytest.MonkeyPatch) -> clients.MirrorHolder:
+    """Of the node `loop`, while the calibration holds the mirror."""
+
+    def call(_client: Any, request: Any, *_waits: Any) -> HoldMirror.Response:
+        response = HoldMirror.Response()
+        try:
+            hold.ask(request.operation, request.holder, request.purpose, request.duration, request.lease)
+        except Refusal as refusal:
+            response.error_code, response.message = refusal.error_code, str(refusal)
+        response.holder = hold.holder
+        return response
+
+    monkeypatch.setattr(clients, "call", call)
+    node: Any = Node()
+    return clients.MirrorHolder(node, "loop")
+
+
+def asked(holder: str = "", take_over: bool = False) -> Any:
+    return SimpleNamespace(holder=holder, take_over=take_over)
+
+
+@pytest.mark.parametrize("take_over", [False, True])
+def test_a_run_goes_on_in_the_name_of_who_asks_where_they_hold_it(
+    hold: MirrorHold, run: clients.MirrorHolder, take_over: bool
+) -> None:
+    with run.held(asked("calibration", take_over), "a loop", 0.0, 1.0):
+        assert run.holder == hold.holder == "calibration"
+    assert hold.holder == "calibration" and "cancel its action" in hold.sentence
+    hold.ask(Operation.RELEASE, "calibration")
+    with run.held(asked("calibration"), "a loop", 0.0, 1.0):
+        assert run.holder == hold.holder == "loop"
+    assert hold.holder == ""
+
+
+def test_a_run_takes_over_what_somebody_else_holds_only_where_it_is_asked_to(
+    hold: MirrorHold, run: clients.MirrorHolder
+) -> None:
+    with refused(ErrorCode.BUSY), run.held(asked(), "a loop", 0.0, 1.0):
+        pass
+    assert hold.holder == "calibration"
+    with run.held(asked(take_over=True), "a loop", 0.0, 1.0):
+        assert run.holder == hold.holder == "loop"
+        with refused(ErrorCode.PREEMPTED):
+            hold.ask(Operation.RENEW, "calibration")

@@ -38,6 +38,9 @@ JsonOption = Annotated[
         callback=_free_standard_output,
     ),
 ]
+TakeOverOption = Annotated[
+    bool, typer.Option("--take-over", help="Even if somebody else holds the mirror: their run ends.")
+]
 NamespaceOption = Annotated[str, typer.Option("--namespace", help="Namespace of the mirror, one per mirror.")]
 
 

@@ -119,6 +119,8 @@ def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
     except DeformableMirrorError as error:
         if error.error_code == ErrorCode.BUSY and (by := holder(client)):
             text = f"{by}: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
+            if error.response is not None:  # not by the same action, which takes one goal at a time
+                text += ", or end it with --take-over"
             raise DeformableMirrorError(error.error_code, text, error.response) from error
         raise
 

@@ -247,7 +247,7 @@ class MapListener:
         with self._turn:
             if self._busy():
                 raise Refusal(ErrorCode.BUSY, "a calibration is running")
-            with self._services.held("a map is compared with the calibration (service update_calibration)"):
+            with self._services.held(request, "a map is compared with the calibration (service update_calibration)"):
                 self._wait_for_rest()
                 measured = self._services.measure_as_it_stands("calibration check")
             try:

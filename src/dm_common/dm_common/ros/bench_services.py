@@ -94,10 +94,11 @@ class BenchServices:
         self.state = message
 
     @contextmanager
-    def held(self, purpose: str, duration: float = 0.0) -> Iterator[None]:
+    def held(self, asked: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:
         """Hold the mirror for the block: commands of others are refused.
 
         Args:
+            asked: the goal or request to do so, of which `holder` and `take_over` count, see `MirrorHolder.held`.
             purpose: what for and how to end it, for those who are refused meanwhile.
             duration: s that it will last, about; 0 = not known.
 
@@ -106,7 +107,7 @@ class BenchServices:
         """
         with ExitStack() as stack:
             with self._answered("hold_mirror", self._driver, self._set_signals.service_is_ready) as stop:
-                stack.enter_context(self._hold.held(purpose, duration, self._values["driver_timeout"], stop))
+                stack.enter_context(self._hold.held(asked, purpose, duration, self._values["driver_timeout"], stop))
             yield
 
     def check_ready(self) -> None:

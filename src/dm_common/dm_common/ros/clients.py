@@ -97,17 +97,18 @@ class MirrorHolder:
 
     Args:
         node: hosts the client.
-        holder: who holds the mirror; goes with every command as well.
+        name: of who holds the mirror.
 
     Attributes:
+        holder: who holds it; goes with every command as well.
         lost: the refusal once somebody else took the mirror over; None = nobody did.
     """
 
-    def __init__(self, node: Node, holder: str) -> None:
-        self.holder = holder
+    def __init__(self, node: Node, name: str) -> None:
+        self.holder = self._name = name
         self.lost: Refusal | None = None
         self._client = node.create_client(HoldMirror, "hold_mirror")
-        self._request = HoldMirror.Request(holder=holder)
+        self._request = HoldMirror.Request(holder=name)
         self._renewal: Any = None
         self._one = threading.Lock()  # held with the mirror
         clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -115,11 +116,18 @@ class MirrorHolder:
 
     @contextmanager
     def held(
-        self, purpose: str, duration: float, timeout_s: float, cancelled: Callable[[], bool] = lambda: False
+        self,
+        asked: Any,
+        purpose: str,
+        duration: float,
+        timeout_s: float,
+        cancelled: Callable[[], bool] = lambda: False,
     ) -> Iterator[None]:
         """Hold the mirror for the block.
 
         Args:
+            asked: the goal or request to do so. Where its `holder` has the mirror already, that hold serves: it is
+                neither renewed nor given back here. Its `take_over` ends the hold of anybody else.
             purpose: what for and how to end it, for those who are refused meanwhile.
             duration: s that it will last, about; 0 = not known.
             timeout_s: longest wait for the driver.
@@ -130,11 +138,19 @@ class MirrorHolder:
             ServiceCallError: there is no driver.
         """
         if not self._one.acquire(blocking=False):
-            raise Refusal(ErrorCode.BUSY, f"{self.holder} holds the mirror already: {self._request.purpose}")
+            raise Refusal(ErrorCode.BUSY, f"{self._name} holds the mirror already: {self._request.purpose}")
         try:
-            self.lost = None
+            self.lost, self.holder = None, self._name
             self._request.purpose, self._request.duration = purpose, duration
-            self._ask(HoldMirror.Request.HOLD, timeout_s, cancelled)
+            answer = self._ask(HoldMirror.Request.HOLD, timeout_s, cancelled)
+            if answer.error_code == ErrorCode.BUSY and answer.holder == asked.holder:
+                self.holder = asked.holder
+                yield
+                return
+            if answer.error_code == ErrorCode.BUSY and asked.take_over:
+                answer = self._ask(HoldMirror.Request.TAKE_OVER, timeout_s, cancelled)
+            if answer.error_code != ErrorCode.OK:
+                raise Refusal(answer.error_code, answer.message)
             self._request.operation = HoldMirror.Request.RENEW
             self._timer.reset()
             try:
@@ -149,14 +165,12 @@ class MirrorHolder:
     def _release(self) -> None:
         try:
             self._ask(HoldMirror.Request.RELEASE, RELEASE_S, lambda: False)
-        except (Refusal, ServiceCallError):
-            pass  # the driver is gone, or somebody took the mirror over just now
+        except ServiceCallError:
+            pass  # the driver is gone
 
-    def _ask(self, operation: int, timeout_s: float, cancelled: Callable[[], bool]) -> None:
+    def _ask(self, operation: int, timeout_s: float, cancelled: Callable[[], bool]) -> Any:
         self._request.operation = operation
-        answer = call(self._client, self._request, timeout_s, cancelled)
-        if answer.error_code != ErrorCode.OK:
-            raise Refusal(answer.error_code, answer.message)
+        return call(self._client, self._request, timeout_s, cancelled)
 
     def _renew(self) -> None:
         if self._renewal is not None:

@@ -52,7 +52,8 @@ class ConvergeRun:
             handle.publish_feedback(feedback)
 
         try:
-            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)):
+            cancelled, waiting = lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)
+            with self._bench.reserved(handle.request.request, BUSY, cancelled, waiting):
                 outcome, error_code, message = self._judge(self._loop(handle.request, report))
         except Exception as error:
             outcome, error_code, message = ending(error)

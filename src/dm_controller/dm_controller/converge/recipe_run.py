@@ -54,7 +54,8 @@ class RecipeRun:
         feedback = BuildRecipes.Feedback()
 
         try:
-            with self._bench.reserved(BUSY, lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)):
+            cancelled, waiting = lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)
+            with self._bench.reserved(handle.request, BUSY, cancelled, waiting):
                 outcome, result = self._build_and_store(handle, feedback)
         except Exception as error:
             outcome, error_code, message = ending(error)

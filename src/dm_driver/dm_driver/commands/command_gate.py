@@ -56,7 +56,7 @@ class CommandGate:
 
         Args:
             source: what the request came by, for the log.
-            request: its fields `holder` and, where it has one, `take_over` are judged here.
+            request: its fields `holder` and `take_over` are judged here.
             carry_out: returns what has begun to move; None = nothing has, and whoever holds the mirror keeps it.
         """
         writer, configuration = self.writer, self.configuration
@@ -67,7 +67,7 @@ class CommandGate:
                 raise Refusal(
                     ErrorCode.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first"
                 )
-            takes_over = not dry_run and self.hold.check(request.holder, getattr(request, "take_over", False))
+            takes_over = not dry_run and self.hold.check(request.holder, request.take_over)
             result = carry_out(writer, configuration)
             if result is not None:
                 holder = self.hold.holder

@@ -13,7 +13,16 @@ import typer
 
 from dm_common.errors import ErrorCode
 from dm_common.figures import in_nanometres
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, progress_bar, write_json
+from dm_tools.output import (
+    JsonOption,
+    NamespaceOption,
+    TakeOverOption,
+    console,
+    nanometres,
+    next_step,
+    progress_bar,
+    write_json,
+)
 from dm_tools.running_suite import promise, running_suite
 
 #: What tells the sentence of a result on what --until asked for.
@@ -217,6 +226,7 @@ def calibrate(
     ] = False,
     activate: Annotated[bool, typer.Option(help="Use the new calibration at once.")] = True,
     note: Annotated[str, typer.Option(help="Stored with the calibration.")] = "",
+    take_over: TakeOverOption = False,
     write: Annotated[
         Path | None, typer.Option(help="Write what a poke check finds into this copy of the parameter file.")
     ] = None,
@@ -252,6 +262,7 @@ def calibrate(
         maps_per_state=maps_per_state,
         activate=activate,
         note=note,
+        take_over=take_over,
     )
     with running_suite(namespace) as client:
         source = source_of(write, config, client.mirror_info.serial) if write is not None and not dry_run else None

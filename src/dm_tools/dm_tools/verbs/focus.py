@@ -6,7 +6,15 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
+from dm_tools.output import (
+    JsonOption,
+    NamespaceOption,
+    TakeOverOption,
+    console,
+    nanometres,
+    next_step,
+    write_json,
+)
 from dm_tools.running_suite import naming_holder, promise, running_suite
 
 
@@ -18,6 +26,7 @@ def focus(
     conic: Annotated[float, typer.Option(help="Conic constant: 0 = sphere, -1 = paraboloid.")] = 0.0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict only; nothing moves.")] = False,
     wait: Annotated[bool, typer.Option(help="Return when the shape stands.")] = True,
+    take_over: TakeOverOption = False,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
@@ -37,23 +46,24 @@ def focus(
         _show(state)
         if not dry_run:
             if wait:
-                result = client.move_focus(wanted, conic)
+                result = client.move_focus(wanted, conic, take_over=take_over)
                 state = result.state
                 console.print(f"the shape stands after {result.duration * 1e3:.0f} ms{_held(state)}")
             else:
-                state = client.focus(wanted, conic)
+                state = client.focus(wanted, conic, take_over=take_over)
     write_json(json, {"focus": [figures_of(state)]})
     _show_next(state)
 
 
 def flatten(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict only; nothing moves.")] = False,
+    take_over: TakeOverOption = False,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
     """Make the surface as flat as the mirror can: curvature 0, its own figure corrected."""
     with running_suite(namespace) as client, naming_holder(client):
-        state = client.flatten(dry_run=dry_run)
+        state = client.flatten(dry_run=dry_run, take_over=take_over)
     _show(state)
     if state.applied:
         console.print(f"commanded{_held(state)}")
@@ -61,14 +71,14 @@ def flatten(
     _show_next(state)
 
 
-def degauss(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
+def degauss(take_over: TakeOverOption = False, namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     """Swing all actuators with falling amplitude: the mirror ends at mid range, with a known history.
 
     It takes seconds. After it every promise is as narrow as the calibration allows.
     """
     with running_suite(namespace) as client, naming_holder(client):
         console.print("degaussing: the mirror swings over its whole range and ends at mid range")
-        response = client.degauss()
+        response = client.degauss(take_over=take_over)
         known = client.wait(lambda: client.actuator_state.history_known, 2.0)
     console.print(f"done in {response.duration:.1f} s; the actuators' history is {'known' if known else 'not known'}")
     write_json(json, {"degauss": {"seconds": response.duration, "history_known": known}})

@@ -6,7 +6,15 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, write_json
+from dm_tools.output import (
+    JsonOption,
+    NamespaceOption,
+    TakeOverOption,
+    console,
+    nanometres,
+    next_step,
+    write_json,
+)
 from dm_tools.running_suite import hear_health, naming_holder, running_suite, standing, verdict
 
 
@@ -45,6 +53,7 @@ def measure(
 def check(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Compare only; the calibration stays as it is.")] = False,
     forget: Annotated[bool, typer.Option("--forget", help="Drop all earlier updates; no map is taken.")] = False,
+    take_over: TakeOverOption = False,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
@@ -56,7 +65,7 @@ def check(
         raise typer.BadParameter("--dry-run and --forget: only one of them")
     with running_suite(namespace) as client, naming_holder(client):
         health = hear_health(client)
-        response = client.update_calibration(dry_run=dry_run, forget=forget)
+        response = client.update_calibration(dry_run=dry_run, forget=forget, take_over=take_over)
         calibration = client.latest("calibration")
     shape, capabilities = standing(health), client.messages.get("capabilities")
     if shape is not None:

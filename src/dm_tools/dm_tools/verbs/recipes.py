@@ -6,7 +6,16 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, next_step, progress_bar, write_json
+from dm_tools.output import (
+    JsonOption,
+    NamespaceOption,
+    TakeOverOption,
+    console,
+    nanometres,
+    next_step,
+    progress_bar,
+    write_json,
+)
 from dm_tools.running_suite import naming_holder, running_suite
 
 #: Range of [1], section 3.2.
@@ -32,8 +41,8 @@ def curvatures_of(text: str) -> list[float]:
     return [round(first + k * step, 12) for k in range(number)]
 
 
-def _build(client: Any, curvatures: list[float], conic: float, tolerance: float, max_maps: int) -> Any:
-    """Build with a progress bar; returns the action's result."""
+def _build(client: Any, curvatures: list[float], conic: float, **options: Any) -> Any:
+    """Build with a progress bar; `options` as of `build_recipes` of the client. Returns the action's result."""
     order = {curvature: place for place, curvature in enumerate(sorted(curvatures))}
     with progress_bar() as progress:
         task = progress.add_task("recipes", total=len(order))
@@ -46,7 +55,7 @@ def _build(client: Any, curvatures: list[float], conic: float, tolerance: float,
                 f"{nanometres(feedback.max_zernike):.2f} nm",
             )
 
-        result = client.build_recipes(curvatures, conic, tolerance=tolerance, max_maps=max_maps, on_feedback=show)
+        result = client.build_recipes(curvatures, conic, on_feedback=show, **options)
         progress.update(task, completed=len(order), description="recipes: done")
     return result
 
@@ -76,6 +85,7 @@ def recipes(
     tolerance: Annotated[float, typer.Option(help="Largest coefficient error [nm]; 0 = configured.")] = 0.0,
     max_maps: Annotated[int, typer.Option(min=0, max=100, help="Maps per recipe; 0 = configured.")] = 0,
     show: Annotated[bool, typer.Option("--list", help="Only list the recipes of the calibration in use.")] = False,
+    take_over: TakeOverOption = False,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
@@ -87,7 +97,7 @@ def recipes(
     wanted = curvatures_of(curvatures or DEFAULT)
     with running_suite(namespace) as client, naming_holder(client):
         if not show:
-            result = _build(client, wanted, conic, tolerance * 1e-9, max_maps)
+            result = _build(client, wanted, conic, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over)
             console.print(result.message)
             client.wait(lambda: len(client.latest("calibration").recipes.recipes) >= result.recipes)
         calibration = client.latest("calibration")
