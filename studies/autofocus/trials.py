@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_autofocus.defocus_model import DefocusModel, FocusLens
-from dm_autofocus.defocus_search import BEYOND, FocusSearch
-from dm_autofocus.search import NOISE_POINTS, PeakSearch, SearchConfig
+from dm_autofocus.search.defocus_model import DefocusModel, FocusLens
+from dm_autofocus.search.defocus_search import BEYOND
+from dm_autofocus.search.focus_search import FocusSearch
+from dm_autofocus.search.peak_search import NOISE_POINTS, PeakSearch, SearchConfig
 from dm_autofocus.sharpness import cut, tenengrad
 from studies.autofocus.rivals import RIVALS, Task
 from studies.autofocus.scenes import RANGE, Scene, SceneCamera, draw_scene

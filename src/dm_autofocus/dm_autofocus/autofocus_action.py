@@ -15,13 +15,14 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_autofocus.autofocus_parameters import focus_lens, search_config
-from dm_autofocus.defocus_model import DefocusModel
-from dm_autofocus.defocus_search import BEYOND, FocusSearch
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
-from dm_autofocus.search import Peak, Phase, SearchConfig
+from dm_autofocus.search.defocus_model import DefocusModel
+from dm_autofocus.search.defocus_search import BEYOND
+from dm_autofocus.search.focus_search import FocusSearch
+from dm_autofocus.search.peak_search import Peak, Phase, SearchConfig
+from dm_autofocus.search.tracking import TrackConfig, Tracker
 from dm_autofocus.sharpness import Region, check_region, cut
-from dm_autofocus.tracking import TrackConfig, Tracker
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerActionServer

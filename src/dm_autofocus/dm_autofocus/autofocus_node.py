@@ -15,7 +15,7 @@ from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities
 from dm_autofocus.autofocus_parameters import PARAMETERS, focus_optics, tolerance_of
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.optics import dioptre_of, distance_of
-from dm_autofocus.search import Phase
+from dm_autofocus.search.peak_search import Phase
 from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import diagnostics, qos

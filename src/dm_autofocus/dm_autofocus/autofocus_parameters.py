@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-from dm_autofocus.defocus_model import FocusLens
 from dm_autofocus.optics import FocusOptics, depth_of_focus
-from dm_autofocus.search import NOISE_POINTS, SearchConfig
+from dm_autofocus.search.defocus_model import FocusLens
+from dm_autofocus.search.peak_search import NOISE_POINTS, SearchConfig
 from dm_autofocus.sharpness import METRICS, check_region
 from dm_common.ros.parameters import Parameter, real, reals, switch, text, whole
 

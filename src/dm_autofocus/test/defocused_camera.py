@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dm_autofocus.defocus_model import FocusLens
 from dm_autofocus.optics import depth_of_focus
+from dm_autofocus.search.defocus_model import FocusLens
 
 SIDE, FINER = 128, 2
 LENS = FocusLens(aperture_radius=0.01, wavelength=550e-9, focal_length_px=1.3 * 0.02 / 550e-9)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from defocused_camera import DEPTH, LENS, SIDE, DefocusedCamera, clouds
 
-from dm_autofocus import defocus_search
-from dm_autofocus.defocus_model import DefocusModel
-from dm_autofocus.defocus_search import FocusSearch
-from dm_autofocus.search import Phase, SearchConfig
+from dm_autofocus.search import defocus_search
+from dm_autofocus.search.defocus_model import DefocusModel
+from dm_autofocus.search.focus_search import FocusSearch
+from dm_autofocus.search.peak_search import Phase, SearchConfig
 from dm_autofocus.sharpness import tenengrad
 
 LOW, HIGH = -0.04, 0.04

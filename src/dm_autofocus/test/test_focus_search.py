@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dm_autofocus.images import SettledGate
-from dm_autofocus.search import MOST_SHIFTS, PeakSearch, Phase, SearchConfig
-from dm_autofocus.tracking import TrackConfig, Tracker
+from dm_autofocus.search.peak_search import MOST_SHIFTS, PeakSearch, Phase, SearchConfig
+from dm_autofocus.search.tracking import TrackConfig, Tracker
 
 LOW, HIGH, TOLERANCE = -0.05, 0.05, 0.0011
 CONFIG = SearchConfig(LOW, HIGH, TOLERANCE)

@@ -1,4 +1,4 @@
-"""Staying on the sharpest focus: a state machine like `search.PeakSearch`, for a scene that changes."""
+"""Staying on the sharpest focus: a state machine like `PeakSearch`, for a scene that changes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dm_autofocus.search import Step
+from dm_autofocus.search.peak_search import Step
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Where the focus is, by a few images: how their power has changed with the focus, against the optics.
 
-A state machine as `search.PeakSearch`, for a mirror that stands where it is sent. Each image adds what it says about
+A state machine as `PeakSearch`, for a mirror that stands where it is sent. Each image adds what it says about
 every possible place of the object (`DefocusModel`): the texture's own power in each band is taken as whatever explains
 the images best, so only ratios between images count (depth from defocus [31, 32]). The next image is taken at the most
 probable place, or in the widest gap while nothing was seen that changes with focus. An image on either side then
@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_autofocus.defocus_model import TRANSFER_ERROR, TRANSFER_ERROR_NEAR, DefocusModel, Floats
-from dm_autofocus.search import MOST_REFUSALS, RETREAT, Peak, PeakSearch, Phase, SearchConfig, Step
+from dm_autofocus.search.defocus_model import TRANSFER_ERROR, TRANSFER_ERROR_NEAR, DefocusModel, Floats
+from dm_autofocus.search.peak_search import MOST_REFUSALS, RETREAT, Peak, Phase, SearchConfig, Step
 
 #: How much better than a scene that does not change with focus a place must explain the images (twice a log ratio).
 EVIDENCE = 25.0
@@ -29,7 +29,7 @@ SIDE, BEYOND = 4.5, 10.0
 PRECISION = 0.25
 
 
-class DefocusSearch:
+class DepthFromDefocus:
     """One search from beginning to end, or to where it gives up.
 
     Args:
@@ -193,87 +193,6 @@ class DefocusSearch:
 
     def _give_up(self, reason: str) -> None:
         self.gave_up, self.done = reason, True
-
-
-class FocusSearch:
-    """A search from a few images where that is possible, and else, or when it gives up, a `PeakSearch`.
-
-    Args:
-        config: of both.
-        model: of the camera, or the reason why there is none.
-        start: where the mirror stands [1/m]; NaN = not known.
-
-    Attributes:
-        reason: why the range is swept; "" = it is not.
-    """
-
-    def __init__(self, config: SearchConfig, model: DefocusModel | str, start: float) -> None:
-        self.reason = ""
-        self._before = 0
-        self._search: DefocusSearch | PeakSearch
-        if isinstance(model, str):
-            self._search, self.reason = PeakSearch(config), model
-        else:
-            self._search = DefocusSearch(config, model, start)
-
-    @property
-    def config(self) -> SearchConfig:
-        """As given, the range as far as it was not refused."""
-        return self._search.config
-
-    @property
-    def step(self) -> Step:
-        """Where to go next; after the end, where to stand."""
-        return self._search.step
-
-    @property
-    def phase(self) -> Phase:
-        """COARSE or FINE."""
-        return self._search.phase
-
-    @property
-    def done(self) -> bool:
-        """Whether nothing more is to be fed."""
-        return self._search.done
-
-    @property
-    def peak(self) -> Peak | None:
-        """What was found."""
-        return self._search.peak
-
-    @property
-    def measured(self) -> int:
-        """Positions measured so far."""
-        return self._before + self._search.measured
-
-    @property
-    def steps(self) -> int:
-        """Positions to be measured, about."""
-        expected = EXPECTED_IMAGES if isinstance(self._search, DefocusSearch) else self._before + self.config.steps
-        return max(expected, self.measured)
-
-    def feed(self, sharpness: float | None, images: Sequence[NDArray] = ()) -> None:
-        """Report sharpness and images (H, W) at `step`; None when it was not to be measured."""
-        if isinstance(self._search, PeakSearch):
-            self._search.feed(sharpness)
-            return
-        assert sharpness is not None
-        self._search.feed(sharpness, images)
-        self._sweep_after_all()
-
-    def refuse(self) -> None:
-        """Report that the mirror cannot take `step`. Raises ValueError when hardly anything of the range is left."""
-        self._search.refuse()
-        self._sweep_after_all()
-
-    def sweep(self, reason: str, approach: float) -> None:
-        """Sweep the range instead, each sweep from `approach` [1/m] below it."""
-        self.reason, self._before = reason, self.measured
-        self._search = PeakSearch(replace(self.config, approach=approach))
-
-    def _sweep_after_all(self) -> None:
-        if isinstance(self._search, DefocusSearch) and self._search.gave_up:
-            self.sweep(self._search.gave_up, 0.0)
 
 
 def _mean_and_spread(grid: Floats, misfit: Floats) -> tuple[float, float]:
