@@ -30,6 +30,16 @@ needs_browser = pytest.mark.skipif(
     not (CHROMIUM and DRIVER),
     reason="no chromium and chromedriver in PATH; run it with: sudo apt-get install chromium chromium-driver",
 )
+#: The accessibility engine axe-core, where somebody has installed it.
+AXE = next(
+    (
+        path
+        for folder in (Path(__file__).parents[1], Path("/usr/lib"), Path("/usr/local/lib"))
+        if (path := folder / "node_modules" / "axe-core" / "axe.min.js").is_file()
+    ),
+    None,
+)
+needs_axe = pytest.mark.skipif(AXE is None, reason="no axe-core; run it with: npm install --no-save axe-core")
 DESKTOP, PHONE = (1440, 1000), (390, 844)
 
 
@@ -157,6 +167,15 @@ class Browser:
         while self.driver.find_elements(By.CSS_SELECTOR, ".failure:not(.missing) button"):
             with contextlib.suppress(StaleElementReferenceException, IndexError):
                 self.driver.find_elements(By.CSS_SELECTOR, ".failure:not(.missing) button")[0].click()
+
+    def violations(self) -> list[str]:
+        """What axe-core finds against WCAG 2.2 AA and good practice, a line for each rule, with the elements."""
+        assert AXE is not None
+        self.driver.execute_script(AXE.read_text())
+        found = self.driver.execute_async_script(
+            "const done = arguments[0]; axe.run({resultTypes: ['violations']}).then((found) => done(found.violations))"
+        )
+        return [f"{rule['id']}: {rule['help']}: {[node['html'] for node in rule['nodes']]}" for rule in found]
 
     def alerts(self) -> str:
         return str(self.driver.execute_script("return document.querySelector('[role=alert]').innerText")).strip()

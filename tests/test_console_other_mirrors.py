@@ -13,7 +13,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
+from console_browser import DESKTOP, PHONE, Browser, needs_axe, needs_browser, served, shots_folder
 from console_stand_in import StandIn
 from dm_common.geometry import hexagonal_positions
 from dm_common.ros.domains import own_domain
@@ -177,6 +177,21 @@ def test_all_text_stands_out_from_its_ground(
     page.dismiss_all()
     page.prefer("light")
     page.resize(*DESKTOP)
+
+
+@needs_axe
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_axe_finds_nothing(bench: tuple[Browser, StandIn, str], size: tuple[int, int], scheme: str) -> None:
+    page = bench[0]
+    page.resize(*size)
+    page.prefer(scheme)
+    for title in DETAILS:
+        page.unfold(title)
+    found = page.violations()
+    page.prefer("light")
+    page.resize(*DESKTOP)
+    assert "\n".join(found) == ""
 
 
 def test_the_focus_goes_through_the_page_in_order_and_is_seen(bench: tuple[Browser, StandIn, str]) -> None:

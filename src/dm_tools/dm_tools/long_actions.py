@@ -126,7 +126,7 @@ class ExternalGoals:
 def calibration_step(feedback: Any) -> str:
     """Feedback of the action `calibrate`: phase, what is measured, what was dropped, how good it is so far."""
     phase = PHASES[feedback.phase] if feedback.phase < len(PHASES) else "?"
-    text = f"{phase} {feedback.label}"
+    text = phase if feedback.label in ("", phase) else f"{phase} {feedback.label}"
     if feedback.maps_dropped:
         text += f", {feedback.maps_dropped} dropped"
     if feedback.reached_max_zernike > 0.0:

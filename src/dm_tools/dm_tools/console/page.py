@@ -41,6 +41,8 @@ def serve(ros: ConsoleNode, port: int) -> None:
 
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=HOST_NAMES)
     app.on_shutdown(session.end)
+    # Quasar's bar of what is being fetched has no name for a screen reader, and says nothing about the mirror.
+    app.config.quasar_config["loadingBar"]["skipHijack"] = True
     ui.run(
         host=HOST,
         port=port,
@@ -59,7 +61,7 @@ def build(session: Session, view: SurfaceView) -> None:
     ui.add_css(style.CSS)
     ui.colors(primary=style.PRIMARY, negative=style.ERROR, warning=style.WARNING)
     header = Header(session)
-    with ui.element("main").classes("grid"):
+    with ui.element("div").classes("grid"):  # inside the page's own <main>
         with ui.element("div").classes("column side"):
             left = (FocusCard(session), CalibrationCard(session), RecipesCard(session))
         with ui.element("div").classes("column wide"):

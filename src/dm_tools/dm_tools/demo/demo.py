@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
-from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, progress_bar, write_json
+from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, next_step, progress_bar, write_json
 
 #: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
@@ -112,7 +112,7 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
         "predicted rms nm",
         "measured rms nm",
         "largest coeff. nm",
-        "",
+        "λ/n",
         "saturated",
     ):
         table.add_column(heading, justify="right")
@@ -215,7 +215,8 @@ def demo(
             figures["real_map"] = ingest_real_map(map_file, folder, domain)
         console.print(
             f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
-            f"seed {seed}; logs in {os.path.relpath(folder)}"
+            f"seed {seed}; its time runs {f'{speed:g} times as fast as' if speed else 'as'} real time; logs in "
+            f"{os.path.relpath(folder)}"
         )
         with running_bench(config, folder, domain, DeformableMirrorClient) as client:
             begun = time.monotonic()
@@ -231,6 +232,7 @@ def demo(
             fitting_limit = best_possible(client.latest("calibration"), mirror, ends)
             if hysteresis_maps and (hysteresis is not Hysteresis.off or actual_creep):
                 show_sweep(rows, fitting_limit, "influence function alone")
+                console.print("what an influence function cannot know is hysteresis and creep; now they are identified")
                 without_hysteresis = rows
                 identified, rows = identify_hysteresis(client, hysteresis_maps, settle)
                 figures["hysteresis"] = figures_of(identified)
@@ -251,3 +253,5 @@ def demo(
     }
     write_json(json, figures)
     console.print(f"done in {time.monotonic() - started:.0f} s")
+    option = f" --config {config_file}" if config_file else ""
+    next_step(f"./dm up{option} starts such nodes for you to play with; ./dm demo --camera focuses a camera")

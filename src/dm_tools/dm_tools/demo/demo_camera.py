@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
-from dm_tools.output import console, progress_bar, write_json
+from dm_tools.output import console, next_step, progress_bar, write_json
 from dm_tools.verbs.up import DISTANCES, RATE, add_camera
 
 if TYPE_CHECKING:  # both are slow to import, and `dm --help` needs neither
@@ -229,3 +229,4 @@ def demo_camera(
         },
     )
     console.print(f"done in {time.monotonic() - started:.0f} s")
+    next_step("./dm up --camera starts these nodes for you to play with; docs/camera.md puts your camera in its place")

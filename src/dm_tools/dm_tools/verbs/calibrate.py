@@ -177,7 +177,7 @@ def write_parameters(parameters: str, target: Path, source: Path) -> None:
 
 def _foretold(result: Any) -> str:
     expected = result.expected_max_zernike
-    return f", expected {in_nanometres(expected)}" if expected > 0.0 else ""
+    return f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
 
 
 def figures_of(result: Any) -> dict[str, Any]:
