@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dm_common.hysteresis.inverse import TOLERANCE, invert
+from dm_common.bounded import BoundedProgramme
+from dm_common.hysteresis.inverse import TOLERANCE, ConstrainedInverse, invert
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.limits import Limits
 from example_hysteresis import plays, rich
 
 STATIC = HysteresisModel(np.zeros(1), np.array([[1.0, 0.2, 0.05]]), np.zeros(0), 0.0, 0.0, np.zeros(0))
@@ -51,3 +53,37 @@ def test_wrong_wishes_are_refused(wanted: np.ndarray) -> None:
     law = rich()
     with pytest.raises(ValueError, match="must be 3 finite numbers"):
         invert(law, law.demagnetised(3, 0.0), wanted, -1.0, 1.0)
+
+
+@pytest.mark.parametrize(("seed", "move"), [(0, 4), (9, 2)])
+def test_actuators_that_turn_do_not_keep_the_search_from_the_nearest_legal_shape(seed: int, move: int) -> None:
+    """With the slopes where they stand alone it goes round in circles here and ends at 0.5 and 1.1."""
+    law = HysteresisModel(
+        np.array([0.0, 0.02, 0.1, 0.3]), np.array([[0.65], [0.1], [0.1], [0.1]]), np.zeros(0), 0.0, 0.0, np.zeros(0)
+    )
+    axis = np.arange(-3, 4)
+    x, y = np.array([(a + b / 2, b * 0.75**0.5) for a in axis for b in axis if abs(a + b) <= 3]).T / 3
+    pairs = np.argwhere(np.triu(np.hypot(x[:, None] - x, y[:, None] - y) < 0.4, 1))
+    matrix, ridge = _smooth_rows(x, y)
+    limits = Limits(-1.0, 1.0, pairs, 0.5)
+    programme, inverse = BoundedProgramme(matrix, limits, ridge=ridge), ConstrainedInverse(law, limits, matrix, ridge)
+    rng = np.random.default_rng(seed)
+    state = law.demagnetised(len(x), 0.0)
+    for number in range(move + 1):
+        bowl, coma, astigmatism = rng.uniform(-1.0, 1.0, 3) * (1.2, 0.4, 0.4)
+        rows = matrix @ (bowl * (x**2 + y**2 - 0.5) + coma * x**3 + astigmatism * x * y)
+        near = invert(law, state, programme.solve(rows), -1.0, 1.0).signals
+        found = [inverse.solve(state, rows, 0.0, start) for start in (near, state.signals, np.zeros(len(x)))]
+        left = [np.linalg.norm(matrix @ one.effective - rows) for one in found]
+        assert number < move or max(left) < 0.06
+        state = law.move(state, found[0].signals, 0.0)
+
+
+def _smooth_rows(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
+    """Rows of a mirror of smooth influence, its low orders counting a hundred times, and the ridge with it."""
+    grid = np.linspace(-0.7, 0.7, 17)
+    at_x, at_y = (axis[np.add.outer(grid**2, grid**2) <= 0.5] for axis in np.meshgrid(grid, grid))
+    sag = np.exp(-(np.subtract.outer(at_x, x) ** 2 + np.subtract.outer(at_y, y) ** 2) / 0.32)
+    powers = np.stack([at_x**i * at_y**j for i in range(6) for j in range(6 - i)], axis=1)
+    low = np.linalg.qr(powers)[0]
+    return np.vstack((100.0 * (low.T @ sag)[1:], sag - low @ (low.T @ sag))), 1e-4

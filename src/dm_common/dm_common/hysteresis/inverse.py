@@ -6,9 +6,9 @@ grows with actuators times operators.
 
 Where limits bind, they are those of the signals, and the shape is that of the effective signals. A limit on signals is
 another one on effective signals for every state, so the programme is solved for signals, with the model taken as
-straight about the last solution (sequential quadratic programming): a few rounds end where the next one changes
-nothing. Each ends inside the limits: what comes out is the nearest legal shape, not a part of the way to one that is
-not legal.
+straight about the last solution (sequential quadratic programming), or, where that led further away, on the way to it:
+a few rounds end where the next one changes nothing. Each ends inside the limits: what comes out is the nearest legal
+shape, not a part of the way to one that is not legal.
 """
 
 from __future__ import annotations
@@ -233,17 +233,37 @@ class ConstrainedInverse:
         rest = np.exp(-ahead / law.creep_time)
         growth = 1.0 + law.creep_share @ (1.0 - rest)  # of a step taken now, until it counts
         crept = (law.creep_share * at.crept) @ rest
+
+        def reached(signals: Floats) -> Floats:
+            return np.asarray(growth * law.position_at(at, signals) + crept)
+
+        def rise(signals: Floats) -> Floats:
+            change = law.position_at(at, signals + SLOPE_STEP) - law.position_at(at, signals - SLOPE_STEP)
+            return np.asarray(growth * change / (2.0 * SLOPE_STEP))
+
+        def missed(effective: Floats) -> float:
+            return float(np.linalg.norm(self._root @ effective - wanted))
+
         signals = np.clip(start, limits.low, limits.high)
+        effective, slope = reached(signals), rise(signals)
+        least = np.inf  # where it begins need not be legal
         for _ in range(ROUNDS):
-            reached = growth * law.position_at(at, signals) + crept
-            rise = law.position_at(at, signals + SLOPE_STEP) - law.position_at(at, signals - SLOPE_STEP)
-            slope = growth * rise / (2.0 * SLOPE_STEP)
             programme = BoundedProgramme(self._root * slope, limits)
-            before = signals
-            signals = programme.solve(wanted - self._root @ (reached - slope * signals))
-            if np.abs(signals - before).max() <= CONVERGED:
+            found = programme.solve(wanted - self._root @ (effective - slope * signals))
+            step, there = found - signals, reached(found)
+            if missed(there) < least:
+                signals, effective = found, there
+                slope = rise(signals)
+            else:
+                # Actuators turn on the way, which changes their slopes: those of the whole way serve better.
+                np.divide(there - effective, step, out=slope, where=np.abs(step) > SLOPE_STEP)
+                half = signals + 0.5 * step
+                if missed(reached(half)) < least:
+                    signals, effective = half, reached(half)
+            least = missed(effective)
+            if np.abs(step).max() <= CONVERGED:
                 break
-        return Constrained(signals, growth * law.position_at(at, signals) + crept)
+        return Constrained(signals, effective)
 
 
 #: Random histories that tell what is always within reach, their moves, and the time between those, s.
