@@ -60,7 +60,7 @@ def sphere_command(view: View, curvature: float, stroke: float) -> tuple[Array, 
     """Best signals inside -1..+1 for a sphere, piston and tilt free; the surface they give and what is left of it.
 
     Returns:
-        signals (37,), sag and residual (pixels, pixels) in m.
+        signals (37,); sag, its tilt taken off, and residual (pixels, pixels) in m.
     """
     x, y = np.meshgrid(view.x, view.y)
     inside = view.camera.aperture
@@ -76,8 +76,8 @@ def sphere_command(view: View, curvature: float, stroke: float) -> tuple[Array, 
     x, y = np.meshgrid(view.x, view.y)
     with np.errstate(invalid="ignore"):
         wanted = curvature * (x**2 + y**2) / (1 + np.sqrt(1 - curvature**2 * (x**2 + y**2)))
-    plane = (np.stack([np.ones_like(x), x / view.radius, y / view.radius], -1) @ solution[-3:]) * micrometre
-    return signals, sag, sag + plane - wanted
+    sag += (np.stack([np.ones_like(x), x / view.radius, y / view.radius], -1) @ solution[-3:]) * micrometre
+    return signals, sag, sag - wanted
 
 
 def draw_hysteresis(axes: Axes, config: PiezoConfig) -> None:
@@ -158,7 +158,7 @@ def draw(output: Path, poke: int, curvature: float, config: PiezoConfig, seed: i
     )
     signals, sag, residual = sphere_command(view, curvature, config.stroke)
     sag_nm = (sag - np.nanmean(sag)) * 1e9
-    view.show(figure, axes[0, 1], sag_nm, f"Sphere, curvature {curvature:g} 1/m", "sag less mean / nm")
+    view.show(figure, axes[0, 1], sag_nm, f"Sphere, curvature {curvature:g} 1/m", "sag less mean and tilt / nm")
     rms = float(np.sqrt(np.nanmean(residual**2)) * 1e9)
     view.show(figure, axes[0, 2], residual * 1e9, f"What the actuators cannot reach: {rms:.1f} nm rms", "residual / nm")
 

@@ -15,7 +15,7 @@ from dm_bringup.suite import save_config
 from dm_client import DeformableMirrorClient
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
-from dm_tools.verbs.up import configurations
+from dm_tools.verbs.up import configurations, shared_config
 
 pytestmark = pytest.mark.processes
 
@@ -54,6 +54,11 @@ def test_a_camera_comes_with_an_autofocus_that_knows_its_optics(tmp_path: Path) 
 def test_what_does_not_fit_is_refused(tmp_path: Path, files: int, names: list[str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         configurations([tmp_path / "config.yaml"] * files, names)
+
+
+def test_a_template_that_nobody_has_filled_in_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"hardware\.yaml: still CHANGE: pdm_driver\.mirror\.serial, .*watch_folder"):
+        configurations([shared_config("hardware.yaml")], [""])
 
 
 def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:

@@ -56,10 +56,17 @@ def load_config(path: Path) -> Config:
     return result
 
 
+class _Dumper(yaml.SafeDumper):
+    """Quotes every text: ROS takes some for numbers that are none in YAML, such as the serials 0815 and 1e5."""
+
+
+_Dumper.add_representer(str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"'))
+
+
 def save_config(config: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """Write a ROS 2 parameter file that applies in any namespace."""
     content = {f"/**/{name}": {"ros__parameters": dict(values)} for name, values in config.items()}
-    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    path.write_text(yaml.dump(content, Dumper=_Dumper, sort_keys=False))
 
 
 def stop_processes(processes: Collection[subprocess.Popen[bytes]], timeout_s: float = 15.0) -> None:

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from rclpy.context import Context
+from rclpy.node import Node
 
 from dm_bringup import suite as suite_module
-from dm_bringup.suite import RESTART_S, Suite
+from dm_bringup.suite import RESTART_S, Suite, load_config, save_config
 
 
 @pytest.fixture
@@ -23,6 +25,22 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Suit
         return Suite({"calibration": {}}, tmp_path / "run", nodes=("calibration",))
 
     return run
+
+
+@pytest.mark.parametrize("text", ["0815", "1e5", "1234", "true", "10:30", "", 'a "b" \\ c', "λ"])
+def test_texts_stay_texts_on_their_way_to_the_nodes(tmp_path: Path, text: str) -> None:
+    """A serial such as 0815 is a number to the parser of ROS, and none to that of YAML, unless it is quoted."""
+    file = tmp_path / "config.yaml"
+    save_config({"pdm_driver": {"mirror.serial": text}}, file)
+    assert load_config(file) == {"pdm_driver": {"mirror.serial": text}}
+    context = Context()
+    context.init(["--ros-args", "--params-file", str(file)])
+    try:
+        node = Node("pdm_driver", context=context, automatically_declare_parameters_from_overrides=True)
+        assert node.get_parameter("mirror.serial").value == text
+        node.destroy_node()
+    finally:
+        context.shutdown()
 
 
 def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:

@@ -44,7 +44,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "calibration": _calibration(calibration),
         "promise": _promise(capabilities) if calibration is not None else "none without a calibration",
         "health": "; ".join(f"{name}: {each.message}" for name, each in health.items() if each.level != b"\0") or "ok",
-        "next": _next(lacking, by, calibration, shape, capabilities),
+        "next": _next(lacking, by, state, calibration, shape, capabilities),
     }
     for name, text in rows.items():
         console.print(f"[bold]{name:12s}[/]{text}", soft_wrap=True)
@@ -97,9 +97,11 @@ def _promise(capabilities: Any) -> str:
     )
 
 
-def _next(lacking: list[str], by: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
+def _next(lacking: list[str], by: Any, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
     if lacking:
         return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
+    if state is None or state.driver_state != state.STATE_ACTIVE:
+        return "the driver must be active first: ./dm doctor --config FILE says what it lacks"
     if by is not None:
         return "wait for its end; ./dm console shows how far it is, and can cancel it"
     if calibration is None or not calibration.hysteresis.play_radius:

@@ -136,6 +136,8 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
         ValueError: the numbers do not match, a namespace comes twice, a section is missing, or a file has the say on
             the camera.
     """
+    from dm_tools.doctor.bench import own_values
+
     if camera and files:
         raise ValueError("--camera is for the virtual bench that ships; a file of yours says itself what camera it has")
     names = [namespace.strip("/") for namespace in namespaces]
@@ -148,6 +150,8 @@ def configurations(files: list[Path], namespaces: list[str], camera: bool = Fals
         configuration = load_config(files[number] if files else shared_config("bench.yaml"))
         if "pdm_driver" not in configuration:
             raise ValueError(f"{files[number]}: no section for pdm_driver: its required parameters must be given")
+        if (unset := own_values(configuration)) is not None:
+            raise ValueError(f"{files[number]}: {unset.problem}: {unset.cure}")
         if camera:
             add_camera(configuration)
         result[name] = configuration if files or len(names) == 1 else virtual_mirror(configuration, name, number)
