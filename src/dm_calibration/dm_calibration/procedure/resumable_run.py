@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -85,7 +85,8 @@ def identity_of(
     steps = hashlib.sha256(json.dumps(described).encode()).hexdigest()
     facts = {
         "plan": plan.kind.name,
-        "plan_options": asdict(options),
+        # Whatever else of the options the plan uses shows in its steps.
+        "until": options.until,
         "plan_sha256": _hash(*signals) + steps,
         "mirror": mirror_facts(mirror),
         "settings": dict(settings),

@@ -158,9 +158,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{folder.name}: schema version {content.get('schema_version')}: this software reads {SCHEMA_VERSION}"
         )
     identity = content.get("identity")
-    if isinstance(identity, dict) and "memory_maps" in identity.get("plan_options", ()):  # its name before 0.2
-        identity["plan_options"]["hysteresis_maps"] = identity["plan_options"].pop("memory_maps")
-        identity["plan_options"].setdefault("until", 0.0)  # no run ended early then
+    if isinstance(identity, dict) and "plan_options" in identity:  # of before 0.2: all options, used by the plan or not
+        identity["until"] = identity.pop("plan_options").get("until", 0.0)
         if identity.get("plan") == "MEMORY":
             identity["plan"] = "HYSTERESIS"
     return content
