@@ -174,7 +174,11 @@ def test_the_command_checks_and_tells_by_its_exit_status(suite: Suite, tmp_path:
     command = [sys.executable, "-m", "dm_tools", "check", "--json", str(figures)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert json.loads(figures.read_text())["check"]["revision"] == 1
+    check = json.loads(figures.read_text())["check"]
+    assert check["revision"] == 1
+    suite.bench.plant.figure_coefficients[4] += 1e-9 * (check["promised_nm"] + check["max_zernike_nm"])
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and "outside" in done.stdout and "the map disagrees" not in done.stdout, done.stdout
     suite.bench.plant.figure_coefficients[4] += 100e-9
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1

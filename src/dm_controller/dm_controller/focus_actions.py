@@ -23,7 +23,7 @@ from dm_controller.conditioning import Run
 from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE, MOVE_FOCUS
 from dm_controller.focus_types import Order, StartDegauss
 from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.target import FocusTarget, Request
+from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
@@ -37,9 +37,12 @@ class LoopHost:
         self._node = node
 
     def target(self, request: FocusRequest) -> FocusTarget:
-        """The target of a request that could be carried out. Raises Refusal."""
-        with self._node.controller() as (controller, now):
-            return controller.judge(Request.from_message(request), now).target
+        """The target of a request that could be carried out. Raises Refusal, as for a move."""
+        outcome = self._node.order(request, dry_run=True).outcome
+        if outcome.refusal is not None:
+            raise outcome.refusal
+        assert outcome.move is not None  # else it is refused
+        return outcome.move.target
 
     def active_calibration(self) -> ActiveCalibration:
         """The calibration in use. Raises Refusal."""

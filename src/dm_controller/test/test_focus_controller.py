@@ -6,7 +6,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import Applied
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
+from dm_controller.focus_actions import LoopHost
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import capabilities_message, health
 from dm_controller.focus_types import (
@@ -267,6 +269,15 @@ def test_a_dry_run_changes_nothing(bench: Bench) -> None:
     assert order.outcome is not None and order.outcome.move is not None
     assert not (bench.commands or bench.outcomes)
     assert not bench.controller.hold.active
+
+
+def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None:
+    host = LoopHost(cast(Any, SimpleNamespace(order=lambda message, dry_run: bench.ask(message.curvature, dry_run))))
+    assert host.target(FocusRequest(curvature=0.01)).curvature == 0.01
+    with pytest.raises(Refusal, match="reachable:") as refused:
+        host.target(FocusRequest(curvature=9.0))
+    assert refused.value.error_code == ErrorCode.UNREACHABLE
+    assert not (bench.commands or bench.outcomes)
 
 
 @pytest.mark.parametrize(

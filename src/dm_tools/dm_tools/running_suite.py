@@ -67,11 +67,16 @@ def ago(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
+def kept(promised: float, measured: float) -> bool:
+    """Whether a measured largest coefficient error (m) is inside the promise; 0 = nothing is promised."""
+    return measured <= promised or not promised > 0.0
+
+
 def verdict(promised: float, measured: float) -> str:
     """Promised (0 = not known) and measured largest coefficient error (m), and whether the promise was kept."""
-    kept = "[green]inside[/]" if measured <= promised else "[red]outside[/]"
+    judged = "[green]inside[/]" if kept(promised, measured) else "[red]outside[/]"
     found = f"promised {promise(promised)}, measured {in_nanometres(measured)}"
-    return f"{found}: {kept}" if promised > 0.0 else found
+    return f"{found}: {judged}" if promised > 0.0 else found
 
 
 class Holder(NamedTuple):
