@@ -1,4 +1,4 @@
-"""Make camera.gif of the README: the animation that `./dm demo --camera` leaves in runs/demo, with fewer frames.
+"""Make camera.gif of the README: the animation that `./dm demo --camera` leaves in runs/demo, with fewer colours.
 
 ./dm exec python docs/images/camera.py
 """
@@ -10,8 +10,8 @@ from pathlib import Path
 
 from PIL import Image, ImageSequence
 
-#: Of a search every second image is kept, and the one it ends with, which the demo shows for longer than a moment.
-EVERY, MOMENT_MS = 2, 200
+#: The image that a search ends with is shown by the demo for longer than this.
+MOMENT_MS = 200
 #: How long each is shown here.
 SEARCH_MS, END_MS = 150, 2000
 COLOURS = 128
@@ -21,10 +21,9 @@ def main() -> None:
     source = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/demo/camera.gif")
     kept: list[tuple[Image.Image, int]] = []
     with Image.open(source) as animation:
-        for number, frame in enumerate(ImageSequence.Iterator(animation)):
+        for frame in ImageSequence.Iterator(animation):
             ends = frame.info["duration"] > MOMENT_MS
-            if ends or number % EVERY == 0:
-                kept.append((frame.convert("RGB"), END_MS if ends else SEARCH_MS))
+            kept.append((frame.convert("RGB"), END_MS if ends else SEARCH_MS))
     # One palette for all: that of the first frame, where all is dull, beside those that the searches end with.
     shown = [kept[0][0], *(frame for frame, duration in kept if duration == END_MS)]
     sheet = Image.new("RGB", (shown[0].width, shown[0].height * len(shown)))
