@@ -198,6 +198,7 @@ class Browser:
 
 
 def shots_folder(fallback: Path) -> Path:
-    """Where screenshots go: DM_SCREENSHOTS when it is set."""
-    named = os.environ.get("DM_SCREENSHOTS")
-    return Path(named) if named else fallback
+    """Where screenshots go: DM_SCREENSHOTS when it is set, made where it is not there."""
+    folder = Path(os.environ.get("DM_SCREENSHOTS") or fallback)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
