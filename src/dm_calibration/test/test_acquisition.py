@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from dm_calibration.acquisition import acquisition
 from dm_calibration.acquisition.acquisition import Acquisition, AcquisitionSettings
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.trigger import TriggerError, run_trigger
@@ -158,11 +159,15 @@ def test_no_new_file_in_time(tmp_path: Path, bench: Any) -> None:
         bench(tmp_path).acquisition.acquire(0.2)
 
 
-def test_folder_that_does_not_exist_is_reported_once_and_waited_for(tmp_path: Path, bench: Any) -> None:
+@pytest.mark.parametrize(("patience", "complaints"), [(0.1, 1), (20.0, 0)])
+def test_folder_that_does_not_exist_is_waited_for_and_reported_once_when_that_takes_long(
+    tmp_path: Path, bench: Any, monkeypatch: pytest.MonkeyPatch, patience: float, complaints: int
+) -> None:
+    monkeypatch.setattr(acquisition, "FOLDER_PATIENCE_S", patience)
     one = bench(tmp_path / "later")
     with pytest.raises(Refusal, match="cannot be read: No such file"):
-        one.acquisition.acquire(0.3)
-    assert len(one.troubles) == 1
+        one.acquisition.acquire(0.5)
+    assert len(one.troubles) == complaints
     (tmp_path / "later").mkdir()
     wait_until(lambda: not one.acquisition.folder_trouble, what="the folder is watched")
     (tmp_path / "later" / "a.dat").write_bytes(MAP)

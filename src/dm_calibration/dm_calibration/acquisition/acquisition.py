@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import re
 import threading
@@ -20,6 +21,8 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
 
 _POLL_OUTPUT_S = 0.01
+#: A folder that cannot be read for so long is worth a warning, s: who makes it may be starting at the same time.
+FOLDER_PATIENCE_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ class Acquisition:
         """
         self.settings = settings
         self.folder_trouble = ""
+        self._complain_at: float | None = None
         self._read = read
         self._now_ns = now_ns
         self._on_file = on_file
@@ -250,12 +254,15 @@ class Acquisition:
         try:
             events = watch.poll(time.monotonic())
         except OSError as error:
-            trouble = f"watch_folder = {str(watch.folder)!r} cannot be read: {error.strerror or error}"
-            if not self.folder_trouble:
-                self._on_trouble(trouble)
-            self.folder_trouble = trouble
+            self.folder_trouble = f"watch_folder = {str(watch.folder)!r} cannot be read: {error.strerror or error}"
+            now = time.monotonic()
+            if self._complain_at is None:
+                self._complain_at = now + FOLDER_PATIENCE_S
+            if now >= self._complain_at:
+                self._on_trouble(self.folder_trouble)
+                self._complain_at = math.inf  # once
             return []
-        self.folder_trouble = ""
+        self.folder_trouble, self._complain_at = "", None
         return events
 
     def _hand_over(self, event: FileEvent) -> None:

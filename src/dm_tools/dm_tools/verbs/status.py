@@ -7,6 +7,7 @@ from typing import Any
 
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
 from dm_tools.running_suite import (
+    BUSY_S,
     REPORT_S,
     Standing,
     ago,
@@ -28,6 +29,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     with running_suite(namespace) as client:
         health = hear_health(client)
         client.wait(lambda: set(NEEDED) <= health.keys() & nodes_of_suite(client).keys(), REPORT_S)
+        client.wait(lambda: set(NEEDED) <= nodes_of_suite(client).keys(), BUSY_S - REPORT_S)
         client.wait(lambda: {"mirror_info", "calibration", "capabilities"} <= client.messages.keys(), 0.5)
         by = holder(client)
         found, place = nodes_of_suite(client), where(client)
