@@ -2,7 +2,9 @@
 
 Creep much younger than a map, or much older than the run, follows from the smoothness of the spectrum alone; what is
 between, from the maps. To first order the errors of the weights are those of a Bayesian linear regression on the
-positions and what the creep elements have followed of them, with figure and gains as fitted.
+positions and what the creep elements have followed of them, with figure and gains as fitted. What the law does not
+hold, such as loops that widen with speed, all actuators do together, so that errors of the responses are not
+independent: the maps count for less, as far as what they leave goes the way of the features.
 """
 
 from __future__ import annotations
@@ -20,9 +22,13 @@ from dm_common.optics.zernike import PISTON_TILT
 
 Floats = NDArray[np.float64]
 
-#: Prior standard deviation of the elements' weights relative to the mean rate, and their correlation over elements;
-#: that of a position, relative; the spread of both between actuators, relative to that.
-SPECTRUM, CORRELATION, POSITION, SPREAD = 0.6, 6.0, 0.03, 0.3
+#: Prior of the elements' weights that all actuators share: standard deviation relative to the mean rate, and their
+#: correlation over elements. Creep may begin or end anywhere: none at all of an element is not unlikely.
+SHARED, SHARED_CORRELATION = 0.9, 2.0
+#: The same of what an actuator differs by: rather in its rate than in its spectrum.
+OWN, OWN_CORRELATION = 0.12, 6.0
+#: Prior standard deviations of a position, relative: shared, and of each.
+POSITION, OWN_POSITION = 0.03, 0.009
 #: An actuator whose gains are less than this share of the largest is dead.
 DEAD = 0.01
 
@@ -55,17 +61,27 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
     gains = solution[figure.shape[1] :] / scatter
     seen = without(features[keep], basis_of(figure))
 
-    prior = np.zeros((1 + len(CREEP_TIMES),) * 2)
-    prior[0, 0], prior[1:, 1:] = POSITION**2, spectrum_prior(law.creep_rate, SPECTRUM, CORRELATION)
     together = seen @ gains
-    shared = np.linalg.inv(np.einsum("mjd,mkd->jk", together, together) + np.linalg.inv(prior))
+    evidence = np.einsum("mjd,mkd->jk", together, together)
+    errors = np.einsum("mjd,md->mj", together, left / scatter)
+    excess = max(1.0, float(np.mean(np.square(errors).sum(axis=0) / np.diag(evidence))))
+    prior = _prior(law, SHARED, SHARED_CORRELATION, POSITION)
+    shared = np.linalg.inv(evidence / excess + np.linalg.inv(prior))
     # What one actuator shows beside all others, but for piston and tilt, which no response holds; a dead one nothing.
     # It takes the place of one of those three: it does not follow them, so the others show that pattern.
     moves = np.linalg.norm(gains, axis=1)
     alive = moves > DEAD * moves.max()
     hidden = max(PISTON_TILT, int((~alive).sum()))
     size, axes = np.linalg.eigh(gains @ gains.T)
-    evidence = np.zeros(len(gains))
-    evidence[alive] = 1.0 / (np.square(axes[alive, hidden:]) / size[hidden:]).sum(axis=1)
-    each = np.einsum("mjn,mkn,n->njk", seen, seen, evidence, optimize=True) + np.linalg.inv(SPREAD**2 * prior)
+    weight = np.zeros(len(gains))
+    weight[alive] = 1.0 / (np.square(axes[alive, hidden:]) / size[hidden:]).sum(axis=1)
+    prior = _prior(law, OWN, OWN_CORRELATION, OWN_POSITION)
+    each = np.einsum("mjn,mkn,n->njk", seen, seen, weight, optimize=True) + np.linalg.inv(prior)
     return np.stack((shared, np.linalg.inv(each).mean(axis=0)))
+
+
+def _prior(law: HysteresisModel, spectrum: float, correlation: float, position: float) -> Floats:
+    """(1 + J, 1 + J) covariance of the weights of position and creep elements, relative to those of `law`."""
+    prior = np.zeros((1 + len(CREEP_TIMES),) * 2)
+    prior[0, 0], prior[1:, 1:] = position**2, spectrum_prior(law.creep_rate, spectrum, correlation)
+    return prior
