@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import Degauss
-from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import HoldMirror, Measure, SetSignals
 
 from dm_common.errors import Refusal
@@ -50,6 +50,7 @@ class StandIn:
         self.state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
         self.zernike = node.create_publisher(ZernikeCoefficients, "zernike", qos.STATE)
         self.samples = node.create_publisher(SurfaceSamples, "surface_samples", qos.STATE)
+        self.map_info = node.create_publisher(SurfaceMapInfo, "surface_map_info", qos.with_lease(qos.STATE))
         node.create_timer(0.1, self.publish_state)  # a driver reports in any case
         node.create_service(SetSignals, "set_signals", self.on_set_signals)
         WorkerActionServer(node, Degauss, "degauss", lambda handle: self.on_degauss(handle.request.steps))
@@ -150,7 +151,7 @@ class StandIn:
         response = response if response is not None else Measure.Response()
         sag = self.plant.sag(self.signals) + bump * self.plant.modes[:, 4]
         zernike, samples = response.zernike, response.samples
-        zernike.header.stamp = samples.header.stamp = self.node.get_clock().now().to_msg()
+        response.info.header.stamp = zernike.header.stamp = samples.header.stamp = self.node.get_clock().now().to_msg()
         zernike.radius = samples.radius = RADIUS
         zernike.wavelength = 632.8e-9
         zernike.coefficients = doubles(self.plant.fit_terms(sag))
@@ -163,3 +164,4 @@ class StandIn:
         """As the interferometer does after each map."""
         self.zernike.publish(message.zernike)
         self.samples.publish(message.samples)
+        self.map_info.publish(message.info)

@@ -11,8 +11,10 @@ import sys
 import time
 import traceback
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import pytest
 import rclpy
 import yaml
@@ -25,6 +27,7 @@ from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_simulation.interferometer.zygo_files import encode_dat
 from dm_tools.doctor import bench as doctor_bench
 from dm_tools.doctor import machine as doctor_machine
 from dm_tools.doctor.finding import Finding
@@ -74,11 +77,22 @@ WIRING = list(range(1, 38))
 TWO_RINGS = {"mirror.actuators": 19, "mirror.wiring": "custom", "mirror.channels": WIRING[:19]}
 LINK = {"electronics.pty_link": "tty", "framed.channels": 40}
 
+_FOLDER = TemporaryDirectory()
+#: A map of 632.8 nm.
+FLAT = Path(_FOLDER.name) / "flat.dat"
+FLAT.write_bytes(encode_dat(np.zeros((8, 8)), 1e-4, 632.8e-9, 0))
+
 #: Values that contradict each other: node, what differs from the shipped bench, words of the reason.
 CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("interferometer", {"watch_folder": ""}, "trigger_command needs watch_folder"),
     ("interferometer", {"watch_folder": "~nobody-of-that-name/maps"}, "watch_folder = '~nobody"),
     ("interferometer", {"trigger_command": ["", "x"]}, "must name a program"),
+    (
+        "interferometer",
+        {"reference_surface": "/nowhere/flat.dat"},
+        "reference_surface: /nowhere/flat.dat: No such file",
+    ),
+    ("interferometer", {"reference_surface": str(FLAT), "wavelength.expected": 532e-9}, "must be 532.000 nm"),
     ("interferometer", {"trigger_output_suffix": "../x"}, "must be an ending such as .datx"),
     ("pdm_driver", {"mirror.serial": " "}, "mirror.serial is empty"),
     ("pdm_driver", {"mirror.actuators": 19}, "lists 37 channels: must be 19"),

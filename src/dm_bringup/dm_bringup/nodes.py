@@ -77,7 +77,7 @@ NODES = (
         "dm_calibration",
         "InterferometerNode",
         "interferometer_parameters",
-        "interferometer_parameters.acquisition_settings",
+        "interferometer_parameters.configure",
         True,
     ),
     SuiteNode("calibration", "dm_calibration", "CalibrationNode", "calibration_parameters"),

@@ -39,6 +39,7 @@ _ATTRIBUTES: dict[str, type] = {
     "targets": tuple,
     "limitations": tuple,
     "note": str,
+    "reference_surface": str,
 }
 #: Names of attributes that differ from their fields'.
 _STORED_AS = {"limitations": "known_limitations"}
@@ -70,6 +71,8 @@ class Calibration:
         note: the user's.
         hysteresis: hysteresis and creep; with it, `fit` acts on effective signals. None = not identified.
         recipes: built on this calibration.
+        reference_surface: the map that was subtracted from all others as the instrument's error, and its SHA-256; "" =
+            none.
         region_weights: (10,) Eq. (8), for commands weighted by region; empty where no sample surfaces were measured.
     """
 
@@ -90,6 +93,7 @@ class Calibration:
     software_version: str = ""
     hysteresis: HysteresisFit | None = None
     recipes: RecipeBook = NO_RECIPES
+    reference_surface: str = ""
     region_weights: Floats = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -165,6 +169,7 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         columns = {"maps/moved_ns": unknown, "maps/segment": unknown, **columns}
         raw: dict[str, Any] = {f.name: columns[f"maps/{f.name}"] for f in fields(MapSet) if f.name != "points"}
         maps = MapSet(points=points, **raw)
+        attributes = {"reference_surface": "", **attributes}  # there was none before it was kept
         result: dict[str, Any] = {"points": points}
         for figure in fields(InfluenceFit):
             if figure.name == "points":

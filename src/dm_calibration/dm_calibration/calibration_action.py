@@ -167,9 +167,8 @@ class CalibrateAction:
                 source = "" if in_use else ", by typical data sheets"
                 reach = f"{expected.max_zernike * 1e9:.1f} nm"
                 accuracy = f", moves then right to {reach} (largest coefficient, 95 %{source})"
-            guess = (
-                "" if map_time or in_use is not None else f" if a map takes {TYPICAL_MAP_S:g} s (none was taken yet)"
-            )
+            known = map_time or in_use is not None
+            guess = "" if known else f" if a map takes {TYPICAL_MAP_S:g} s (none was taken yet)"
             result.message = f"{maps} maps in about {expected.duration:.0f} s{guess}{accuracy}; nothing was moved"
 
     def _procedure(

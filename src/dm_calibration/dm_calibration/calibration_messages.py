@@ -21,7 +21,10 @@ from dm_common.messages import doubles, recipe_book_message, time_message
 Floats = NDArray[np.float64]
 
 # Fields of the message that are named as those of a calibration and of its fit.
-_NAMES = ("id", "mirror_name", "mirror_serial", "software_version", "wavelength", "aperture_radius", "maps_dropped")
+_NAMES = (
+    *("id", "mirror_name", "mirror_serial", "software_version", "wavelength", "aperture_radius", "maps_dropped"),
+    "reference_surface",
+)
 _RANGE = ("method", "actuators", "signal_min", "signal_max")
 _FIGURES = ("in_sample_rms", "held_out_rms", "held_out_max_zernike", "condition_number")
 _MODEL = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")

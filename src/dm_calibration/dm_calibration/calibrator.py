@@ -158,6 +158,7 @@ def _evaluated(
         note=provenance.note,
         software_version=software_version(),
         hysteresis=hysteresis,
+        reference_surface=outcome.setup.reference_surface if outcome.setup else "",
         region_weights=_region_weights(maps, fit, options),
     )
 

@@ -26,7 +26,8 @@ from std_msgs.msg import Header
 from dm_calibration.acquisition import interferometer_messages as messages
 from dm_calibration.acquisition.acquisition import Acquisition
 from dm_calibration.acquisition.ingest import Ingest, too_large
-from dm_calibration.interferometer_parameters import PARAMETERS, acquisition_settings, ingest_settings
+from dm_calibration.acquisition.reference_surface import reference_name
+from dm_calibration.interferometer_parameters import PARAMETERS, configure, ingest_settings
 from dm_calibration.map_files import MapFileError, SurfaceMap
 from dm_calibration.requests import INGEST_FILE, MEASURE
 from dm_common.errors import CodedError, ErrorCode, Refusal
@@ -50,6 +51,7 @@ class InterferometerNode(LifecycleNode):
             self, PARAMETERS, unlocked=lambda: not self._configured, check=self._fits_mirror
         )
         self._ingest = Ingest()
+        self._reference: SurfaceMap | None = None
         self._acquisition: Acquisition | None = None
         self._publishing = threading.Lock()  # the four messages of one map stay together
         self._taken = self._bad = 0
@@ -86,9 +88,8 @@ class InterferometerNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             self._values.check()
-            self._acquisition = Acquisition(
-                acquisition_settings(self._values), self._read, self._now_ns, self._on_new_file, self._warn_of_file
-            )
+            settings, self._reference = configure(self._values)
+            self._acquisition = Acquisition(settings, self._read, self._now_ns, self._on_new_file, self._warn_of_file)
         except ValueError as error:
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
@@ -104,7 +105,8 @@ class InterferometerNode(LifecycleNode):
         self._active = True
         self._acquisition.start()
         source = self._acquisition.settings.folder or "files named to ingest_file only"
-        self.get_logger().info(f"active; maps from {source}")
+        less = f", less {reference_name(self._reference)}" if self._reference is not None else ""
+        self.get_logger().info(f"active; maps from {source}{less}")
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -186,7 +188,7 @@ class InterferometerNode(LifecycleNode):
             self._published.pop(next(iter(self._published)))
 
     def _read(self, path: Path) -> tuple[SurfaceMap, Measurement]:
-        return self._ingest.read(path, ingest_settings(self._values, self._mirror_radius))
+        return self._ingest.read(path, ingest_settings(self._values, self._mirror_radius, self._reference))
 
     def _accept(self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str) -> Any:
         if self._active:
@@ -195,6 +197,7 @@ class InterferometerNode(LifecycleNode):
         response.error_code = ErrorCode.OK
         response.message = (
             f"{what}: {Path(surface.file).name}, rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
+            f"{_mended(surface)}"
         )
         response.info = messages.info_message(surface, measured, header)
         response.zernike = messages.zernike_message(measured, header)
@@ -217,7 +220,7 @@ class InterferometerNode(LifecycleNode):
         self._last_file, self._last_refusal = surface.file, ""
         self.get_logger().info(
             f"{what}: {surface.file}: PV {surface.pv * 1e9:.1f} nm, rms {surface.rms * 1e9:.1f} nm, "
-            f"{100 * measured.valid_fraction:.1f} % valid"
+            f"{100 * measured.valid_fraction:.1f} % valid{_mended(surface)}"
         )
         if surface.pitch is None and not self._warned_of_pitch:
             self._warned_of_pitch = True
@@ -276,6 +279,11 @@ class InterferometerNode(LifecycleNode):
         if self._last_refusal:
             return diagnostics.Health(diagnostics.WARN, f"refused: {self._last_refusal}", values)
         return diagnostics.Health(diagnostics.OK, "active" if self._active else "inactive", values)
+
+
+def _mended(surface: SurfaceMap) -> str:
+    count = surface.phase_steps
+    return f", {count} region{'s' if count > 1 else ''} brought back by whole fringes" if count else ""
 
 
 def main() -> int:

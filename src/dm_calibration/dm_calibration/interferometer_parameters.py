@@ -8,7 +8,8 @@ from typing import Any
 
 from dm_calibration.acquisition.acquisition import AcquisitionSettings
 from dm_calibration.acquisition.ingest import IngestSettings
-from dm_calibration.map_files import XYZ_UNITS
+from dm_calibration.acquisition.reference_surface import load_reference
+from dm_calibration.map_files import XYZ_UNITS, SurfaceMap
 from dm_calibration.optics.orientation import Orientation
 from dm_common.ros.parameters import Parameter, real, switch, text, texts
 
@@ -78,6 +79,12 @@ PARAMETERS = (
         live=True,
     ),
     Parameter(
+        "reference_surface",
+        text(""),
+        "Map file of the instrument's own error, as it shows it (before orientation.*), which is subtracted from every "
+        "map; empty = nothing is.",
+    ),
+    Parameter(
         "xyz_unit",
         text("", choices=("", *XYZ_UNITS)),
         "Unit of the values in .xyz files, which do not tell it; empty = refuse them.",
@@ -93,7 +100,20 @@ PARAMETERS = (
 )
 
 
-def ingest_settings(values: Mapping[str, Any], mirror_radius: float = 0.0) -> IngestSettings:
+def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMap | None]:
+    """What maps are taken by, and the reference surface; None = there is none.
+
+    Raises:
+        ValueError: values that contradict each other, a folder of an unknown user, or no map to refer to.
+    """
+    path, unit = values["reference_surface"], values["xyz_unit"]
+    expected = values["wavelength.expected"], values["wavelength.tolerance"]
+    return acquisition_settings(values), load_reference(path, unit, *expected) if path else None
+
+
+def ingest_settings(
+    values: Mapping[str, Any], mirror_radius: float = 0.0, reference: SurfaceMap | None = None
+) -> IngestSettings:
     """What maps are read with, of a mirror of `mirror_radius`, m; 0 = not known."""
     return IngestSettings(
         xyz_unit=values["xyz_unit"],
@@ -107,6 +127,7 @@ def ingest_settings(values: Mapping[str, Any], mirror_radius: float = 0.0) -> In
         mirror_radius=mirror_radius,
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
         minimum_valid_fraction=values["aperture.minimum_valid_fraction"],
+        reference=reference,
         remove_piston_tilt=values["remove_piston_tilt"],
     )
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ from std_msgs.msg import Header
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings, MapRejectedError
 from dm_calibration.acquisition.interferometer_messages import zernike_message
-from dm_calibration.map_files import NoValidPixelsError
+from dm_calibration.acquisition.reference_surface import load_reference
+from dm_calibration.map_files import NoValidPixelsError, read_map
 from dm_calibration.optics.aperture import InsufficientDataError
 from dm_calibration.optics.orientation import Orientation
 from dm_common.optics.zernike import basis
@@ -59,6 +62,56 @@ def test_an_aperture_larger_than_the_mirror_is_refused(surface: Path) -> None:
     with pytest.raises(MapRejectedError, match=r"aperture.radius = 0.05 m: the mirror has a radius of 0.015 m"):
         Ingest().read(surface, IngestSettings(aperture_radius=0.05, mirror_radius=0.015))
     Ingest().read(surface, IngestSettings(aperture_radius=0.01, mirror_radius=0.015))
+
+
+def test_the_error_of_the_instrument_is_subtracted_before_the_map_is_turned(surface: Path, tmp_path: Path) -> None:
+    content = read_map(surface)
+    error = np.zeros(21)
+    error[[4, 7, 11]] = [30e-9, -20e-9, 10e-9]
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    own = basis((columns - 62) / 55, (57 - rows) / 55) @ error
+    seen = dataclasses.replace(content, sag=content.sag + own)
+    reference = dataclasses.replace(content, sag=np.where(np.isfinite(content.sag), own, np.nan))
+    settings = IngestSettings(
+        orientation=Orientation(flip_x=True, rotate_deg=90.0),
+        aperture_radius=54 * PITCH,
+        aperture_centre=(2.5 * PITCH, 2.5 * PITCH),
+    )
+    absolute, measured = Ingest().measure(seen, dataclasses.replace(settings, reference=reference))
+    alone = Ingest().measure(content, settings)[1]
+    np.testing.assert_allclose(measured.coefficients, alone.coefficients, atol=1e-15)
+    assert measured.reference_surface == f"map.datx, SHA-256 {hashlib.sha256(surface.read_bytes()).hexdigest()}"
+    assert (measured.system_error_subtracted, alone.system_error_subtracted) == (1, -1)
+    np.testing.assert_allclose(absolute.sag, settings.orientation.apply(content.sag), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"sag": np.zeros((SIZE, SIZE - 1))}, "120 x 120 pixels from column 0, row 0 .* has 119 x 120"),
+        ({"origin": (3, 0)}, "reference_surface has 120 x 120 pixels from column 3"),
+        ({"pitch": 2.1e-4}, "pitch 200.000 um, reference_surface has 210.000 um"),
+        ({"wavelength": 1.064e-6}, "wavelength 632.800 nm, reference_surface has 1064.000 nm"),
+    ],
+)
+def test_a_reference_of_another_setting_is_refused(surface: Path, change: dict[str, Any], text: str) -> None:
+    reference = dataclasses.replace(read_map(surface), **change)
+    with pytest.raises(MapRejectedError, match=f"map.datx: .*{text}"):
+        Ingest().read(surface, IngestSettings(reference=reference))
+
+
+def test_an_error_is_not_subtracted_twice(surface: Path) -> None:
+    corrected = dataclasses.replace(read_map(surface), system_error_subtracted=True)
+    with pytest.raises(MapRejectedError, match="has subtracted its own error already"):
+        Ingest().measure(corrected, IngestSettings(reference=read_map(surface)))
+
+
+def test_a_reference_is_a_map_of_the_instruments_wavelength(surface: Path, tmp_path: Path) -> None:
+    assert load_reference(str(surface), "", WAVELENGTH, 1e-9).file == str(surface)
+    with pytest.raises(ValueError, match=r"wavelength 632.800 nm, must be 532.000 nm"):
+        load_reference(str(surface), "", 532e-9, 1e-9)
+    with pytest.raises(ValueError, match=r"reference_surface: .*missing.dat: No such file"):
+        load_reference(str(tmp_path / "missing.dat"), "", 0.0, 1e-9)
 
 
 def test_orientation_turns_the_coefficients(surface: Path) -> None:

@@ -27,6 +27,7 @@ class Measurement:
         radius: of the aperture the coefficients and points are normalised to, m; 0 = unknown.
         wavelength: m; 0 = unknown.
         system_error_subtracted: 1 yes, 0 no, -1 not known.
+        reference_surface: the map that was subtracted as the instrument's error, and its SHA-256; "" = none.
         file, sha256: the map file it came from; "" = none.
         moved_ns: when the mirror took the shape, ns; 0 = not known.
         instrument: what took the map, with its serial number; "" = not known.
@@ -54,6 +55,7 @@ class Measurement:
     radius: float = 0.0
     wavelength: float = 0.0
     system_error_subtracted: int = -1
+    reference_surface: str = ""
     file: str = ""
     sha256: str = ""
     moved_ns: int = 0

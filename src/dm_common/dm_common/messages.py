@@ -104,6 +104,7 @@ def measurement_from(response: Any) -> Measurement:
         radius=zernike.radius,
         wavelength=zernike.wavelength,
         system_error_subtracted=response.info.system_error_subtracted,
+        reference_surface=response.info.reference_surface,
         file=response.info.file,
         sha256=response.info.sha256,
         instrument=response.info.instrument,

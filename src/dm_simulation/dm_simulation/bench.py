@@ -104,6 +104,10 @@ class VirtualBench:
         self._measuring = threading.Lock()
         # At once, as on the instrument's PC: whoever watches the folder finds it before the first map.
         config.files.folder.mkdir(parents=True, exist_ok=True)
+        if config.interferometer.instrument_error:
+            reference = config.files.folder.absolute() / "reference"
+            reference.mkdir(exist_ok=True)
+            deliver(self._map_file(self.interferometer.reference(), ".datx", 0), reference / "flat.datx", 0.0)
         self.electronics = ElectronicsServer(
             self.unit, config.ports, self._on_frame, lambda text: on_event(text.startswith("malformed"), text)
         )
@@ -167,16 +171,19 @@ class VirtualBench:
             sag = instrument.measure(displacement)
             if path is None:
                 path = self._next_path()
-            facts = (sag, instrument.pitch, instrument.config.wavelength, stamp)
-            if path.suffix == ".dat":
-                content = encode_dat(*facts, intensity=files.intensity, part_name=files.part_name)
-            else:
-                content = encode_datx(*facts, unit=files.datx_unit, part_name=files.part_name)
-            deliver(content, path, files.slow_write)
+            deliver(self._map_file(sag, path.suffix, stamp), path, files.slow_write)
             if files.limit and path.parent == files.folder.absolute():
                 prune(path.parent, files.limit)
             self.maps_written += 1
         return path
+
+    def _map_file(self, sag: Array, suffix: str, stamp: int) -> bytes:
+        """The file of a map, with its ending and the Unix time of its measurement."""
+        files, instrument = self.config.files, self.interferometer
+        facts = (sag, instrument.pitch, instrument.config.wavelength, stamp)
+        if suffix == ".dat":
+            return encode_dat(*facts, intensity=files.intensity, part_name=files.part_name)
+        return encode_datx(*facts, unit=files.datx_unit, part_name=files.part_name)
 
     def _next_path(self) -> Path:
         files, number = self.config.files, self.maps_written

@@ -108,6 +108,11 @@ PARAMETERS = (
     Parameter(
         "interferometer.tilt_spread", real(_INSTRUMENT.tilt_spread, 0.0, 1e-4, "m"), "Spread of edge sag by tilt."
     ),
+    Parameter(
+        "interferometer.instrument_error",
+        real(_INSTRUMENT.instrument_error, 0.0, 1e-5, "m"),
+        "What the instrument adds to every map, rms; a map of it alone lies in output_folder/reference/flat.datx.",
+    ),
     Parameter("interferometer.specks", whole(_INSTRUMENT.specks, 0, 1_000_000), "Mean number of dropped pixels."),
     Parameter("interferometer.blobs", whole(_INSTRUMENT.blobs, 0, 1000), "Dropped discs per map."),
     Parameter(

@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.acquisition.reference_surface import MapRejectedError, absolute_sag, reference_name
 from dm_calibration.map_files import SurfaceMap, read_map
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError, configured_aperture, find_aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
-from dm_common.errors import CodedError, ErrorCode
+from dm_calibration.optics.phase_steps import PhaseStepError, mend_phase_steps
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sampling import edge_clustered_points, sample_map
+from dm_common.optics.zernike import basis
 
-
-class MapRejectedError(CodedError):
-    """A readable map that does not belong to this bench: another wavelength or setting."""
-
-    error_code = ErrorCode.MAP_REJECTED
+#: Maps are searched for phase steps where the terms leave more than this at a sampling point, in wavelengths; a step of
+#: a fringe leaves more wherever it ends.
+STEP_SHARE = 0.125
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class IngestSettings:
         mirror_radius: m; no aperture_radius is larger. 0 = not known.
         aperture_centre: (x, y) in m from the oriented map's centre, used with aperture_radius.
         minimum_valid_fraction: valid pixels / pixels inside the aperture.
+        reference: the instrument's own error, subtracted from every map before it is turned; None = not known.
         remove_piston_tilt: subtract the map's plane from the map that is handed on; the fit keeps piston and tilt.
     """
 
@@ -51,6 +52,7 @@ class IngestSettings:
     mirror_radius: float = 0.0
     aperture_centre: tuple[float, float] = (0.0, 0.0)
     minimum_valid_fraction: float = 0.7
+    reference: SurfaceMap | None = None
     remove_piston_tilt: bool = False
 
 
@@ -66,6 +68,7 @@ class Ingest:
 
     def __init__(self, sample_count: int = 500) -> None:
         self.points = edge_clustered_points(sample_count)
+        self._terms = basis(self.points.x, self.points.y)
         self._turn = threading.Lock()
         self._fitter: MapFitter | None = None  # of the last mask: dropouts often stay where they are
 
@@ -78,14 +81,15 @@ class Ingest:
         Raises:
             MapFileError: the file is not a whole, readable map.
             InsufficientDataError, NoValidPixelsError: too few valid pixels.
-            MapRejectedError: another wavelength than expected, an aperture in m for a map without a pitch, or one that
-                is larger than the mirror.
+            MapRejectedError: another wavelength than expected, another setting than the reference surface, an aperture
+                in m for a map without a pitch, or one that is larger than the mirror.
+            PhaseStepError: a region stands off by what is no whole number of fringes.
         """
         with self._turn:
             source = read_map(path, xyz_unit=settings.xyz_unit or None)
             try:
                 return self.measure(source, settings)
-            except (InsufficientDataError, MapRejectedError) as error:
+            except (InsufficientDataError, MapRejectedError, PhaseStepError) as error:
                 raise type(error)(f"{path}: {error}") from error
 
     def measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
@@ -97,7 +101,11 @@ class Ingest:
                 f"{settings.wavelength_tolerance * 1e9:g} nm (parameters wavelength.expected, wavelength.tolerance)"
             )
         pitch = source.pitch or settings.pitch or None
-        sag = settings.orientation.apply(source.sag)
+        sag, subtracted = source.sag, source.system_error_subtracted
+        if settings.reference is not None:
+            sag = absolute_sag(source, settings.reference, settings.pitch, settings.wavelength_tolerance)
+            subtracted = True
+        sag = settings.orientation.apply(sag)
         surface = replace(source, sag=sag, pitch=pitch)
         aperture = self._aperture(surface.valid, pitch, settings)
         circle = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
@@ -111,10 +119,15 @@ class Ingest:
                 "(parameter aperture.minimum_valid_fraction)"
             )
         fit = self._fitter.fit(sag)
-        subtracted = source.system_error_subtracted
+        samples = sample_map(sag, *circle, self.points)
+        left = np.abs(samples - self._terms @ fit.coefficients)
+        if not source.phase_steps and np.fmax.reduce(left) > STEP_SHARE * source.wavelength > 0.0:
+            mended, regions = mend_phase_steps(source.sag, 0.5 * source.wavelength)
+            if regions:
+                return self.measure(replace(source, sag=mended, phase_steps=regions), settings)
         measured = Measurement(
             points=self.points,
-            sag=sample_map(sag, *circle, self.points),
+            sag=samples,
             coefficients=fit.coefficients,
             sigma=fit.sigma,
             stamp_ns=0,
@@ -123,6 +136,7 @@ class Ingest:
             radius=aperture.radius_px * (pitch or 0.0),
             wavelength=source.wavelength,
             system_error_subtracted=-1 if subtracted is None else int(subtracted),
+            reference_surface=reference_name(settings.reference),
             file=source.file,
             instrument=f"{source.instrument}, serial {source.serial}" if source.serial else source.instrument,
             pitch=pitch or 0.0,

@@ -40,6 +40,7 @@ def info_message(surface: SurfaceMap, measured: Measurement, header: Header) -> 
         rms=surface.rms,
         piston_tilt_removed=surface.piston_tilt_removed,
         system_error_subtracted=measured.system_error_subtracted,
+        reference_surface=measured.reference_surface,
         flip_x=measured.orientation[0],
         flip_y=measured.orientation[1],
         rotate_deg=measured.orientation[2],

@@ -27,6 +27,9 @@ _BLOCK_PIXELS = 2**17
 #: Largest height of a map, m: far beyond the range of any interferometer.
 HEIGHT_MAX = 10.0
 
+#: Pixels of one instrument agree so well from map to map, relatively; files keep the pitch in single precision.
+PITCH_TOLERANCE = 1e-4
+
 _WAVELENGTH_RANGE = (1e-7, 2e-5)  # m, from deep ultraviolet to CO2 lasers
 _PITCH_RANGE = (1e-9, 0.1)  # m per pixel
 
@@ -59,6 +62,7 @@ class SurfaceMap:
         time_stamp: Unix time of the measurement, s; None when not known.
         system_error_subtracted: None when not known. Maps that differ in it must not be mixed.
         piston_tilt_removed: whether the plane of the map was subtracted.
+        phase_steps: number of regions that stood whole fringes off and were brought back.
         file: where the map was read from.
         content: the file's bytes, for :attr:`sha256`.
     """
@@ -74,6 +78,7 @@ class SurfaceMap:
     time_stamp: float | None = None
     system_error_subtracted: bool | None = None
     piston_tilt_removed: bool = False
+    phase_steps: int = 0
     file: str = ""
     content: bytes = field(default=b"", repr=False)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.maps import REFERENCE, same_points
+from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
 from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
 from dm_calibration.procedure.outcome import NOWHERE, Doubted, Event, MapTaken, Outcome, Setup
 from dm_calibration.procedure.plan import Step, StepKind
@@ -19,8 +20,6 @@ from dm_common.mirror import APERTURE_TOLERANCE, Mirror
 
 Floats = NDArray[np.float64]
 
-#: Pixels of an instrument agree so well from map to map, relatively; files keep the pitch in single precision.
-PITCH_TOLERANCE = 1e-4
 #: Largest relative difference of wavelengths between maps.
 WAVELENGTH_TOLERANCE = 1e-4
 
@@ -206,4 +205,7 @@ def _other_setup(measured: Measurement, setup: Setup) -> str:
         return f"{different}: never mix instruments in one fit, measure the whole run with one"
     if measured.system_error_subtracted != setup.system_error_subtracted:
         return "system error subtracted differs from the maps before: never mix them"
+    if measured.reference_surface != setup.reference_surface:
+        here, before = (each or "none" for each in (measured.reference_surface, setup.reference_surface))
+        return f"reference_surface {here}, before it was {before}: leave it alone in a run"
     return ""

@@ -34,6 +34,7 @@ class Setup:
     pitch: float = 0.0
     camera: tuple[int, int] = (0, 0)
     orientation: tuple[bool, bool, float] = (False, False, 0.0)
+    reference_surface: str = ""
 
     @classmethod
     def of(cls, measured: Measurement) -> Setup:

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState, SurfaceSamples, ZernikeCoefficients
+from dm_msgs.msg import ActuatorState, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import Measure, UpdateCalibration
 from rclpy.node import Node
@@ -33,8 +33,8 @@ from dm_common.ros.worker import WorkerService
 REPORT_WAIT_S = 3.0
 #: Least wall time between two messages on `calibration` that updates cause, s.
 PUBLISH_PERIOD_S = 1.0
-#: Halves of maps that wait for the other half, and maps remembered so that none counts twice.
-HALVES_KEPT = 8
+#: Maps of which messages are still to come, and maps remembered so that none counts twice.
+INCOMPLETE_KEPT = 8
 MAPS_KEPT = 64
 
 
@@ -63,7 +63,7 @@ class MapListener:
         self._history = AppliedHistory()
         self._law: HysteresisModel | None = None
         self._turn = threading.Lock()  # one map at a time; held over measuring and judging
-        self._halves: dict[int, dict[str, Any]] = {}
+        self._incomplete: dict[int, dict[str, Any]] = {}  # by the stamp that the messages of one map share
         self._judged: deque[Measurement] = deque(maxlen=MAPS_KEPT)
         self._taken = self._refused = 0
         self._last_refusal = ""
@@ -72,8 +72,9 @@ class MapListener:
         self._published_at = float("-inf")
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="updates")
         node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
-        node.create_subscription(ZernikeCoefficients, "zernike", lambda m: self._on_half("zernike", m), qos.STATE)
-        node.create_subscription(SurfaceSamples, "surface_samples", lambda m: self._on_half("samples", m), qos.STATE)
+        node.create_subscription(ZernikeCoefficients, "zernike", lambda m: self._on_part("zernike", m), qos.STATE)
+        node.create_subscription(SurfaceSamples, "surface_samples", lambda m: self._on_part("samples", m), qos.STATE)
+        node.create_subscription(SurfaceMapInfo, "surface_map_info", lambda m: self._on_part("info", m), qos.STATE)
         self._service = WorkerService(node, UpdateCalibration, "update_calibration", self._on_update)
 
     def stop(self) -> None:
@@ -158,25 +159,24 @@ class MapListener:
         except ValueError as error:
             self._node.get_logger().error(f"actuator_state refused: {error}", throttle_duration_sec=10.0)
 
-    def _on_half(self, name: str, message: Any) -> None:
-        """Coefficients and samples of one map carry the same stamp."""
+    def _on_part(self, name: str, message: Any) -> None:
         if not self._values["updates.enable"] or self._busy() or self._updates.calibration is None:
             return
         stamp = stamp_ns(message.header.stamp)
-        halves = self._halves.setdefault(stamp, {})
-        halves[name] = message
-        if len(halves) == 2:
-            del self._halves[stamp]
-            self._worker.submit(self._on_map, Measure.Response(**halves))
-        while len(self._halves) > HALVES_KEPT:
-            del self._halves[next(iter(self._halves))]
+        parts = self._incomplete.setdefault(stamp, {})
+        parts[name] = message
+        if len(parts) == 3:
+            del self._incomplete[stamp]
+            self._worker.submit(self._on_map, Measure.Response(**parts))
+        while len(self._incomplete) > INCOMPLETE_KEPT:
+            del self._incomplete[next(iter(self._incomplete))]
 
-    def _on_map(self, halves: Measure.Response) -> None:
+    def _on_map(self, answer: Measure.Response) -> None:
         """A map that came over the topics; runs in the worker thread."""
         log = self._node.get_logger()
         try:
             with self._turn:
-                measured = measurement_from(halves)
+                measured = measurement_from(answer)
                 if not any(measured.same_map(before) for before in self._judged):
                     self._judge(measured, dry_run=False)
         except EXPECTED as error:

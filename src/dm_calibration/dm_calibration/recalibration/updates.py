@@ -257,6 +257,11 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
             f"wavelength {measured.wavelength * 1e9:.3f} nm, the calibration's is "
             f"{calibration.wavelength * 1e9:.3f} nm (0 = not known)"
         )
+    if measured.reference_surface != calibration.reference_surface:
+        raise MapNotUsableError(
+            f"reference_surface {measured.reference_surface or 'none'}, the calibration was made with "
+            f"{calibration.reference_surface or 'none'}"
+        )
     radius, tolerance = calibration.aperture_radius, options.aperture_tolerance
     if measured.radius and not abs(measured.radius - radius) <= tolerance * radius:
         raise MapNotUsableError(

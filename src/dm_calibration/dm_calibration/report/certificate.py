@@ -106,11 +106,15 @@ def certificate(calibration: Calibration, names: Mapping[str, str]) -> Section:
     until = calibration.created_ns + round(1e9 * DEFAULTS["updates.stale_after"])
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
+    absolute = f"less the instrument's error in {calibration.reference_surface}"
+    if not calibration.reference_surface:
+        absolute = "only as far as the instrument is right: no reference surface was subtracted (reference_surface)"
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach if np.isfinite(low) else "flat is out of reach"),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move"),
+        ("absolute", absolute),
         ("measured", utc(calibration.stamp_ns)),
         ("valid until", f"{utc(until)}, longer when ./dm check agrees"),
         ("operator", names.get("operator") or "not given (./dm report --operator)"),

@@ -33,6 +33,7 @@ class InterferometerConfig:
         pixel_noise: rms of white noise per pixel, m.
         low_order_noise: rms over the field of all Zernike terms of orders 2-5 together, drawn anew for every map, m.
         piston_spread, tilt_spread: standard deviations of piston and of the edge sag of each tilt, per map, m.
+        instrument_error: rms of what the instrument adds to every map, orders 2-12 over the field, seeded, m.
         specks: mean number of dropped single pixels per map.
         blobs: number of dropped discs per map, of 3 to 16 pixels radius (scaled with the camera).
         mount_angle, mount_mirrored, mount_x, mount_y, mount_scale: how the mirror stands in the field: its own frame is
@@ -49,6 +50,7 @@ class InterferometerConfig:
     low_order_noise: float = 0.3e-9
     piston_spread: float = 200e-9
     tilt_spread: float = 300e-9
+    instrument_error: float = 0.0
     specks: int = 400
     blobs: int = 6
     mount_angle: float = 0.0
@@ -112,12 +114,16 @@ class Interferometer:
         self._influence = interpolate(plate.influence_at(metres_x, metres_y))
         # Over the field disc: piston, two tilts, then orders 2 to 5.
         self._low_orders = interpolate(zernike.evaluate(x, y, zernike.terms_to_order(5)))
-        figure = zernike.terms_to_order(12)[3:]
-        shapes = zernike.evaluate(metres_x / plate.radius, metres_y / plate.radius, figure)
-        amplitudes = figure_rng.standard_normal(len(figure)) / np.array([term.n for term in figure]) ** 1.5
-        self._figure = interpolate((shapes @ amplitudes)[..., None])[0]
-        inside = self._evaluate(self._figure)[self.aperture]
-        self._figure *= config.figure_rms / np.sqrt(np.mean((inside - inside.mean()) ** 2))
+        terms = zernike.terms_to_order(12)[3:]
+
+        def drawn(x: Array, y: Array, size: float) -> Array:
+            amplitudes = figure_rng.standard_normal(len(terms)) / np.array([term.n for term in terms]) ** 1.5
+            shape = interpolate((zernike.evaluate(x, y, terms) @ amplitudes)[..., None])[0]
+            inside = self._evaluate(shape)[self.aperture]
+            return np.asarray(shape * (size / np.sqrt(np.mean((inside - inside.mean()) ** 2))))
+
+        self._figure = drawn(metres_x / plate.radius, metres_y / plate.radius, config.figure_rms)
+        self._error = drawn(x, y, config.instrument_error)
 
     def _on_mirror(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Places of the field (m) in the frame of the mirror as it is mounted."""
@@ -156,7 +162,14 @@ class Interferometer:
 
     def true_sag(self, displacement: Array) -> Array:
         """The noise-free surface (pixels, pixels), m, as the camera shows it, NaN outside: for judging only."""
-        sag = self._evaluate(np.tensordot(displacement, self._influence, 1) + self._figure)
+        return self._shown(self.surface(displacement))
+
+    def reference(self) -> Array:
+        """The instrument's error (pixels, pixels), m: what it would show of a perfect flat without noise."""
+        return self._shown(self._error)
+
+    def _shown(self, coefficients: Array) -> Array:
+        sag = self._evaluate(coefficients)
         sag[self._outside] = np.nan
         return self._camera(sag)
 
@@ -167,9 +180,7 @@ class Interferometer:
         low[0] = config.piston_spread * rng.standard_normal()
         low[1:3] = config.tilt_spread / 2 * rng.standard_normal(2)  # an orthonormal tilt is 2 at the edge
         low[3:] = config.low_order_noise / np.sqrt(len(low) - 3) * rng.standard_normal(len(low) - 3)
-        sag = self._evaluate(
-            np.tensordot(displacement, self._influence, 1) + self._figure + np.tensordot(low, self._low_orders, 1)
-        )
+        sag = self._evaluate(self.surface(displacement) + self._error + np.tensordot(low, self._low_orders, 1))
         noise = rng.standard_normal(sag.shape, dtype=np.float32)
         noise *= np.float32(config.pixel_noise)
         sag += noise
