@@ -144,20 +144,22 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
     }
     if switches:
         parameters.append(switches)
-    remappings = []
-    for rule in values["remap"].split():
-        old, arrow, new = rule.partition(":=")
-        if not (arrow and old and new):
-            raise ValueError(f"remap: {rule!r}: must be of the form from:=to")
-        remappings.append((old, new))
     return {
         "namespace": values["namespace"],
         "parameters": parameters,
-        "remappings": remappings,
+        "remappings": [remapping(rule) for rule in values["remap"].split()],
         "arguments": ["--ros-args", "--log-level", values["log_level"]],
         "respawn": flag("respawn", values["respawn"]),
         "respawn_delay": float(values["respawn_delay"]),
     }
+
+
+def remapping(rule: str) -> tuple[str, str]:
+    """The names in `from:=to`; raises ValueError for another form."""
+    old, _, new = rule.partition(":=")
+    if not (old and new):
+        raise ValueError(f"remap: {rule!r}: must be of the form from:=to")
+    return old, new
 
 
 def flag(name: str, text: str) -> bool:

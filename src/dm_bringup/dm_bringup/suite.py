@@ -16,7 +16,7 @@ from typing import Any, NoReturn, Self
 
 import yaml
 
-from dm_bringup.nodes import MODULES, NAMES, nodes_of
+from dm_bringup.nodes import MODULES, NAMES, nodes_of, remapping
 
 Config = dict[str, dict[str, Any]]
 
@@ -105,6 +105,7 @@ class Suite:
         namespace: one per mirror.
         echo: True shows the nodes' output on this terminal instead of writing logs.
         nodes: names of those to start; None = all.
+        remap: rules `from:=to` for the names of all of them.
     """
 
     def __init__(
@@ -115,12 +116,14 @@ class Suite:
         namespace: str = "",
         echo: bool = False,
         nodes: Sequence[str] | None = None,
+        remap: Sequence[str] = (),
     ) -> None:
         self.folder = folder
         self._config = config
         self._namespace = f"{namespace.strip('/')}/" if namespace.strip("/") else ""
         self._echo = echo
         self._nodes = NAMES if nodes is None else nodes
+        self._remap = [word for rule in remap for word in ("-r", ":=".join(remapping(rule)))]
         self._environment = dict(os.environ)
         if domain is not None:
             self._environment["ROS_DOMAIN_ID"] = str(domain)
@@ -137,7 +140,7 @@ class Suite:
         return self
 
     def _start(self, name: str) -> None:
-        arguments = ["--ros-args", "--params-file", str(self.folder / "config.yaml")]
+        arguments = ["--ros-args", "--params-file", str(self.folder / "config.yaml"), *self._remap]
         if self._namespace:
             arguments += ["-r", f"__ns:=/{self._namespace.rstrip('/')}"]
         self._processes[name] = self._process(name, arguments)

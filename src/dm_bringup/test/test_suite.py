@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rclpy.context import Context
@@ -15,14 +16,14 @@ from dm_bringup.suite import RESTART_S, Suite, load_config, save_config
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Suite]:
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Suite]:
     """A suite of one node that runs this code."""
 
-    def run(code: str) -> Suite:
+    def run(code: str, **arguments: Any) -> Suite:
         (tmp_path / "node_of_a_test.py").write_text(code)
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
         monkeypatch.setitem(suite_module.MODULES, "calibration", "node_of_a_test")
-        return Suite({"calibration": {}}, tmp_path / "run", nodes=("calibration",))
+        return Suite({"calibration": {}}, tmp_path / "run", nodes=("calibration",), **arguments)
 
     return run
 
@@ -59,7 +60,19 @@ def revived(suite: Suite, count: int) -> tuple[list[str], list[float]]:
     return told, [times[2 * k + 1] - times[2 * k] for k in range(count)]
 
 
-def test_a_node_that_dies_is_started_again_later_each_time(run: Callable[[str], Suite]) -> None:
+def test_a_node_is_told_its_namespace_and_other_names_of_topics(run: Callable[..., Suite]) -> None:
+    code = "import sys; print(sys.argv[1:], flush=True); sys.stdin.read()"
+    with run(code, namespace="/left", remap=["image_raw:=/camera/image_raw"]) as suite:
+        deadline = time.monotonic() + 30.0
+        while not suite.log("calibration").read_text() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        told = suite.log("calibration").read_text()
+    assert "'-r', 'image_raw:=/camera/image_raw', '-r', '__ns:=/left'" in told
+    with pytest.raises(ValueError, match="remap: 'image_raw': must be of the form from:=to"):
+        run(code, remap=["image_raw"])
+
+
+def test_a_node_that_dies_is_started_again_later_each_time(run: Callable[..., Suite]) -> None:
     with run("import os; os.kill(os.getpid(), 9)") as suite:
         told, pauses = revived(suite, 2)
     assert told[0] == f"the node calibration was killed by signal 9; it is started again in {RESTART_S:g} s"
@@ -67,7 +80,7 @@ def test_a_node_that_dies_is_started_again_later_each_time(run: Callable[[str], 
     assert pauses[0] >= RESTART_S and pauses[1] >= 2 * RESTART_S
 
 
-def test_a_node_that_cannot_be_made_is_not_tried_again(run: Callable[[str], Suite]) -> None:
+def test_a_node_that_cannot_be_made_is_not_tried_again(run: Callable[..., Suite]) -> None:
     with run("import sys; sys.exit('ParameterError: mirror.serial is missing')") as suite:
         with pytest.raises(RuntimeError, match=r"calibration ended with status 1\nParameterError: mirror.serial"):
             revived(suite, 1)

@@ -53,6 +53,10 @@ def up(
         bool,
         typer.Option("--camera", help="With a virtual camera behind the mirror of the virtual bench, and autofocus."),
     ] = False,
+    remap: Annotated[
+        list[str] | None,
+        typer.Option(help="Another name of a topic: image_raw:=/camera/image_raw; several times."),
+    ] = None,
     logs: Annotated[Path | None, typer.Option(help="Write the nodes' output to files in this folder instead.")] = None,
 ) -> None:
     """Start the nodes and keep them running until Ctrl-C or SIGTERM; the mirror is then ramped to its safe shape.
@@ -72,7 +76,9 @@ def up(
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
         folder = logs if logs is not None else Path(temporary)
         suites = [
-            stack.enter_context(Suite(configuration, folder / name, namespace=name, echo=logs is None))
+            stack.enter_context(
+                Suite(configuration, folder / name, namespace=name, echo=logs is None, remap=remap or [])
+            )
             for name, configuration in mirrors.items()
         ]
         for name, configuration in mirrors.items():
