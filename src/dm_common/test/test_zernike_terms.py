@@ -92,3 +92,12 @@ def test_converters_there_and_back(coefficients: np.ndarray) -> None:
 def test_wrong_number_of_coefficients_is_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \(20,\).*21 terms"):
         zernike.born_wolf_to_noll(np.zeros(20))
+
+
+def test_rms_beyond_tilt_is_that_of_the_surface_without_its_plane() -> None:
+    coefficients = np.random.default_rng(1).normal(size=len(TERMS))
+    axis = np.linspace(-1, 1, 601)
+    x, y = np.meshgrid(axis, axis)
+    inside = np.hypot(x, y) <= 1
+    sag = basis(x[inside], y[inside])[:, 3:] @ coefficients[3:]
+    assert zernike.rms_beyond_tilt(coefficients, 0.5) == pytest.approx(np.hypot(sag.std(), 0.5), rel=0.01)

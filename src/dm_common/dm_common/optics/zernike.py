@@ -132,6 +132,15 @@ def curvature_of_defocus(coefficient: float, radius: float) -> float:
     return 4.0 * coefficient / radius**2
 
 
+def rms_beyond_tilt(coefficients: ArrayLike, residual: float = 0.0) -> float:
+    """Rms sag over the aperture without piston and tilt, m, of coefficients (21,), m.
+
+    Args:
+        residual: rms of what the terms leave, m.
+    """
+    return float(np.hypot(np.linalg.norm((_checked(coefficients) * TERM_RMS)[PISTON_TILT:]), residual))
+
+
 def _checked(coefficients: ArrayLike) -> NDArray[np.float64]:
     values = np.asarray(coefficients, dtype=float)
     if values.ndim < 1 or values.shape[-1] != len(TERMS):

@@ -11,6 +11,7 @@ from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import Flatten, LoadCalibration, Measure, SetFocus, SetSignals
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.optics.zernike import rms_beyond_tilt
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
 from dm_tools.console.view_models import NM, poke_signals, prediction_text
@@ -82,7 +83,8 @@ async def degauss(session: Session) -> str:
 async def measure(session: Session, label: str = "console") -> str:
     """Take one map."""
     answer = await session.ros.call("measure", Measure.Request(label=label), MEASURE_S)
-    return f"rms {answer.info.rms * NM:.1f} nm, valid {100 * answer.info.valid_fraction:.1f} % of the aperture"
+    rms = rms_beyond_tilt(answer.zernike.coefficients, answer.zernike.residual_rms)
+    return f"rms beyond tilt {rms * NM:.1f} nm, valid {100 * answer.info.valid_fraction:.1f} % of the aperture"
 
 
 async def calibrate(session: Session, goal: Calibrate.Goal) -> str:

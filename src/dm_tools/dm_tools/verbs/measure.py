@@ -24,13 +24,14 @@ def measure(
     json: JsonOption = None,
 ) -> None:
     """Take one map of the mirror as it stands, and say what it shows. Nothing moves."""
-    from dm_common.optics.zernike import PISTON_TILT, SPOKEN, curvature_of
+    from dm_common.optics.zernike import PISTON_TILT, SPOKEN, curvature_of, rms_beyond_tilt
 
     with running_suite(namespace) as client:
         answer = client.measure(label)
     info, coefficients = answer.info, list(answer.zernike.coefficients)
     figures: dict[str, Any] = {
         "curvature": curvature_of(coefficients, info.aperture_radius) if info.aperture_radius > 0 else None,
+        "rms_beyond_tilt_nm": nanometres(rms_beyond_tilt(coefficients, answer.zernike.residual_rms)),
         "rms_nm": nanometres(info.rms),
         "pv_nm": nanometres(info.pv),
         "valid_fraction": info.valid_fraction,
@@ -40,8 +41,11 @@ def measure(
     terms = list(figures["zernike_nm"].items())[PISTON_TILT:]
     largest = sorted(terms, key=lambda term: -abs(term[1]))[:3]
     console.print(
-        f"{figures['rms_nm']:.1f} nm rms, {figures['pv_nm']:.1f} nm peak to valley, {info.valid_fraction:.0%} of the "
-        f"aperture valid; largest: {', '.join(f'{name} {value:+.1f} nm' for name, value in largest)}"
+        f"{figures['rms_beyond_tilt_nm']:.1f} nm rms beyond tilt, of the whole map {figures['rms_nm']:.1f} nm rms and "
+        f"{figures['pv_nm']:.1f} nm peak to valley; {info.valid_fraction:.0%} of the aperture valid"
+    )
+    console.print(
+        f"largest coefficients beyond tilt: {', '.join(f'{name} {value:+.1f} nm' for name, value in largest)}"
     )
     if figures["curvature"] is not None:
         console.print(f"defocus: as of a surface of {figures['curvature']:+.4f} 1/m")
