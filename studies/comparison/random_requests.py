@@ -14,7 +14,7 @@ from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
-from dm_controller.planning.choice import check_reachable
+from dm_controller.planning.choice import unreachable
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.driven_mirror import DrivenMirror
 from studies.comparison.simulated_bench import Floats, SimulatedBench
@@ -113,7 +113,8 @@ def judge_requests(
     for target, dwell in zip(targets, dwells, strict=True):
         try:
             move = driven.plan(target)
-            check_reachable(move, active, REACHABLE_TOLERANCE)
+            if not move.max_zernike <= REACHABLE_TOLERANCE:
+                raise unreachable(move, active, REACHABLE_TOLERANCE)
             driven.go(move)
             driven.hold(move, float(dwell))
         except (Refusal, RecipeError) as error:

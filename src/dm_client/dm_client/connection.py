@@ -150,7 +150,7 @@ class Connection:
 
     def _lost(self, name: str) -> bool:
         """Whether the node that serves `name` has died."""
-        return name in self._servers and self._servers[name].missing(lambda: True)
+        return name in self._servers and self._servers[name].missing()
 
     def _check_server(self, name: str) -> None:
         """Raise DeformableMirrorError when the node that serves `name` has died."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ class Limits:
         """From mid range to either end."""
         return 0.5 * (self.high - self.low)
 
-    @property
+    @cached_property
     def neighbours_can_bind(self) -> bool:
         """Whether neighbours can differ by more than their limit inside the range."""
         return len(self.pairs) > 0 and self.neighbour_difference < self.high - self.low
@@ -60,11 +61,9 @@ class Limits:
 
     def allow(self, signals: Floats) -> bool:
         """Whether `signals` (N,) break none of the limits but by rounding."""
-        return self.allow_range(signals) and self.allow_neighbours(signals)
-
-    def allow_range(self, signals: Floats) -> bool:
         # Half the time of the methods of the same names.
-        return bool(np.minimum.reduce(signals) >= self.low - SLACK and np.maximum.reduce(signals) <= self.high + SLACK)
+        inside = np.minimum.reduce(signals) >= self.low - SLACK and np.maximum.reduce(signals) <= self.high + SLACK
+        return bool(inside) and self.allow_neighbours(signals)
 
     def allow_neighbours(self, signals: Floats) -> bool:
         if not self.neighbours_can_bind:

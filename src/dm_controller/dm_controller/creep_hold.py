@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_controller.driver_monitor import same_signals
-from dm_controller.focus_types import CommandedShape
-from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.focus_types import CommandedShape, DriverReport, Moment, SendCommand
 
 Floats = NDArray[np.float64]
 
@@ -57,10 +56,6 @@ class CreepHold:
         """Whether a shape is held."""
         return self.shape is not None and self.shape.held
 
-    def wanted(self, active: ActiveCalibration | None) -> bool:
-        """Whether shapes of this calibration are corrected for creep."""
-        return active is not None and self._values["hold.enable"] and active.planner.law.creep_rate > 0.0
-
     @property
     def next_check(self) -> float:
         """When a correction can be due, s; infinite without a shape to hold."""
@@ -82,6 +77,16 @@ class CreepHold:
             return
         if shape.sent.confirmed or now - shape.sent.time > CONFIRM_S:
             self.end("another command came")
+
+    def command(self, report: DriverReport | None, estimate: ActuatorEstimate, now: Moment) -> SendCommand | None:
+        """What is due for the shape by the driver's last report and the actuators `now`; None = nothing yet."""
+        shape = self.shape
+        if shape is None or not shape.held or report is None or report.applied.moving:
+            return None
+        if report.holder not in ("", shape.sent.command.holder):
+            return None  # goes on afterwards, if they leave the shape as it is
+        signals = self.correction(estimate, now.time)
+        return None if signals is None else shape.send_on(signals, now, report.applied.turns)
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
         """The next command (N,) at `now` (s), the mirror being at rest in the state `estimate`; None = not yet."""

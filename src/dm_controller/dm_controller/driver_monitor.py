@@ -60,7 +60,7 @@ class DriverMonitor:
         shape: that was commanded last; None = none was yet.
         latest: the driver's last report; None before the first.
         starts: how often the driver was activated anew, as far as reports tell.
-        trusted_until: s, until when the driver counts as one that takes commands; after it ask `check`.
+        open_until: s, until when the driver counts as one that takes commands of anybody; after it ask `check`.
         gone: what became of a driver that is known to be dead, as a sentence; "" = it may live.
     """
 
@@ -69,7 +69,7 @@ class DriverMonitor:
         self.shape: CommandedShape | None = None
         self.latest: DriverReport | None = None
         self.starts = 0
-        self.trusted_until = -math.inf
+        self.open_until = -math.inf
         self.gone = ""
         self._heard = 0.0
         self._latencies: deque[float] = deque(maxlen=MOVES)
@@ -80,14 +80,14 @@ class DriverMonitor:
         return statistics.median(self._latencies) if self._latencies else 0.0
 
     def lost(self, reason: str) -> None:
-        """The driver is dead, for a reason as a sentence; "" = it is back, or another is there."""
+        """What became of a driver that is known to be dead, as a sentence; "" = it may live."""
         self.gone = reason
-        self._trust()
+        self._trust()  # a parameter may have changed, too
 
     def observe(self, report: DriverReport, now: float) -> bool:
         """Take the driver's next report; returns whether the latency is known from now on."""
         before, self.latest, self._heard = self.latest, report, now
-        self.gone = ""  # who reports lives, whatever a lease that lapsed on a busy machine says
+        self.gone = ""  # who reports lives
         if before is not None and report.sequence < before.sequence:
             self.starts += 1
         self._trust()
@@ -102,8 +102,9 @@ class DriverMonitor:
         return len(self._latencies) == 1
 
     def _trust(self) -> None:
-        active = self.latest is not None and self.latest.driver_state == _ACTIVE and not self.gone
-        self.trusted_until = self._heard + (self._values["driver_timeout"] or math.inf) if active else -math.inf
+        report = self.latest
+        is_open = report is not None and report.driver_state == _ACTIVE and not report.holder and not self.gone
+        self.open_until = self._heard + (self._values["driver_timeout"] or math.inf) if is_open else -math.inf
 
     def age(self, now: float) -> float:
         """s since the driver's last report."""
@@ -131,13 +132,10 @@ class DriverMonitor:
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
         return None
 
-    def check(self, now: float) -> None:
-        """Raise what `refusal` gives."""
+    def check(self, request: Request, now: float) -> None:
+        """Raise what `refusal` gives, or that somebody else holds the mirror and `request` does not take it over."""
         if (refusal := self.refusal(now)) is not None:
             raise refusal
-
-    def check_holder(self, request: Request) -> None:
-        """Raise Refusal when somebody else holds the mirror and `request` does not take it over."""
         report = self.latest
         if report is not None and report.holder not in ("", request.holder) and not request.take_over:
             raise Refusal(ErrorCode.BUSY, report.holding)
@@ -203,7 +201,6 @@ class DriverMonitor:
 
         None = there is none. A command that went out later is the one that counts: the latest wins at the driver too.
         """
-        self._trust()  # the parameter may have changed
         if self.shape is None:
             return None
         limit, sent = self._values["driver_timeout"] or CONFIRM_S, self.shape.sent

@@ -32,7 +32,7 @@ from dm_controller.focus_types import (
     StartDegauss,
 )
 from dm_controller.planning.active_calibration import NO_CALIBRATION, ActiveCalibration, active_calibration
-from dm_controller.planning.choice import Degauss, PlanningContext, check_reachable, choose_move
+from dm_controller.planning.choice import Degauss, PlanningContext, choose_move, unreachable
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import Request
 
@@ -113,11 +113,6 @@ class FocusController:
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
         return [*effects, *self.monitor.settled(), *self._news(now, latency_learnt)]
 
-    def driver_lost(self, reason: str, now: Moment) -> list[Effect]:
-        """The driver is known to be dead, for a reason as a sentence; "" = it is back, or another is there."""
-        self.monitor.lost(reason)
-        return self.tick(now)
-
     def unavailable(self, now: Moment) -> Refusal | None:
         """The reason why requests are refused now, whatever they ask for; None = they are not."""
         return self.not_calibrated if self.active is None else self.monitor.refusal(now.steady)
@@ -155,30 +150,34 @@ class FocusController:
             raise Refusal(ErrorCode.STALE, f"header.stamp: the request is {age:.3f} s old; allowed: {limit:g} s")
         if active is None:
             raise self.not_calibrated
-        time_budget, degauss = values["time_budget"], None
+        target, settle, budget = request.target(), values["settle_time"], request.time_budget or values["time_budget"]
+        estimate = self._at_rest or self.observer.estimate(now.time, active.slew_rate)
         if degaussed is not None:
             degauss = Degauss(degaussed, True, 0.0)
-        elif self.conditioning.run is not None or request.mode == _CONDITIONED or request.time_budget or time_budget:
+        elif self.conditioning.run is not None or request.mode == _CONDITIONED or budget:
             degauss = self.conditioning.prospect(active, values["condition.degauss_steps"], now.steady)
-        estimate = self._at_rest or self.observer.estimate(now.time, active.slew_rate)
-        context = PlanningContext(active, estimate, now.time, values["settle_time"], degauss)
-        return choose_move(request, time_budget, context)
+        else:  # there is no time for one: at once from where the mirror stands
+            return active.planner.plan(target, estimate.state, now.time, not estimate.unknown, ahead=settle)
+        context = PlanningContext(active, estimate, now.time, settle, degauss)
+        return choose_move(target, request.mode, budget, context)
 
     def _attempt(
         self, order: Order, now: Moment, dry_run: bool = False, degaussed: int | None = None
     ) -> tuple[Order, list[Effect]]:
         effects: list[Effect] = []
         move = refusal = None
+        held = self.active is not None and self._values["hold.enable"] and self.active.planner.law.creep_rate > 0.0
         try:
             move = self.judge(order.request, now, degaussed)
             assert self.active is not None
-            check_reachable(move, self.active, self._values["reachable_tolerance"])
+            tolerance = self._values["reachable_tolerance"]
+            if not move.max_zernike <= tolerance:
+                raise unreachable(move, self.active, tolerance)
             if not dry_run:
-                if now.steady > self.monitor.trusted_until:
-                    self.monitor.check(now.steady)
-                self.monitor.check_holder(order.request)
+                if now.steady > self.monitor.open_until:
+                    self.monitor.check(order.request, now.steady)
                 if degaussed is not None or (move.degauss is None and self.conditioning.run is None):
-                    effects += self._go(order, move, now)
+                    effects += self._go(order, move, now, held)
                 else:
                     effects += self._condition(order, move, now)
         except Refusal as error:
@@ -190,7 +189,7 @@ class FocusController:
             move,
             pending=order.pending,
             unknown=(self._at_rest or self.observer).unknown,
-            creep_held=self.hold.wanted(self.active),
+            creep_held=held,
             refusal=refusal,
         )
         if refusal is not None:
@@ -207,16 +206,18 @@ class FocusController:
         order.outcome = Outcome(order.request, now.ns, refusal=refusal)
         return [Log("warning", f"refused: {refusal}"), PublishState(order.outcome)]
 
-    def _go(self, order: Order, move: Move, now: Moment) -> list[Effect]:
-        """The command of `move`, whose shape is to stand from now on."""
+    def _go(self, order: Order, move: Move, now: Moment, held: bool) -> list[Effect]:
+        """The command of `move`, whose shape is to stand from now on, `held` against creep."""
         assert self.active is not None
-        order.began, request = now.steady, order.request
-        replaced = self.monitor.settled("a newer request took its place before the driver confirmed it")
+        order.began, request, before = now.steady, order.request, self.monitor.shape
         command = SendCommand(move.signals, now.ns, 0, request.holder, request.take_over)
+        effects: list[Effect] = [command]
+        if before is not None and before.sent.order is not None:
+            effects += self.monitor.settled("a newer request took its place before the driver confirmed it")
         sent = Sent(command, order, now.time, now.steady)
-        shape = CommandedShape(move, self.active.planner, sent, self.hold.wanted(self.active), now.time, began=now.time)
+        shape = CommandedShape(move, self.active.planner, sent, held, now.time, began=now.time)
         self.monitor.shape = self.hold.shape = shape
-        return [command, *replaced]
+        return effects
 
     # --- a degauss on the way ---
 
@@ -258,8 +259,12 @@ class FocusController:
 
     # --- time ---
 
-    def tick(self, now: Moment) -> list[Effect]:
-        """Do what is due: creep corrections, and refusals of what the driver did not take or does not finish."""
+    def tick(self, now: Moment, driver_gone: str = "") -> list[Effect]:
+        """Do what is due: creep corrections, and refusals of what the driver did not take or does not finish.
+
+        `driver_gone`: what became of a driver that is known to be dead, as a sentence; "" = it may live.
+        """
+        self.monitor.lost(driver_gone)
         effects: list[Effect] = []
         failure = self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady)
         if failure is not None:
@@ -270,22 +275,12 @@ class FocusController:
             self.hold.end("the driver did not take the command")
             # A correction, or the end of a move, answers no order.
             effects += self._refuse(order, refusal, now) if order is not None else [Log("warning", str(refusal))]
-        return [*effects, *self._news(now), *self._compensate_creep(now)]
+        correction = self.hold.command(self.monitor.latest, self.observer.estimate(now.time), now)
+        return [*effects, *self._news(now), *([] if correction is None else [correction])]
 
     def quick_ticks(self, now: Moment) -> bool:
         """Whether something can be due before `SLOW_PERIOD_S` has passed."""
         return self.conditioning.run is not None or self.hold.next_check - now.time <= SLOW_PERIOD_S
-
-    def _compensate_creep(self, now: Moment) -> list[Effect]:
-        report, shape = self.monitor.latest, self.hold.shape
-        if shape is None or not shape.held or report is None or report.applied.moving:
-            return []
-        if report.holder not in ("", shape.sent.command.holder):
-            return []  # goes on afterwards, if they leave the shape as it is
-        signals = self.hold.correction(self.observer.estimate(now.time), now.time)
-        if signals is None:
-            return []
-        return [shape.send_on(signals, now, report.applied.turns)]
 
     def stop(self, order: Order, now: Moment) -> list[Effect] | None:
         """Leave the move of `order` where it is; None = another shape was asked for since, and nothing is sent."""

@@ -45,21 +45,21 @@ def monitor(timeout: float = TIMEOUT) -> DriverMonitor:
 
 def test_a_driver_that_never_reported_is_unavailable() -> None:
     with pytest.raises(Refusal, match="is the driver running"):
-        DriverMonitor({"driver_timeout": TIMEOUT}).check(BEGAN)
+        DriverMonitor({"driver_timeout": TIMEOUT}).check(Request(), BEGAN)
 
 
 @pytest.mark.parametrize(("timeout", "refused"), [(TIMEOUT, True), (0.0, False)])
 def test_reports_grow_old(timeout: float, refused: bool) -> None:
     driver = monitor(timeout)
-    driver.check(BEGAN + TIMEOUT)
+    driver.check(Request(), BEGAN + TIMEOUT)
     later = BEGAN + TIMEOUT + 0.1
     assert bool(driver.silent(later)) == bool(driver.stopped(later)) == refused
     if refused:
         with pytest.raises(Refusal, match=r"has not reported for 2.1 s \(driver_timeout 2 s\)") as caught:
-            driver.check(later)
+            driver.check(Request(), later)
         assert caught.value.error_code == ErrorCode.DRIVER_UNAVAILABLE
     else:
-        driver.check(later)
+        driver.check(Request(), later)
 
 
 def test_a_command_that_is_confirmed_is_not_told_of() -> None:
@@ -130,4 +130,4 @@ def test_who_reports_after_a_lease_lapsed_is_not_dead() -> None:
     driver.observe(report(), BEGAN + 1.0)
     assert driver.silent(BEGAN + 1.5) == ""
     assert driver.age(BEGAN + 1.5) == 0.5
-    driver.check(BEGAN + 1.5)
+    driver.check(Request(), BEGAN + 1.5)

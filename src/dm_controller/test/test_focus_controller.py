@@ -344,7 +344,7 @@ def test_a_dead_driver_is_known_at_once(bench: Bench) -> None:
     bench.ask(0.01)
     bench.obeys, before = False, bench.capabilities
     bench.ask(0.01)
-    bench.do(bench.controller.driver_lost("pdm_driver has died", bench.now))
+    bench.do(bench.controller.tick(bench.now, "pdm_driver has died"))
     assert bench.refusal().error_code == ErrorCode.DRIVER_UNAVAILABLE and "has died" in str(bench.refusal())
     assert bench.capabilities == before + 1
     message = capabilities_message(bench.controller, MIRROR, VALUES, bench.now)
@@ -352,7 +352,6 @@ def test_a_dead_driver_is_known_at_once(bench: Bench) -> None:
     assert message.error_code == ErrorCode.DRIVER_UNAVAILABLE and message.calibration_id == "known"
     bench.ask(0.02)
     assert bench.refusal().error_code == ErrorCode.DRIVER_UNAVAILABLE
-    bench.do(bench.controller.driver_lost("", bench.now))
     bench.obeys = True
     bench.report()
     bench.ask(0.02)

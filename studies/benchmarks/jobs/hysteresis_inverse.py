@@ -61,7 +61,7 @@ def _law(
     at = law.advance(state, asked)
     aims = iter(generator.uniform(-AIM, AIM, (20 * effort.rounds + 100, 37)))
     curvatures = iter(generator.uniform(-REACH, REACH, 20 * effort.rounds + 100))
-    ready = PreparedInverse(law, state, -1.0, 1.0)
+    ready = PreparedInverse(law, state, Limits())
     cold, warm = (Planner(mirror, stand_in_mirror.figures(law)) for _ in range(2))
     warm.prepare(state)
     model = mirror.model
@@ -70,7 +70,7 @@ def _law(
     jobs = {
         "ms": lambda: invert(law, at, next(aims), -1.0, 1.0, SETTLE_S),
         "prepared_ms": lambda: ready.invert(asked, next(aims), SETTLE_S),
-        "prepare_ms": lambda: PreparedInverse(law, state, -1.0, 1.0),
+        "prepare_ms": lambda: PreparedInverse(law, state, Limits()),
         "plan_ms": lambda: cold.plan(FocusTarget(next(curvatures)), state, asked, ahead=SETTLE_S).signals,
         "plan_prepared_ms": lambda: warm.plan(FocusTarget(next(curvatures)), state, asked, ahead=SETTLE_S).signals,
         "linear_ms": lambda: np.clip(gain @ wanted, -1.0, 1.0),

@@ -68,7 +68,6 @@ class Liveliness:
         name: of the node that is watched.
         message_type, topic: one that is published seldom.
         profile: of the topic, without the lease.
-        changed: called by the executor at every change.
 
     Attributes:
         name: of the node that is watched.
@@ -76,18 +75,9 @@ class Liveliness:
         seen: there was one at all.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        name: str,
-        message_type: Any,
-        topic: str,
-        profile: QoSProfile,
-        changed: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, node: Node, name: str, message_type: Any, topic: str, profile: QoSProfile) -> None:
         self.name, self.lost, self.seen = name, False, False
         self._born = self._lost_at = time.monotonic()
-        self._changed = changed
         node.create_subscription(
             message_type,
             topic,
@@ -100,8 +90,11 @@ class Liveliness:
             raw=True,
         )
 
-    def missing(self, served: Callable[[], bool]) -> bool:
-        """Whether the node is lost, or never came: not even what it serves is there, which `served` looks for."""
+    def missing(self, served: Callable[[], bool] = lambda: True) -> bool:
+        """Whether the node is lost, or never came: not even what it serves is there, which `served` looks for.
+
+        Without that, one that never came is not missing.
+        """
         if self.lost:
             return time.monotonic() - self._lost_at > SURE_S
         return not self.seen and time.monotonic() - self._born > APPEAR_S and not served()
@@ -116,4 +109,3 @@ class Liveliness:
         self.seen = self.seen or not lost
         if lost != self.lost:
             self.lost, self._lost_at = lost, time.monotonic()
-            self._changed()

@@ -1,4 +1,4 @@
-"""Which way to a shape: at once from where the mirror stands, or after a degauss; and what to expect of it."""
+"""Which way to a shape, where there is a choice: at once from where the mirror stands, or after a degauss."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
 from dm_controller.planning.recipes import FoundRecipe, find
-from dm_controller.planning.target import REQUEST, FocusTarget, Request
+from dm_controller.planning.target import FocusTarget
 
 #: A message's constants are properties of its class, which take longer to look up.
 _DIRECT, _CONDITIONED = FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED
@@ -42,52 +42,44 @@ class PlanningContext(NamedTuple):
         estimate: the actuators now.
         now: s, ROS time.
         settle: s after the way at which the shape is to be right.
-        degauss: None = there is no time for one.
+        degauss: that a move can begin with.
     """
 
     active: ActiveCalibration
     estimate: ActuatorEstimate
     now: float
     settle: float
-    degauss: Degauss | None
+    degauss: Degauss
 
 
-def choose_move(request: Request, time_budget: float, context: PlanningContext) -> Move:
-    """The move to the surface of `request`, by the way that its mode asks for; AUTO may take so many s.
+def choose_move(target: FocusTarget, mode: int, budget: float, context: PlanningContext) -> Move:
+    """The move to `target` by the way that the mode of a request asks for; AUTO may take `budget` s.
 
     Raises:
-        Refusal: a field makes no sense, or no recipe serves the target in the mode CONDITIONED.
+        Refusal: no recipe serves the target in the mode CONDITIONED.
     """
-    REQUEST.check(request)
-    mode, budget = request.mode, request.time_budget
-    target = FocusTarget(request.curvature, request.conic_constant, request.zernike)
-    if context.degauss is None:
-        return _direct(target, context)
     if mode == _CONDITIONED:
-        return _conditioned(target, context, context.degauss)
+        return _conditioned(target, context)
     if mode == _DIRECT:
-        return _unconditioned(target, context, context.degauss)
-    return _best(target, budget or time_budget, context, context.degauss)
+        return _unconditioned(target, context)
+    return _best(target, budget, context)
 
 
-def _direct(target: FocusTarget, context: PlanningContext) -> Move:
-    """From where the mirror stands."""
-    estimate, planner = context.estimate, context.active.planner
-    return planner.plan(target, estimate.state, context.now, not estimate.unknown, ahead=context.settle)
-
-
-def _unconditioned(target: FocusTarget, context: PlanningContext, degauss: Degauss) -> Move:
+def _unconditioned(target: FocusTarget, context: PlanningContext) -> Move:
     """From where the mirror stands, or will stand after the degauss under way."""
-    return _after_degauss(target, context, degauss, None) if degauss.begun else _direct(target, context)
+    if context.degauss.begun:
+        return _after_degauss(target, context, None)
+    estimate, planner = context.estimate, context.active.planner
+    return planner.plan(target, estimate.state, context.now, estimate.known, ahead=context.settle)
 
 
-def _conditioned(target: FocusTarget, context: PlanningContext, degauss: Degauss) -> Move:
+def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
     """A degauss, then the recipe.
 
     Raises:
         Refusal: there is no recipe for it.
     """
-    book = context.active.recipes
+    book, degauss = context.active.recipes, context.degauss
     if not book.recipes:
         raise Refusal(
             ErrorCode.NOT_SUPPORTED, "mode CONDITIONED: this calibration holds no recipes; use AUTO or DIRECT"
@@ -102,22 +94,22 @@ def _conditioned(target: FocusTarget, context: PlanningContext, degauss: Degauss
         recipe = find(book, target, context.active.planner)
     except RecipeError as error:
         raise Refusal(ErrorCode.OUT_OF_RANGE, f"mode CONDITIONED: {error}") from error
-    return replace(_after_degauss(target, context, degauss, recipe), mode=_CONDITIONED)
+    return replace(_after_degauss(target, context, recipe), mode=_CONDITIONED)
 
 
-def _best(target: FocusTarget, budget: float, context: PlanningContext, degauss: Degauss) -> Move:
+def _best(target: FocusTarget, budget: float, context: PlanningContext) -> Move:
     """The way with the smallest bound of its error among those within `budget` s."""
-    ways = [_unconditioned(target, context, degauss)]
+    degauss, ways = context.degauss, [_unconditioned(target, context)]
     if not degauss.begun:
         if not 0.0 < degauss.wait <= budget:
             return ways[0]
         if not ways[0].known:
             # Even where the model cannot say by how much, a mirror whose history is known repeats better.
-            fresh = _after_degauss(target, context, degauss, None)
+            fresh = _after_degauss(target, context, None)
             if fresh.duration <= budget:
                 ways = [fresh]
     try:
-        recipe = _conditioned(target, context, degauss)
+        recipe = _conditioned(target, context)
         if degauss.begun or recipe.duration <= budget:
             ways.append(recipe)
     except Refusal:
@@ -126,9 +118,9 @@ def _best(target: FocusTarget, budget: float, context: PlanningContext, degauss:
     return ways[0] if len(ways) == 1 else min(ways, key=lambda way: way.plan.max_zernike_upper)
 
 
-def _after_degauss(target: FocusTarget, context: PlanningContext, degauss: Degauss, recipe: FoundRecipe | None) -> Move:
+def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundRecipe | None) -> Move:
     """The move after the degauss that is under way, has just ended, or has to begin first."""
-    active, estimate = context.active, context.estimate
+    active, estimate, degauss = context.active, context.estimate, context.degauss
     begin = context.now + degauss.wait
     if not degauss.begun or degauss.wait > 0.0:
         estimate = estimate.after_degauss(active.planner.law, active.calibration.actuators, begin, active.middle)
@@ -144,16 +136,14 @@ def _after_degauss(target: FocusTarget, context: PlanningContext, degauss: Degau
     return replace(move, duration=degauss.wait + move.duration, degauss=None if degauss.begun else degauss.steps)
 
 
-def check_reachable(move: Move, active: ActiveCalibration, tolerance: float) -> None:
-    """Raise Refusal when the limits leave a larger coefficient error than `tolerance` (m)."""
-    if move.max_zernike <= tolerance:
-        return
+def unreachable(move: Move, active: ActiveCalibration, tolerance: float) -> Refusal:
+    """That the limits leave a larger coefficient error than `tolerance` (m), and what they permit."""
     low, high = active.reachable_range(move.target, tolerance)
     if math.isnan(low):
         text = "no curvature is reachable with these added Zernike terms"
     else:
         text = f"reachable: {low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
-    raise Refusal(
+    return Refusal(
         ErrorCode.UNREACHABLE,
         f"curvature = {move.target.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error "
         f"of {move.max_zernike * 1e9:.1f} nm (allowed {tolerance * 1e9:.1f} nm); {text}",

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from dm_common.hysteresis.inverse import Pieces, horner, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.limits import Limits
 from dm_common.optics.conic import disc_coefficients
 from dm_common.optics.zernike import TERMS, basis
 from dm_controller.planning.mirror_model import CalibratedMirror
@@ -109,14 +110,14 @@ class PreparedInverse:
     Args:
         law: that remembers.
         state: of a mirror at rest.
-        low, high: limits of the signals.
+        limits: of the signals.
 
     Attributes:
         state: as given.
     """
 
-    def __init__(self, law: HysteresisModel, state: HysteresisState, low: float, high: float) -> None:
-        self.state, self._low, self._high = state, low, high
+    def __init__(self, law: HysteresisModel, state: HysteresisState, limits: Limits) -> None:
+        self.state, self._limits, self._low, self._high = state, limits, limits.low, limits.high
         self._rate = -1.0 / law.creep_time
         self._share = np.atleast_2d(law.creep_share)
         self._creeps = bool(law.creep_rate)
@@ -202,9 +203,9 @@ class PreparedInverse:
             signals = piece[0] + piece[2] * rise
         else:
             signals = piece[0] + ((piece[4] * rise + piece[3]) * rise + piece[2]) * rise
-        if np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high:
-            return np.asarray(signals)
-        return None  # not a number, too
+        # Not beyond an end by rounding either; where a piece is not exact there is no number.
+        inside = np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high
+        return np.asarray(signals) if inside and self._limits.allow_neighbours(signals) else None
 
     def _static(self, time: float, effective: Floats, ahead: float) -> Floats:
         """What `HysteresisModel.position_for` gives for the state at `time`."""

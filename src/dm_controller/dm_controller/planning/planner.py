@@ -107,9 +107,9 @@ class Planner:
 
     def prepare(self, state: HysteresisState) -> None:
         """Work out now what plans from exactly this `state`, of a mirror at rest, will need."""
-        limits, ready = self.mirror.limits, self._prepared
+        ready = self._prepared
         if self.hysteresis is not None and self.law.remembers and (ready is None or ready.state is not state):
-            self._prepared = PreparedInverse(self.law, state, limits.low, limits.high)
+            self._prepared = PreparedInverse(self.law, state, self._limits)
 
     def plan(
         self,
@@ -186,7 +186,7 @@ class Planner:
         limits, ready = self._limits, self._prepared
         if ready is not None and ready.state is state:
             found = ready.invert(arrival, aim, ahead)
-            if found is not None and limits.allow_neighbours(found):
+            if found is not None:
                 return found, None
         at = self.law.advance(state, arrival)
         inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)

@@ -107,6 +107,11 @@ class Request:
     holder: str = ""
     take_over: bool = False
 
+    def target(self) -> FocusTarget:
+        """The wanted surface. Raises Refusal naming a field that may not be as it is."""
+        REQUEST.check(self)
+        return FocusTarget(self.curvature, self.conic_constant, self.zernike)
+
     @classmethod
     def from_message(cls, message: FocusRequest) -> Request:
         return cls(
