@@ -11,8 +11,8 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import doubles
 from dm_common.ros.parameters import declare
-from dm_controller.focus_actions import LoopHost, serve_loops
 from dm_controller.focus_parameters import LOOP_PARAMETERS
+from dm_controller.loop_actions import LoopHost, serve_loops
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror

@@ -16,7 +16,6 @@ from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import Applied
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
-from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import Recipe, RecipeBook
 
 if TYPE_CHECKING:
@@ -84,7 +83,9 @@ def measurement_from(response: Any) -> Measurement:
     Raises:
         ValueError: the answer holds no samples, or coefficients of another convention.
     """
-    from dm_common.measurement import Measurement  # only those who measure ask
+    # Only those who measure ask.
+    from dm_common.measurement import Measurement
+    from dm_common.optics.sampling import SamplePoints
 
     zernike, samples = response.zernike, response.samples
     if zernike.convention != ZernikeCoefficients.BORN_WOLF:

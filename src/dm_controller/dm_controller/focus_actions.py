@@ -1,147 +1,67 @@
-"""The actions of the focus controller: `move_focus`, `converge` and `build_recipes`; and the driver's `degauss`."""
+"""How others ask for a shape: services `set_focus` and `flatten`, action `move_focus`; and the driver's degauss."""
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from dm_msgs.action import BuildRecipes, Converge, Degauss, MoveFocus
+from dm_msgs.action import Degauss, MoveFocus
 from dm_msgs.msg import FocusRequest
-from dm_msgs.srv import StoreRecipes
+from dm_msgs.srv import Flatten, SetFocus
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
-from dm_common.errors import ErrorCode, MeasurementError, Refusal
-from dm_common.hysteresis.model import HysteresisState
-from dm_common.ros.bench_services import BenchServices
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.worker import WorkerActionServer, answers_arrive, sleep
+from dm_common.ros.worker import WorkerActionServer, WorkerService, answers_arrive, sleep
 from dm_controller.conditioning import Run
-from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE, MOVE_FOCUS
+from dm_controller.driver_monitor import CONFIRM_S
+from dm_controller.focus_parameters import MOVE_FOCUS
 from dm_controller.focus_types import Order, StartDegauss
-from dm_controller.planning.active_calibration import ActiveCalibration
-from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
-    from dm_common.measurement import Measurement
     from dm_controller.focus_controller_node import FocusControllerNode
 
-
-class LoopHost:
-    """What closed loops ask of the focus controller, from any thread."""
-
-    def __init__(self, node: FocusControllerNode) -> None:
-        self._node = node
-
-    def target(self, request: FocusRequest) -> FocusTarget:
-        """The target of a request that could be carried out. Raises Refusal, as for a move."""
-        outcome = self._node.order(request, dry_run=True).outcome
-        if outcome.refusal is not None:
-            raise outcome.refusal
-        assert outcome.move is not None  # else it is refused
-        return outcome.move.target
-
-    def active_calibration(self) -> ActiveCalibration:
-        """The calibration in use. Raises Refusal."""
-        with self._node.controller() as (controller, _now):
-            if controller.active is None:
-                raise controller.not_calibrated
-            return controller.active
-
-    def hysteresis(self) -> HysteresisState | None:
-        """What is known of the actuators; None = nothing."""
-        with self._node.controller() as (controller, now):
-            return controller.observer.estimate(now.time).state
+#: How often an order is looked after, s: by an action, by a service, and how often feedback is published.
+POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
+#: Longest that a confirmation takes beyond the time after which the controller itself gives a command up, s.
+GRACE_S = 1.0
 
 
-class LoopBench(BenchServices):
-    """Driver and interferometer, for one goal of either action at a time.
+class FocusServices:
+    """Serves `set_focus` and `flatten` in worker threads, for the driver's confirmation is waited for.
 
     Args:
-        node: the hosting node.
-        values: its parameters, LOOP_PARAMETERS among them.
-
-    Attributes:
-        host: what the node knows and can do.
+        node: hosts the services and carries the requests out.
+        driver_timeout: s, now; 0 = never.
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any], host: LoopHost) -> None:
-        own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
-        super().__init__(node, own | {"degauss_timeout": values["recipes.degauss_timeout"]})
-        self.host, self._parameters = host, values
-        self._goal = threading.Lock()
+    def __init__(self, node: FocusControllerNode, driver_timeout: Callable[[], float]) -> None:
+        self._node, self._driver_timeout = node, driver_timeout
+        WorkerService(node, SetFocus, "set_focus", self._on_set_focus)
+        WorkerService(node, Flatten, "flatten", self._on_flatten)
 
-    @contextmanager
-    def reserved(
-        self, asked: Any, text: str, cancelled: Callable[[], bool], waiting: Callable[[str], None]
-    ) -> Iterator[None]:
-        """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
+    def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
+        return self._answer(request.request, request.dry_run, response)
 
-        Args:
-            asked: says who asks, see `BenchServices.held`.
-            text: what requests of others are told meanwhile.
-            waiting: called with what is waited for.
+    def _on_flatten(self, request: Flatten.Request, response: Flatten.Response) -> Flatten.Response:
+        flat = FocusRequest(holder=request.holder, take_over=request.take_over)
+        return self._answer(flat, request.dry_run, response)
 
-        Raises:
-            Refusal: another goal has it, or somebody else holds the mirror.
-        """
-        if not self._goal.acquire(blocking=False):
-            raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
-        try:
-            self.cancelled, self.waiting = cancelled, waiting
-            with self.held(asked, f"{text}; cancel it to end it"):
-                yield
-        finally:
-            self._goal.release()
-
-    def degauss(self) -> None:
-        """The condition that recipes begin with: the driver's own number of steps may be another."""
-        self._run_degauss(int(self._parameters["recipes.degauss_steps"]))
-
-    def measure(self, label: str) -> Measurement:
-        """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""
-        left = int(self._parameters["converge.measure_retries"])
-        while True:
-            try:
-                return super().measure(label)
-            except MeasurementError:
-                if left == 0 or self.cancelled():
-                    raise
-                left -= 1
-
-
-def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[WorkerActionServer, ...]:
-    """Offer both actions, one goal at a time. What they run is loaded with the first goal: most mirrors never see one.
-
-    Args:
-        node: the hosting node.
-        values: its parameters, LOOP_PARAMETERS among them.
-        host: judges requests and knows the calibration in use.
-    """
-    bench = LoopBench(node, values, host)
-    store = node.create_client(StoreRecipes, "store_recipes")
-
-    def converge(handle: ServerGoalHandle) -> tuple[str, Any]:
-        from dm_controller.converge.converge_run import ConvergeRun
-
-        return ConvergeRun(node, values, bench).run(handle)
-
-    def build_recipes(handle: ServerGoalHandle) -> tuple[str, Any]:
-        from dm_controller.converge.recipe_run import RecipeRun
-
-        return RecipeRun(node, values, bench, store).run(handle)
-
-    return (
-        WorkerActionServer(node, Converge, "converge", converge, fields=CONVERGE),
-        WorkerActionServer(node, BuildRecipes, "build_recipes", build_recipes, fields=BUILD_RECIPES),
-    )
-
-
-#: How often an order is looked after, s, and how often its feedback is published.
-POLL_S, FEEDBACK_S = 0.002, 0.1
+    def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
+        order = self._node.order(request, dry_run)
+        deadline = time.monotonic() + GRACE_S + (self._driver_timeout() or CONFIRM_S)
+        while waits := not (dry_run or order.pending or order.outcome.applied or order.outcome.refusal):
+            if time.monotonic() > deadline:
+                break
+            time.sleep(SERVICE_POLL_S)
+        response.state = state = self._node.state(order.outcome)
+        response.error_code, response.message = state.error_code, state.message
+        if waits:
+            response.error_code = ErrorCode.TIMEOUT
+            response.message = "the driver has not confirmed the command in time"
+        return response
 
 
 class MoveFocusAction:

@@ -13,20 +13,17 @@ from contextlib import contextmanager
 from typing import Any
 
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
-from dm_msgs.srv import Flatten, SetFocus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import Refusal
 from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare, frame_id
 from dm_common.ros.qos import GONE, LEASE_S, Liveliness
-from dm_common.ros.worker import WorkerService
-from dm_controller.driver_monitor import CONFIRM_S
-from dm_controller.focus_actions import DegaussClient, LoopHost, MoveFocusAction, serve_loops
+from dm_controller.focus_actions import DegaussClient, FocusServices, MoveFocusAction
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
 from dm_controller.focus_messages import capabilities_message, driver_report_from, health, state_message
 from dm_controller.focus_parameters import PARAMETERS
@@ -41,18 +38,17 @@ from dm_controller.focus_types import (
     StartDegauss,
 )
 from dm_controller.forecast import ForecastClient
+from dm_controller.loop_actions import LoopHost, serve_loops
 from dm_controller.planning.target import Request
 
 #: How often silence of the driver is noticed, s of wall time.
 STEADY_PERIOD_S = 0.5
 #: How often what the actuators have crept to is put on disk, s of wall time.
 RECORD_PERIOD_S = 30.0
-#: How often a service looks for the driver's confirmation, s.
-POLL_S = 0.001
 
 
 class FocusControllerNode(Node):
-    """Subscriptions, services and timers run in the executor, actions in threads of their own. See README."""
+    """Subscriptions and timers run in the executor, services and actions in threads of their own. See README."""
 
     def __init__(self, **keywords: Any) -> None:
         super().__init__("focus_controller", **keywords)
@@ -72,14 +68,13 @@ class FocusControllerNode(Node):
         self.create_timer(SLOW_PERIOD_S, self._tick)
         self.create_timer(STEADY_PERIOD_S, self._tick, clock=steady)
         self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
+        FocusServices(self, lambda: values["driver_timeout"])
         self._actions = MoveFocusAction(self, values["settle_time"]), *serve_loops(self, values, LoopHost(self))
         self._driver = Liveliness(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         self.create_subscription(FocusRequest, "focus_request", self.order, qos.COMMAND)
-        for kind, name, answer in ((SetFocus, "set_focus", self._on_set_focus), (Flatten, "flatten", self._on_flatten)):
-            WorkerService(self, kind, name, answer)
         self._publish_capabilities()
 
     @property
@@ -128,36 +123,13 @@ class FocusControllerNode(Node):
         with self.controller() as (controller, now):
             self._do(controller.driver_report(report, now), now)
 
-    def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
-        return self._answer(request.request, request.dry_run, response)
-
-    def _on_flatten(self, request: Flatten.Request, response: Flatten.Response) -> Flatten.Response:
-        flat = FocusRequest(holder=request.holder, take_over=request.take_over)
-        return self._answer(flat, request.dry_run, response)
-
-    def _answer(self, request: FocusRequest, dry_run: bool, response: Any) -> Any:
-        """In a worker thread, for the driver's confirmation is waited for."""
-        order = self.order(request, dry_run)
-        deadline = time.monotonic() + 1.0 + (self._values["driver_timeout"] or CONFIRM_S)
-        while waits := not (dry_run or order.pending or order.outcome.applied or order.outcome.refusal):
-            if time.monotonic() > deadline:
-                break
-            time.sleep(POLL_S)
-        response.state = self.state(order.outcome)
-        response.error_code, response.message = response.state.error_code, response.state.message
-        if waits:
-            response.error_code, response.message = (
-                ErrorCode.TIMEOUT,
-                "the driver has not confirmed the command in time",
-            )
-        return response
-
     def _tick(self) -> None:
         with self.controller() as (controller, now):
             # Who reports lives, whatever a lease says that lapsed on a busy machine.
             dead = controller.monitor.age(now.steady) > LEASE_S and self._driver.missing()
             self._do(controller.tick(now, f"pdm_driver {GONE}" if dead else ""), now)
             self._degauss.retry(controller.conditioning.run)
+            self._forecast.use(controller.active, self._values["reachable_tolerance"])
 
     def _degauss_ended(self, number: int, duration: float, refusal: Refusal | None) -> None:
         with self.controller() as (controller, now):
@@ -193,7 +165,6 @@ class FocusControllerNode(Node):
 
     def state(self, outcome: Outcome) -> FocusState:
         """What came of a request."""
-        self._forecast.use(self._controller.active, self._values["reachable_tolerance"])
         state = state_message(outcome, self._values, self._forecast.share)
         state.header.frame_id = self._frame_id
         return state

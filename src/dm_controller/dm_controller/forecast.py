@@ -103,7 +103,7 @@ class ForecastClient:
     def use(self, active: ActiveCalibration | None, tolerance: float) -> None:
         """Have the share for a calibration fetched that does not know the hysteresis itself.
 
-        Call it with every calibration and every request: it returns at once, and when the calibration node does not
+        Call it with every calibration and now and then: it returns at once, and when the calibration node does not
         answer, a later call asks again.
 
         Args:

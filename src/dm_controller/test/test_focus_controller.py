@@ -28,7 +28,6 @@ from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import Applied
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
-from dm_controller.focus_actions import LoopHost
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import capabilities_message, health
 from dm_controller.focus_types import (
@@ -43,6 +42,7 @@ from dm_controller.focus_types import (
     SendCommand,
     StartDegauss,
 )
+from dm_controller.loop_actions import LoopHost
 from dm_controller.planning.target import Request
 
 ACTUATORS, POINTS, RADIUS = 37, 300, 11e-3

@@ -21,7 +21,7 @@ from dm_common.ros.bench_services import told_by
 from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.goals import ending
-from dm_controller.focus_actions import LoopBench
+from dm_controller.loop_actions import LoopBench
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import MirrorFacts, make_solver
 

@@ -24,7 +24,7 @@ from dm_common.ros.bench_services import told_by
 from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
 from dm_controller.converge.goals import ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
-from dm_controller.focus_actions import LoopBench
+from dm_controller.loop_actions import LoopBench
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget
 

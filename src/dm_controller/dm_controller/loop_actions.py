@@ -1,0 +1,136 @@
+"""The closed loops of the focus controller: actions `converge` and `build_recipes`, and what they ask of the node."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from dm_msgs.action import BuildRecipes, Converge
+from dm_msgs.msg import FocusRequest
+from dm_msgs.srv import StoreRecipes
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+
+from dm_common.errors import ErrorCode, MeasurementError, Refusal
+from dm_common.hysteresis.model import HysteresisState
+from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.worker import WorkerActionServer
+from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.target import FocusTarget
+
+if TYPE_CHECKING:
+    from dm_common.measurement import Measurement
+    from dm_controller.focus_controller_node import FocusControllerNode
+
+
+class LoopHost:
+    """What closed loops ask of the focus controller, from any thread."""
+
+    def __init__(self, node: FocusControllerNode) -> None:
+        self._node = node
+
+    def target(self, request: FocusRequest) -> FocusTarget:
+        """The target of a request that could be carried out. Raises Refusal, as for a move."""
+        outcome = self._node.order(request, dry_run=True).outcome
+        if outcome.refusal is not None:
+            raise outcome.refusal
+        assert outcome.move is not None  # else it is refused
+        return outcome.move.target
+
+    def active_calibration(self) -> ActiveCalibration:
+        """The calibration in use. Raises Refusal."""
+        with self._node.controller() as (controller, _now):
+            if controller.active is None:
+                raise controller.not_calibrated
+            return controller.active
+
+    def hysteresis(self) -> HysteresisState | None:
+        """What is known of the actuators; None = nothing."""
+        with self._node.controller() as (controller, now):
+            return controller.observer.estimate(now.time).state
+
+
+class LoopBench(BenchServices):
+    """Driver and interferometer, for one goal of either action at a time.
+
+    Args:
+        node: the hosting node.
+        values: its parameters, LOOP_PARAMETERS among them.
+
+    Attributes:
+        host: what the node knows and can do.
+    """
+
+    def __init__(self, node: Node, values: Mapping[str, Any], host: LoopHost) -> None:
+        own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
+        super().__init__(node, own | {"degauss_timeout": values["recipes.degauss_timeout"]})
+        self.host, self._parameters = host, values
+        self._goal = threading.Lock()
+
+    @contextmanager
+    def reserved(
+        self, asked: Any, text: str, cancelled: Callable[[], bool], waiting: Callable[[str], None]
+    ) -> Iterator[None]:
+        """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
+
+        Args:
+            asked: says who asks, see `BenchServices.held`.
+            text: what requests of others are told meanwhile.
+            waiting: called with what is waited for.
+
+        Raises:
+            Refusal: another goal has it, or somebody else holds the mirror.
+        """
+        if not self._goal.acquire(blocking=False):
+            raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
+        try:
+            self.cancelled, self.waiting = cancelled, waiting
+            with self.held(asked, f"{text}; cancel it to end it"):
+                yield
+        finally:
+            self._goal.release()
+
+    def degauss(self) -> None:
+        """The condition that recipes begin with: the driver's own number of steps may be another."""
+        self._run_degauss(int(self._parameters["recipes.degauss_steps"]))
+
+    def measure(self, label: str) -> Measurement:
+        """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""
+        left = int(self._parameters["converge.measure_retries"])
+        while True:
+            try:
+                return super().measure(label)
+            except MeasurementError:
+                if left == 0 or self.cancelled():
+                    raise
+                left -= 1
+
+
+def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[WorkerActionServer, ...]:
+    """Offer both actions, one goal at a time. What they run is loaded with the first goal: most mirrors never see one.
+
+    Args:
+        node: the hosting node.
+        values: its parameters, LOOP_PARAMETERS among them.
+        host: judges requests and knows the calibration in use.
+    """
+    bench = LoopBench(node, values, host)
+    store = node.create_client(StoreRecipes, "store_recipes")
+
+    def converge(handle: ServerGoalHandle) -> tuple[str, Any]:
+        from dm_controller.converge.converge_run import ConvergeRun
+
+        return ConvergeRun(node, values, bench).run(handle)
+
+    def build_recipes(handle: ServerGoalHandle) -> tuple[str, Any]:
+        from dm_controller.converge.recipe_run import RecipeRun
+
+        return RecipeRun(node, values, bench, store).run(handle)
+
+    return (
+        WorkerActionServer(node, Converge, "converge", converge, fields=CONVERGE),
+        WorkerActionServer(node, BuildRecipes, "build_recipes", build_recipes, fields=BUILD_RECIPES),
+    )
