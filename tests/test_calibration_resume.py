@@ -26,8 +26,8 @@ from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, open_run
 from dm_calibration.procedure.run_journal import EVENTS, read_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
-from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.atomic_write import StoreError
 from dm_common.errors import Refusal
 from dm_common.measurement import Measurement
 from hysteretic_mirror import MIRROR, lagging_bench

@@ -11,8 +11,8 @@ from pathlib import Path
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance
 from dm_calibration.procedure.event_frames import map_hashes
-from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError
+from dm_common.atomic_write import StoreError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.mirror import Mirror, mismatch
 from dm_common.recipes import RecipeBook, RecipeError

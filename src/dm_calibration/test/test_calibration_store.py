@@ -21,9 +21,9 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome, Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError, check_id
 from dm_calibration.store.hdf5_image import content_hash, read_image, write_image
+from dm_common.atomic_write import StoreError
 from dm_common.measurement import Measurement
 from dm_common.names import UnknownNameError
 from linear_mirror import LinearMirror, make_mirror

@@ -15,8 +15,8 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.drift_filter import Drift, DriftRates
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
-from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common.atomic_write import StoreError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
 from steady_mirror import SteadyMirror

@@ -18,8 +18,8 @@ from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
-from dm_calibration.store.atomic_write import StoreError
 from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError
+from dm_common.atomic_write import StoreError
 from dm_common.errors import ErrorCode, Refusal, error_code
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 from hysteretic_mirror import MIRROR, lagging_bench

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,6 +80,22 @@ def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:
     file.write_bytes(b"PK\x03\x04 torn")
     with pytest.raises(ValueError, match=r"mirror\.creep\.npz"):
         read_record(file, 0.0)
+
+
+def test_a_disk_that_fails_leaves_the_record_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "mirror.creep.npz"
+    record = CreepRecord(10.0, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
+    write_record(file, record)
+
+    def fails(_handle: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fails)  # without it the power may take the old record and the new one
+    with pytest.raises(OSError, match="No space left"):
+        write_record(file, record._replace(time=20.0))
+    kept = read_record(file, 30.0)
+    assert kept is not None and kept.time == 10.0
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_record_of_another_law_or_mirror_is_not_used() -> None:

@@ -9,7 +9,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
@@ -17,7 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_common.errors import Refusal
-from dm_common.hysteresis.creep_record import CreepRecorder
+from dm_common.hysteresis.creep_record import CreepRecord, CreepRecorder, write_record
 from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
@@ -63,6 +65,7 @@ class FocusControllerNode(Node):
         self._controller.degauss_offered = lambda: self._degauss.offered
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._recorder = CreepRecorder(values["state_folder"], self._controller.observer)
+        self._disk = ThreadPoolExecutor(max_workers=1)  # until a disk has a record for sure may take long
         self.create_timer(RECORD_PERIOD_S, self._keep_record, clock=steady)
         self._quick = self.create_timer(values["hold.period"], self._tick)
         self.create_timer(SLOW_PERIOD_S, self._tick)
@@ -103,7 +106,14 @@ class FocusControllerNode(Node):
         with self.controller() as (controller, now):
             # Of a mirror that nobody reports of, the last record stands: what comes after it is in doubt.
             record = None if controller.monitor.stopped(now.steady) else self._recorder.record(now.time)
-        self._warn(self._recorder.keep(record))
+        if record is not None:
+            self._disk.submit(self._write_record, *record)
+
+    def _write_record(self, file: Path, record: CreepRecord) -> None:
+        try:
+            write_record(file, record)
+        except OSError as error:
+            self._warn(f"state_folder: {error}: the next start will not know of creep")
 
     def _warn(self, text: str) -> None:
         if text:

@@ -90,7 +90,7 @@ def _plain(value: Any) -> Any:
 
 def write_json(path: Path | None, figures: dict[str, Any]) -> None:
     """Write figures whole or not at all, `-` to standard output; None writes nothing."""
-    from dm_calibration.store.atomic_write import write_whole
+    from dm_common.atomic_write import write_whole
 
     if path is None:
         return

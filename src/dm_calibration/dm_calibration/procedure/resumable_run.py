@@ -18,7 +18,7 @@ from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions
 from dm_calibration.procedure.run_journal import Kept, RunJournal
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
-from dm_calibration.store.atomic_write import StoreError
+from dm_common.atomic_write import StoreError
 from dm_common.mirror import Mirror
 
 #: Room that must be there for each map, in the journal and then in the calibration [bytes].

@@ -19,7 +19,7 @@ from typing import Any
 
 from dm_calibration.procedure.event_frames import FIRST, Storing, decode, encode
 from dm_calibration.procedure.outcome import Event, MapTaken, Outcome, Segment
-from dm_calibration.store.atomic_write import StoreError, storing, write_whole
+from dm_common.atomic_write import StoreError, storing, write_whole
 
 SCHEMA = "dm_calibration/unfinished"
 SCHEMA_VERSION = 1

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from dm_calibration.procedure.run_journal import JournalError, Kept, RunJournal, read_manifest, read_run
-from dm_calibration.store.atomic_write import storing
+from dm_common.atomic_write import storing
 from dm_common.errors import ErrorCode, Refusal
 
 #: Name of the folder among the calibrations.

@@ -9,9 +9,9 @@ import numpy as np
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.recalibration.drift_filter import Drift
-from dm_calibration.store.atomic_write import write_whole
 from dm_calibration.store.hdf5_image import Attribute, Column, ImageError, content_hash, read_image, write_image
 from dm_calibration.store.hysteresis_storage import hysteresis_columns
+from dm_common.atomic_write import write_whole
 
 SCHEMA = "dm_calibration/updates"
 SCHEMA_VERSION = 1

@@ -20,7 +20,7 @@ from dm_calibration.procedure.applied_history import MapNotUsableError, SettledS
 from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.drift_filter import Comparison, Drift, DriftFilter, DriftRates
 from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
-from dm_calibration.store.atomic_write import storing
+from dm_common.atomic_write import storing
 from dm_common.measurement import Measurement
 from dm_common.mirror import APERTURE_TOLERANCE
 

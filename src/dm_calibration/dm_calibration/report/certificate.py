@@ -15,7 +15,7 @@ from dm_calibration.influence.surfaces import solve_shape
 from dm_calibration.report import figures
 from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
-from dm_calibration.store.atomic_write import write_whole
+from dm_common.atomic_write import write_whole
 from dm_common.geometry import neighbour_pairs
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror

@@ -16,7 +16,7 @@ from dm_calibration.report.html_page import one_html
 from dm_calibration.report.hysteresis_figures import loop_opening
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
-from dm_calibration.store.atomic_write import write_whole
+from dm_common.atomic_write import write_whole
 
 
 class Written(NamedTuple):

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
-from dm_calibration.store.atomic_write import StoreError, storing, write_whole
 from dm_calibration.store.hdf5_image import ImageError, content_hash, read_image, write_image
+from dm_common.atomic_write import StoreError, storing, write_whole
 from dm_common.errors import ErrorCode
 
 SUFFIX = ".h5"

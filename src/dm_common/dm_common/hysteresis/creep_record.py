@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import zipfile
@@ -45,18 +46,16 @@ def record_file(folder: str, serial: str) -> Path | None:
 
 
 def write_record(file: Path, record: CreepRecord) -> None:
-    """Replace `file` as a whole.
+    """Replace `file` as a whole, also when the power fails meanwhile.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: it cannot be written; the record that was there still is.
     """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f"{file.name}.part")
-    with part.open("wb") as stream:
-        np.savez(
-            stream, time=record.time, creep_time=record.creep_time, crept=record.crept, crept_sigma=record.crept_sigma
-        )
-    part.replace(file)
+    from dm_common.atomic_write import write_whole  # a start does not wait for it
+
+    image = io.BytesIO()
+    np.savez(image, **record._asdict())
+    write_whole(file, image.getvalue())
 
 
 def read_record(file: Path, now: float) -> CreepRecord | None:
@@ -93,17 +92,17 @@ def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -
 
 
 class CreepRecorder:
-    """Keeps the record of the mirror that an observer follows, in `folder`; empty = keeps nothing.
-
-    Its methods return the reason why something could not be done; "" = it was.
-    """
+    """Keeps the record of the mirror that an observer follows, in `folder`; empty = keeps nothing."""
 
     def __init__(self, folder: str, observer: HysteresisObserver) -> None:
         self._folder, self._observer = folder, observer
         self._serial: str | None = None
 
     def recall(self, serial: str, now: float) -> str:
-        """Go on from the record of the mirror `serial`, if there is one; reports of another one are forgotten."""
+        """Go on from the record of the mirror `serial`, if there is one; reports of another one are forgotten.
+
+        Returns the reason why that could not be done; "" = it was, or there was none.
+        """
         if serial == self._serial:
             return ""
         another, self._serial = self._serial is not None, serial
@@ -115,16 +114,8 @@ class CreepRecorder:
         self._observer.recall(record, another)
         return failure
 
-    def record(self, now: float) -> CreepRecord | None:
-        """What is to be kept: see :func:`record_of`."""
-        return record_of(self._observer.law, self._observer.state, now)
-
-    def keep(self, record: CreepRecord | None) -> str:
-        """Put it on disk, if there is anything to keep."""
+    def record(self, now: float) -> tuple[Path, CreepRecord] | None:
+        """What is to be kept and where; None = there is nothing to keep."""
         file = record_file(self._folder, self._serial) if self._serial is not None else None
-        try:
-            if file is not None and record is not None:
-                write_record(file, record)
-        except OSError as error:
-            return f"state_folder: {error}: the next start will not know of creep"
-        return ""
+        record = record_of(self._observer.law, self._observer.state, now)
+        return None if file is None or record is None else (file, record)

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
-from dm_calibration.store.atomic_write import write_whole
+from dm_common.atomic_write import write_whole
 
 SUFFIX = ".mcap"
 METADATA_FILE = "metadata.yaml"

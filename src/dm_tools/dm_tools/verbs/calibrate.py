@@ -155,7 +155,7 @@ def write_parameters(parameters: str, target: Path, source: Path) -> None:
     import yaml
 
     from dm_bringup.config_edit import edited
-    from dm_calibration.store.atomic_write import write_whole
+    from dm_common.atomic_write import write_whole
 
     if not parameters:
         console.print(f"no parameter has to be changed: {target} is not written")
