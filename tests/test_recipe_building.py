@@ -24,7 +24,7 @@ from dm_controller.converge.recipe_building import (
 )
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from dm_controller.planning.recipes import find
+from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
@@ -89,11 +89,12 @@ def test_what_was_built_makes_the_shape_again(stand: Stand) -> None:
     assert all(recipe.maps <= 8 for recipe in recipes[1:])
     assert sum(recipe.maps for recipe in recipes) == builder.maps == len(steps)
     book = recipe_book(recipes, stand.loop, bench.config.degauss_steps, 1)
+    corrections = Corrections(book, stand.loop)
     errors, state = [], builder.state
     for curvature, waited in ((0.04, 0.0), (-0.03, 200.0), (0.0, 50.0), (0.04, 5.0), (-0.03, 0.0)):
         bench.time += waited  # creep that the next degauss does not wipe
         target = FocusTarget(curvature)
-        error, state = stand.replay(target, find(book, target, stand.loop).effective, state)
+        error, state = stand.replay(target, corrections.find(target).effective, state)
         errors.append(error)
     assert np.median(errors) < WAVELENGTH / 1000.0
     assert max(errors) < WAVELENGTH / 400.0

@@ -13,7 +13,7 @@ from dm_controller.converge.goals import UnreachableError
 from dm_controller.converge.recipe_building import BuildOptions, RecipeBuilder, recipe_book
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S, Move, Planner
-from dm_controller.planning.recipes import find
+from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.simulated_bench import SimulatedBench
 
@@ -60,10 +60,15 @@ class DrivenMirror:
         record: CreepRecord | None = None,
     ) -> None:
         self.bench = bench
-        self._planner, self._holds, self._book = planner, holds, book
+        self._holds, self._book = holds, book
+        self._plan_with(planner)
         self._tracker = HysteresisTracker(planner.law, record=record)
         self._seen = seen
         self._follow()
+
+    def _plan_with(self, planner: Planner) -> None:
+        self._planner = planner
+        self._corrections = Corrections(self._book, planner) if self._book.recipes else None
 
     def _follow(self) -> None:
         for report in self.bench.reports[self._seen :]:
@@ -73,7 +78,7 @@ class DrivenMirror:
     def under(self, planner: Planner) -> DrivenMirror:
         """The same mirror from here on with another planner of the same hysteresis model."""
         other = copy.copy(self)
-        other._planner = planner
+        other._plan_with(planner)
         return other
 
     def settled(self) -> SettledState:
@@ -91,8 +96,8 @@ class DrivenMirror:
     def plan(self, target: FocusTarget) -> Move:
         """The move to `target` from where the mirror stands, or by a recipe after a degauss, which is carried out."""
         effective, error = None, None
-        if self._book.recipes:
-            found = find(self._book, target, self._planner)
+        if self._corrections is not None:
+            found = self._corrections.find(target)
             effective, error = found.effective, found.error
             self.bench.degauss()
         self._follow()

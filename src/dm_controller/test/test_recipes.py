@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
-from dm_controller.planning.recipes import REPEAT_SHARE, find, worst_error
+from dm_controller.planning.active_calibration import ActiveCalibration
+from dm_controller.planning.recipes import REPEAT_SHARE, Corrections
 from dm_controller.planning.target import FocusTarget
 
 CURVATURES = (-0.05, -0.03, -0.01, 0.0, 0.02, 0.03, 0.05)
@@ -72,7 +73,7 @@ BOOK = book(*[recipe(curvature) for curvature in CURVATURES])
 
 
 def test_a_stored_recipe_is_found_as_it_is() -> None:
-    found = find(BOOK, FocusTarget(0.02), PLANNER)
+    found = Corrections(BOOK, PLANNER).find(FocusTarget(0.02))
     np.testing.assert_array_equal(found.effective, own(FocusTarget(0.02)))
     assert not found.interpolated
     assert found.error == pytest.approx(3e-10 + REPEAT_SHARE * 1e-9)
@@ -82,7 +83,7 @@ def test_between_recipes_what_the_neighbours_show_corrects_the_model() -> None:
     law = Law(np.random.default_rng(1), 100e-9, 0.5)
     corrected = book(*[recipe(c, law(own(FocusTarget(c)))) for c in np.linspace(-0.05, 0.05, 11)])
     for curvature in (-0.044, -0.011, 0.032):
-        found = find(corrected, FocusTarget(curvature), PLANNER)
+        found = Corrections(corrected, PLANNER).find(FocusTarget(curvature))
         effective = own(FocusTarget(curvature))
         error = largest(found.effective - effective - law(effective))
         assert found.interpolated
@@ -92,24 +93,24 @@ def test_between_recipes_what_the_neighbours_show_corrects_the_model() -> None:
 
 def test_the_worse_neighbour_counts() -> None:
     two = book(recipe(0.0, measured=1e-10), recipe(0.02, measured=4e-10))
-    found = find(two, FocusTarget(0.01), PLANNER)
+    found = Corrections(two, PLANNER).find(FocusTarget(0.01))
     assert 4e-10 + REPEAT_SHARE * 1e-9 < found.error < 1e-9
-    assert worst_error(two, PLANNER) == pytest.approx(found.error, rel=0.01)
+    assert Corrections(two, PLANNER).worst == pytest.approx(found.error, rel=0.01)
 
 
 def test_a_single_recipe_claims_nothing_of_other_shapes_beyond_the_model() -> None:
     missed = scaled(np.ones(ACTUATORS), 225e-9)
     alone = book(recipe(0.04, missed))
-    errors = [find(alone, FocusTarget(0.04, conic), PLANNER).error for conic in (-1.0, -50.0, -200.0)]
+    errors = [Corrections(alone, PLANNER).find(FocusTarget(0.04, conic)).error for conic in (-1.0, -50.0, -200.0)]
     assert errors == sorted(errors)
     assert errors[-1] > 100e-9
 
 
 def test_merging_recipes_that_contradict_each_other_widens_the_bound() -> None:
     good = [recipe(c) for c in (-0.02, 0.0, 0.02)]
-    before = find(book(*good), FocusTarget(0.01), PLANNER).error
+    before = Corrections(book(*good), PLANNER).find(FocusTarget(0.01)).error
     merged = book(*good[:2]).merged(book(recipe(0.02, scaled(np.ones(ACTUATORS), 225e-9))))
-    assert find(merged, FocusTarget(0.01), PLANNER).error > 30e-9 > before
+    assert Corrections(merged, PLANNER).find(FocusTarget(0.01)).error > 30e-9 > before
 
 
 def test_the_bound_holds_on_laws_that_really_err() -> None:
@@ -130,7 +131,7 @@ def test_the_bound_holds_on_laws_that_really_err() -> None:
         curvatures = [curvature for curvature, _ in missed]
         target = FocusTarget(float(rng.uniform(min(curvatures), max(curvatures))), float(rng.uniform(-300.0, 300.0)))
         try:
-            found = find(recipes, target, planner)
+            found = Corrections(recipes, planner).find(target)
         except RecipeError:
             continue
         error = largest(found.effective - own(target) - law(own(target)))
@@ -143,10 +144,10 @@ def test_the_bound_holds_on_laws_that_really_err() -> None:
 def test_other_shapes_are_served_where_recipes_are_near() -> None:
     missed = scaled(np.ones(ACTUATORS), 1e-9)
     corrected = book(*[recipe(c, missed) for c in CURVATURES])
-    conic = find(corrected, FocusTarget(0.02, -1.0), PLANNER)
+    conic = Corrections(corrected, PLANNER).find(FocusTarget(0.02, -1.0))
     assert largest(conic.effective - own(FocusTarget(0.02, -1.0)) - missed) < 2e-10
     mixed = book(recipe(0.02, missed, -1.0), *corrected.recipes)
-    assert find(mixed, FocusTarget(0.02, -1.0), PLANNER).error < conic.error
+    assert Corrections(mixed, PLANNER).find(FocusTarget(0.02, -1.0)).error < conic.error
 
 
 def test_nothing_is_extrapolated_and_far_from_all_recipes_there_is_none() -> None:
@@ -156,12 +157,13 @@ def test_nothing_is_extrapolated_and_far_from_all_recipes_there_is_none() -> Non
         "conic_constant = 0"
     )
     with pytest.raises(RecipeError, match=rf"curvature = \+0\.0510 1/m: nothing is extrapolated; {there}"):
-        find(alone, FocusTarget(0.051), PLANNER)
+        Corrections(alone, PLANNER).find(FocusTarget(0.051))
     with pytest.raises(RecipeError, match=rf"curvature = -0\.0250 1/m: no recipe is near this shape; {there}"):
-        find(alone, FocusTarget(-0.025, 3000.0), PLANNER)
+        Corrections(alone, PLANNER).find(FocusTarget(-0.025, 3000.0))
 
 
 def test_an_empty_book_says_so() -> None:
     with pytest.raises(RecipeError, match="there are no recipes"):
-        find(NO_RECIPES, FocusTarget(0.0), PLANNER)
-    assert worst_error(NO_RECIPES, PLANNER) == 0.0
+        Corrections(NO_RECIPES, PLANNER).find(FocusTarget(0.0))
+    none: Any = None
+    assert ActiveCalibration(none, none, none, PLANNER, NO_RECIPES, 0.0, 1.0, 2.0).conditioned_error == 0.0

@@ -24,7 +24,7 @@ from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 from dm_controller.converge.defects import Defects, mean_of
 from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.recipes import worst_error
+from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag, target_shape
 
@@ -290,5 +290,5 @@ def recipe_book(
     ordered = sorted(recipes, key=lambda recipe: (recipe.conic_constant, recipe.curvature))
     book = RecipeBook(tuple(ordered), degauss_steps, 0.0, stamp_ns)
     whole = before.merged(book)
-    between = worst_error(whole, loop) - max(recipe.max_zernike for recipe in whole.recipes)
+    between = Corrections(whole, loop).worst - max(recipe.max_zernike for recipe in whole.recipes)
     return replace(book, interpolation_error=between)

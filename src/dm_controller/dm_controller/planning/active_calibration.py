@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from dm_common.mirror import mismatch
 from dm_common.recipes import RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
-from dm_controller.planning.recipes import worst_error
+from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 
 NO_CALIBRATION = "no calibration: run `./dm calibrate` or load_calibration"
@@ -59,10 +60,15 @@ class ActiveCalibration:
         """Half-swings of the degauss that conditions: as `configured`, else as for the recipes; 0 = the driver's."""
         return configured or (self.recipes.degauss_steps if self.recipes.recipes else 0)
 
+    @cached_property
+    def corrections(self) -> Corrections:
+        """What the recipes say of other shapes. Raises RecipeError when there are none."""
+        return Corrections(self.recipes, self.planner)
+
     @property
     def conditioned_error(self) -> float:
         """m, bound of the largest coefficient error of a conditioned move; 0 = no recipes."""
-        return worst_error(self.recipes, self.planner)
+        return self.corrections.worst if self.recipes.recipes else 0.0
 
     def error_bound(self, history_known: bool) -> float:
         """m, 95 % bound of the largest coefficient error of a direct move."""

@@ -13,7 +13,7 @@ from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move
-from dm_controller.planning.recipes import FoundRecipe, find
+from dm_controller.planning.recipes import FoundRecipe
 from dm_controller.planning.target import FocusTarget
 
 #: A message's constants are properties of its class, which take longer to look up.
@@ -91,7 +91,7 @@ def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
             f"{degauss.steps} (condition.degauss_steps): build them again, or set it to 0",
         )
     try:
-        recipe = find(book, target, context.active.planner)
+        recipe = context.active.corrections.find(target)
     except RecipeError as error:
         raise Refusal(ErrorCode.OUT_OF_RANGE, f"mode CONDITIONED: {error}") from error
     return replace(_after_degauss(target, context, recipe), mode=_CONDITIONED)

@@ -10,9 +10,8 @@ model promises and from what the recipes show: their corrections, and what is mi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,14 +86,19 @@ def _alike(one: Floats, other: Floats) -> Floats:
 
 
 class Corrections:
-    """The corrections that the recipes of one calibration show.
+    """The corrections that the recipes of `book` show on the mirror of `planner`.
+
+    Raises:
+        RecipeError: there are none.
 
     Attributes:
         amplitude: m, bound of the largest coefficient that a correction makes where no recipe is near.
     """
 
-    def __init__(self, recipes: Sequence[Recipe], planner: Planner) -> None:
-        self._mirror, self._recipes = planner.mirror, recipes
+    def __init__(self, book: RecipeBook, planner: Planner) -> None:
+        if not book.recipes:
+            raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
+        self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
         self._own = np.array([planner.mirror.command(target_of(recipe))[0] for recipe in recipes])
         self._corrections = np.array([recipe.effective for recipe in recipes]) - self._own
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
@@ -169,21 +173,3 @@ def _same(recipe: Recipe, target: FocusTarget) -> bool:
         and abs(recipe.conic_constant - target.conic_constant) <= SAME_CONIC
         and not any(target.zernike)
     )
-
-
-@lru_cache(maxsize=4)
-def corrections(book: RecipeBook, planner: Planner) -> Corrections:
-    """Those of `book` on the mirror of `planner`. Raises RecipeError when it is empty."""
-    if not book.recipes:
-        raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
-    return Corrections(book.recipes, planner)
-
-
-def find(book: RecipeBook, target: FocusTarget, planner: Planner) -> FoundRecipe:
-    """What makes `target` on the mirror of `planner`, by recipes near it. Raises RecipeError when there are none."""
-    return corrections(book, planner).find(target)
-
-
-def worst_error(book: RecipeBook, planner: Planner) -> float:
-    """m, bound of the largest coefficient error at recipes and halfway between neighbours; 0 = no recipes."""
-    return corrections(book, planner).worst if book.recipes else 0.0
