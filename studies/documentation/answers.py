@@ -21,7 +21,7 @@ from dm_msgs.msg import ActuatorState, FocusState
 from dm_client.connection import Connection
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
-from dm_common.ros.worker import answers_arrive, call
+from dm_common.ros.clients import answers_arrive, call
 from studies.documentation.answer_cases import CASES
 
 #: Topics that carry commands: where their answers come.

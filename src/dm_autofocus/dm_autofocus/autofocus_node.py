@@ -19,9 +19,10 @@ from dm_autofocus.search.peak_search import Phase
 from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import diagnostics, qos
+from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.executor import run_node
 from dm_common.ros.parameters import declare
-from dm_common.ros.worker import ServiceCallError, WorkerService, call, never_silent
+from dm_common.ros.worker import WorkerService, never_silent
 from dm_common.values import Fields, real, without_figures
 
 SET_FOCUS_DISTANCE = Fields(

@@ -24,8 +24,7 @@ from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
-from dm_common.ros.clients import MirrorHolder
-from dm_common.ros.worker import ServiceCallError
+from dm_common.ros.clients import MirrorHolder, ServiceCallError
 
 #: As cameras publish; depth 1: an image that was not fetched in time is dropped for the next.
 IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)

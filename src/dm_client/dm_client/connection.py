@@ -15,10 +15,9 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
-from dm_common.ros.clients import ThreadedActionClient
+from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, answers_arrive, call
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.qos import Liveliness
-from dm_common.ros.worker import ServiceCallError, answers_arrive, call
 
 #: Topics by which the nodes are known to live, and what they serve.
 WATCHED: dict[str, tuple[Any, str, Any, tuple[str, ...]]] = {

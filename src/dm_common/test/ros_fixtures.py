@@ -12,10 +12,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from dm_common.ros.clients import ThreadedActionClient
+from dm_common.ros.clients import ThreadedActionClient, answers_arrive
 from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import BackgroundExecutor
-from dm_common.ros.worker import answers_arrive
 from waiting import wait_until
 
 

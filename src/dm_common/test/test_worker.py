@@ -15,16 +15,8 @@ from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import Flatten, SetSignals
 from std_msgs.msg import Int32
 
-from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.worker import (
-    ServiceCallError,
-    WorkerActionServer,
-    WorkerService,
-    answers_arrive,
-    call,
-    never_silent,
-    sleep,
-)
+from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, answers_arrive, call
+from dm_common.ros.worker import WorkerActionServer, WorkerService, never_silent, sleep
 from dm_common.values import Fields, real
 from ros_fixtures import Observer
 from waiting import wait_until

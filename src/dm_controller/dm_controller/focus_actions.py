@@ -13,8 +13,8 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.worker import WorkerActionServer, WorkerService, answers_arrive, sleep
+from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.worker import WorkerActionServer, WorkerService, sleep
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_parameters import MOVE_FOCUS

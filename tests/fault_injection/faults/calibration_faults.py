@@ -24,8 +24,7 @@ from dm_msgs.msg import ErrorCode
 from dm_calibration.procedure.event_frames import map_hashes, record_hash
 from dm_calibration.procedure.run_journal import read_run
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.worker import answers_arrive
+from dm_common.ros.clients import ThreadedActionClient, answers_arrive
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import RigError
 from fault_injection.rigs.parts import checked

@@ -27,8 +27,8 @@ from rclpy.node import Node
 
 from dm_bringup.nodes import MODULES
 from dm_common.ros import qos
+from dm_common.ros.clients import answers_arrive
 from dm_common.ros.executor import BackgroundExecutor
-from dm_common.ros.worker import answers_arrive
 from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
 from dm_simulation.electronics.drive_unit import DriveConfig
 from dm_simulation.electronics.monitor import MonitorConfig

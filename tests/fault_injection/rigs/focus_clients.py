@@ -24,9 +24,8 @@ from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 
 from dm_common.ros import qos
-from dm_common.ros.clients import ThreadedActionClient
+from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, answers_arrive, call
 from dm_common.ros.executor import BackgroundExecutor
-from dm_common.ros.worker import ServiceCallError, answers_arrive, call
 
 REACH = 0.02
 #: Longest wait for one answer, s: far above what a hundred clients need on a busy machine.

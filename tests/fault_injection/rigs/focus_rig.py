@@ -33,8 +33,8 @@ from dm_bringup.nodes import MODULES
 from dm_common.messages import doubles, limits_from, recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
-from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.worker import WorkerService, answers_arrive
+from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.worker import WorkerService
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
 from fault_injection.fault import FaultRecord

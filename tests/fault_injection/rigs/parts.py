@@ -9,8 +9,7 @@ from typing import Any
 
 from dm_msgs.action import Degauss
 
-from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.worker import answers_arrive
+from dm_common.ros.clients import ThreadedActionClient, answers_arrive
 from fault_injection.fault import FaultRecord
 from fault_injection.rigs.driver_rig import PATIENCE_S, DriverRig
 

@@ -23,8 +23,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.procedure.plan import PlanKind
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.ros import qos
-from dm_common.ros.clients import ThreadedActionClient
-from dm_common.ros.worker import answers_arrive
+from dm_common.ros.clients import ThreadedActionClient, answers_arrive
 from dm_simulation.bench import BenchConfig, FilesConfig
 from dm_simulation.electronics.monitor import MonitorConfig
 from dm_simulation.electronics.server import OFF, PortsConfig

@@ -22,9 +22,9 @@ from rclpy.signals import SignalHandlerOptions
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
-from dm_common.ros.clients import MirrorHolder, ThreadedActionClient, run_goal
+from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, answers_arrive, call, run_goal
 from dm_common.ros.qos import Liveliness
-from dm_common.ros.worker import ServiceCallError, answers_arrive, call, sleep
+from dm_common.ros.worker import sleep
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement

@@ -1,4 +1,4 @@
-"""Clients for threads that may wait: of actions, and one that holds the mirror so that nobody else commands it."""
+"""Clients for threads that may wait: of services, of actions, and one that holds the mirror against others."""
 
 from __future__ import annotations
 
@@ -7,21 +7,68 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from dm_msgs.srv import HoldMirror
 from rclpy.action import ActionClient
+from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.worker import ServiceCallError, answers_arrive, call
 
+#: Time that discovery may take on a busy machine from one side to the other.
+DISCOVERY_S = 0.5
 #: How often a hold is renewed, s: several times within the driver's lease of 3 s.
 RENEW_S = 0.7
 #: Longest wait for the driver to take a hold back, s; else it ends with its lease.
 RELEASE_S = 1.0
 #: Longest wait for the end of a goal that was cancelled, s.
 CANCEL_S = 20.0
+
+_first_seen: WeakKeyDictionary[Any, float] = WeakKeyDictionary()
+
+
+class ServiceCallError(Exception):
+    """A service did not answer: not there, too slow, or the wait was cancelled."""
+
+
+def answers_arrive(client: Any, is_ready: Callable[[], bool]) -> bool:
+    """Whether a service or action server is there, and has had time to discover the client in its turn.
+
+    A server that answers before it knows the client's reader drops the answer; no API says whether it does. So a
+    server counts as there only some time after it was first seen.
+    """
+    if not is_ready():
+        _first_seen.pop(client, None)
+        return False
+    return time.monotonic() >= _first_seen.setdefault(client, time.monotonic()) + DISCOVERY_S
+
+
+def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], bool] = lambda: False) -> Any:
+    """Call a service from a worker thread and wait for the answer.
+
+    Never call this from an executor callback: it would wait for itself.
+
+    Raises:
+        ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, or `cancelled()` became true.
+    """
+    deadline = time.monotonic() + timeout_s
+    while not answers_arrive(client, client.service_is_ready):
+        if cancelled():
+            raise ServiceCallError(f"{client.srv_name}: cancelled")
+        if time.monotonic() > deadline:
+            raise ServiceCallError(f"{client.srv_name}: no such service within {timeout_s:g} s; is its node running?")
+        time.sleep(0.02)
+    done = threading.Event()
+    future = client.call_async(request)
+    future.add_done_callback(lambda _future: done.set())
+    while not done.wait(0.02 if deadline - time.monotonic() > 0.02 else 0.001):
+        if cancelled() or time.monotonic() > deadline:
+            client.remove_pending_request(future)
+            reason = "cancelled" if cancelled() else f"no answer within {timeout_s:g} s"
+            raise ServiceCallError(f"{client.srv_name}: {reason}")
+    return future.result()
 
 
 class ThreadedActionClient(ActionClient):

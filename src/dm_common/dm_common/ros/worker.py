@@ -13,11 +13,9 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -32,14 +30,6 @@ RESULT_TIMEOUT_S = 10
 
 #: Of requests that hold nothing that could be wrong, or are checked by whoever takes them.
 NO_FIELDS = Fields({})
-
-#: Time that discovery may take on a busy machine from one side to the other.
-DISCOVERY_S = 0.5
-_first_seen: WeakKeyDictionary[Any, float] = WeakKeyDictionary()
-
-
-class ServiceCallError(Exception):
-    """A service did not answer: not there, too slow, or the wait was cancelled."""
 
 
 def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
@@ -229,44 +219,6 @@ class WorkerActionServer(ActionServer):
 
         if self._worker_node.executor is not None:
             self._worker_node.executor.create_task(ActionServer.notify_execute, self, goal_handle, finish)
-
-
-def answers_arrive(client: Any, is_ready: Callable[[], bool]) -> bool:
-    """Whether a service or action server is there, and has had time to discover the client in its turn.
-
-    A server that answers before it knows the client's reader drops the answer; no API says whether it does. So a
-    server counts as there only some time after it was first seen.
-    """
-    if not is_ready():
-        _first_seen.pop(client, None)
-        return False
-    return time.monotonic() >= _first_seen.setdefault(client, time.monotonic()) + DISCOVERY_S
-
-
-def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], bool] = lambda: False) -> Any:
-    """Call a service from a worker thread and wait for the answer.
-
-    Never call this from an executor callback: it would wait for itself.
-
-    Raises:
-        ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, or `cancelled()` became true.
-    """
-    deadline = time.monotonic() + timeout_s
-    while not answers_arrive(client, client.service_is_ready):
-        if cancelled():
-            raise ServiceCallError(f"{client.srv_name}: cancelled")
-        if time.monotonic() > deadline:
-            raise ServiceCallError(f"{client.srv_name}: no such service within {timeout_s:g} s; is its node running?")
-        time.sleep(0.02)
-    done = threading.Event()
-    future = client.call_async(request)
-    future.add_done_callback(lambda _future: done.set())
-    while not done.wait(0.02 if deadline - time.monotonic() > 0.02 else 0.001):
-        if cancelled() or time.monotonic() > deadline:
-            client.remove_pending_request(future)
-            reason = "cancelled" if cancelled() else f"no answer within {timeout_s:g} s"
-            raise ServiceCallError(f"{client.srv_name}: {reason}")
-    return future.result()
 
 
 def wait_for_clock(clock: Clock, timeout_s: float = 10.0) -> None:

@@ -21,7 +21,8 @@ from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
 from dm_common.ros.bench_services import told_by
-from dm_common.ros.worker import ServiceCallError, call, wait_for_clock
+from dm_common.ros.clients import ServiceCallError, call
+from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.goals import ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench

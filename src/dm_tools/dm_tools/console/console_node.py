@@ -22,8 +22,8 @@ from dm_client.connection import Connection, DeformableMirrorError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
+from dm_common.ros.clients import answers_arrive
 from dm_common.ros.diagnostics import hear_log
-from dm_common.ros.worker import answers_arrive
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.long_actions import LONG, ExternalGoals
 

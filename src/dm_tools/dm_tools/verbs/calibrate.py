@@ -88,7 +88,7 @@ def start_fresh(client: Any, fresh: bool = True) -> None:
     from rclpy.parameter_client import AsyncParameterClient
 
     from dm_client import DeformableMirrorError
-    from dm_common.ros.worker import answers_arrive
+    from dm_common.ros.clients import answers_arrive
 
     parameters = AsyncParameterClient(client.node, "calibration")
     if not client.wait(lambda: answers_arrive(parameters, parameters.services_are_ready)):
