@@ -37,13 +37,9 @@ def recipe_targets(
             raise RecipeError(f"curvatures: {one:+.4f} 1/m is there twice; each recipe once")
     targets = [FocusTarget(curvature, conic_constant) for curvature in ordered]
     for target in targets:
-        left = loop.mirror.plan(target).max_zernike
+        left = loop.mirror.command(target)[1]
         if left > error_max:
-            low, high = loop.mirror.reachable_range(target, error_max)
-            raise UnreachableError(
-                f"curvature = {target.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error of "
-                f"{left * 1e9:.1f} nm (allowed {error_max * 1e9:.1f} nm); reachable: {low:+.4f} to {high:+.4f} 1/m"
-            )
+            raise UnreachableError(target.denied(left, error_max, loop.mirror.reachable_range(target, error_max)))
     return targets
 
 

@@ -26,7 +26,6 @@ from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.goals import ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench
-from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget
 
 #: A model that leaves a larger coefficient error of a curvature, m, cannot reach it.
@@ -80,10 +79,9 @@ class RecipeRun:
         """
         goal, bench = handle.request, self._bench
         options = self._options(goal)
-        target = FocusTarget(0.0, goal.conic_constant)
         active = bench.host.active_calibration()
         planner, calibration = active.planner, active.calibration
-        targets = self._targets(goal, target, planner)
+        targets = recipe_targets(goal.curvatures, goal.conic_constant, planner, UNREACHABLE_ERROR)
         steps = self._values["recipes.degauss_steps"]
         active.recipes.check_condition(steps)
         bench.check_ready()
@@ -159,9 +157,6 @@ class RecipeRun:
         average = min(values["recipes.average"], max(maps // 4, 2))
         tolerance = goal.tolerance or values["recipes.tolerance"]
         return BuildOptions(tolerance, maps, average, float(values["converge.settle_time"]))
-
-    def _targets(self, goal: Any, target: FocusTarget, planner: Planner) -> list[FocusTarget]:
-        return recipe_targets(list(goal.curvatures), target.conic_constant, planner, UNREACHABLE_ERROR)
 
     def _guess(self, law: HysteresisModel, now: float, middle: float) -> HysteresisState | None:
         """The mirror long rested where the driver says it stands; None when it does not say."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -138,13 +137,5 @@ def _after_degauss(target: FocusTarget, context: PlanningContext, recipe: FoundR
 
 def unreachable(move: Move, active: ActiveCalibration, tolerance: float) -> Refusal:
     """That the limits leave a larger coefficient error than `tolerance` (m), and what they permit."""
-    low, high = active.reachable_range(move.target, tolerance)
-    if math.isnan(low):
-        text = "no curvature is reachable with these added Zernike terms"
-    else:
-        text = f"reachable: {low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
-    return Refusal(
-        ErrorCode.UNREACHABLE,
-        f"curvature = {move.target.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error "
-        f"of {move.max_zernike * 1e9:.1f} nm (allowed {tolerance * 1e9:.1f} nm); {text}",
-    )
+    reachable = active.reachable_range(move.target, tolerance)
+    return Refusal(ErrorCode.UNREACHABLE, move.target.denied(move.max_zernike, tolerance, reachable))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +78,24 @@ class FocusTarget:
         if self.zernike:
             result = result + basis(x, y) @ np.asarray(self.zernike)
         return result
+
+    def denied(self, error: float, allowed: float, reachable: tuple[float, float]) -> str:
+        """That limits deny it, as a sentence.
+
+        Args:
+            error: largest coefficient error that they leave, m.
+            allowed: how large it may be, m.
+            reachable: the curvatures that they permit, 1/m; NaN = none.
+        """
+        low, high = reachable
+        if math.isnan(low):
+            text = "no curvature is reachable with these added Zernike terms"
+        else:
+            text = f"reachable: {low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
+        return (
+            f"curvature = {self.curvature:+.4f} 1/m: the limits of the actuators leave a coefficient error of "
+            f"{error * 1e9:.1f} nm (allowed {allowed * 1e9:.1f} nm); {text}"
+        )
 
     def with_curvature(self, curvature: float) -> FocusTarget:
         """The same target at another curvature."""
