@@ -23,6 +23,7 @@ from dm_msgs.msg import (
 from dm_msgs.srv import SetFocus
 from numpy.typing import NDArray
 
+from dm_common.errors import ErrorCode
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 from dm_common.messages import doubles, recipe_book_message, time_message
 from dm_common.recipes import Recipe, RecipeBook
@@ -121,6 +122,8 @@ class Bench:
         self.calibration.publish(message or calibration())
         wait_until(lambda: self.capabilities and self.capabilities[-1].calibration_id == "known", 60)
         self.activate()
+        # A request must not overtake the driver's first report.
+        wait_until(lambda: self.capabilities[-1].error_code == ErrorCode.OK, 60)
         return self
 
     def fall_silent(self) -> None:
