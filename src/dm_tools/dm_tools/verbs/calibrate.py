@@ -294,3 +294,7 @@ def calibrate(
         next_step("the same without --dry-run measures")
     elif result.id:
         next_step("./dm focus 0.02")
+    elif result.poke_check_passed:
+        next_step("./dm calibrate")
+    elif result.parameters:
+        next_step(f"start the nodes with {write or 'these parameters'}, and check again")

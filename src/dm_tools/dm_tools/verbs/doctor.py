@@ -41,4 +41,4 @@ def doctor(
         next_step(f"the cure{'s' if wrong > 1 else ''} above, then ./dm doctor again")
         raise typer.Exit(1)
     running = findings["nodes that are running"]
-    next_step("./dm status" if running and not running["cure"] else "./dm up")
+    next_step("./dm status" if running and not running["cure"] else f"./dm up{f' --config {config}' if config else ''}")
