@@ -82,8 +82,7 @@ class CalibrateAction:
         result.maps_dropped = len(result.dropped)
         result.duration = (clock.now() - started).nanoseconds * 1e-9
         if result.error_code == ErrorCode.OK:
-            done = f"calibration {result.id}" if result.id else "poke check"
-            self._node.get_logger().info(f"{done}: {result.message}")
+            self._node.get_logger().info(f"{result.id or 'poke check'}: {result.message}")
             return "succeed", result
         self._node.get_logger().warning(f"calibration ended with code {result.error_code}: {result.message}")
         return ("canceled" if result.error_code == ErrorCode.CANCELED else "abort"), result
