@@ -81,12 +81,7 @@ class WorkerService:
     """
 
     def __init__(
-        self,
-        node: Node,
-        srv_type: Any,
-        name: str,
-        callback: Callable[[Any, Any], Any],
-        fields: Fields = NO_FIELDS,
+        self, node: Node, srv_type: Any, name: str, callback: Callable[[Any, Any], Any], fields: Fields = NO_FIELDS
     ) -> None:
         self._node = node
         self._callback = never_silent(node, name, callback, fields)
@@ -122,7 +117,7 @@ class WorkerActionServer(ActionServer):
     Args:
         exclusive: "refuse" refuses a goal while another runs; "preempt" asks the running goal to stop and starts the
             newest one after it.
-        fields, admit: of the goal, and what raises the Refusal of one; that aborts it, and no other goal hears of it.
+        fields, admit: of the goal, and what raises the Refusal of one and logs it; that aborts it, no other goal hears.
     """
 
     def __init__(
@@ -180,10 +175,13 @@ class WorkerActionServer(ActionServer):
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
         """Run the body in a thread; rclpy's own execution only publishes the outcome, when it is there."""
         try:
-            self._fields.check(goal_handle.request)
+            try:
+                self._fields.check(goal_handle.request)
+            except Refusal as refusal:
+                self._worker_node.get_logger().warning(f"goal refused: {refusal}")
+                raise
             self._admit(goal_handle.request)
         except Refusal as refusal:
-            self._worker_node.get_logger().warning(f"goal refused: {refusal}")
             with self._bookkeeping:
                 self._running -= 1
             result = without_figures(self._action_type.Result())

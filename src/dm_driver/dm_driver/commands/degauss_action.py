@@ -46,7 +46,7 @@ class DegaussAction:
         return goal.amplitude, steps, end, self._values["degauss.duration_max"], name
 
     def _admit(self, goal: Any) -> None:
-        """Raise the Refusal of a goal that may not be: it must not end the one that runs."""
+        """Raise the Refusal, which the gate logs, of a goal that may not be: it must not end the one that runs."""
 
         def judge(_writer: ActuatorWriter, configuration: DriverConfiguration) -> None:
             degauss_move(configuration.limiter.limits, *self._cycle(goal, configuration))
