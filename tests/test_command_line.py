@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import re
 import subprocess
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -86,7 +89,7 @@ def test_figures_on_standard_output_stand_alone(capsys: pytest.CaptureFixture[st
 def test_exit_codes(
     error: BaseException, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fails(**_keywords: Any) -> None:
+    def fails(*_words: Any, **_keywords: Any) -> None:
         raise error
 
     monkeypatch.setattr(cli, "app", fails)
@@ -176,3 +179,28 @@ def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> Non
     os.utime(older / "b.h5", (0, 0))
     assert folder_with("b", (newer, older)) == older
     assert folder_with("", (older, newer)) == folder_with("d", (older, newer)) == newer
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["dm", "--help"], 0, r"Usage: ros2 dm .*calibrate.*flatten"),
+        (["dm", "focus", "--help"], 0, r"Usage: ros2 dm focus .*--take-over"),
+        (["dm", "focus", "-0.02", "--dry-rn"], 2, "No such option: --dry-rn"),
+    ],
+)
+def test_it_is_a_command_of_ros2_too(
+    words: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (entry_point,) = entry_points(group="ros2cli.command", name="dm")
+    command = entry_point.load()()
+    parser = argparse.ArgumentParser(prog="ros2")  # as ros2cli has it
+    own = parser.add_subparsers().add_parser("dm")
+    own.set_defaults(command=command)
+    command.add_arguments(own, "ros2 dm")
+    with pytest.raises(SystemExit) as ended:
+        arguments = parser.parse_args(words)
+        arguments.command.main(parser=parser, args=arguments)
+    shown = capsys.readouterr()
+    assert ended.value.code == status
+    assert re.search(said, shown.out + shown.err, re.DOTALL)

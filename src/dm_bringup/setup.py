@@ -11,7 +11,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
-        (f"share/{package_name}/launch", [str(path) for path in Path("launch").glob("*.launch.py")]),
+        (f"share/{package_name}/launch", [str(path) for path in Path("launch").glob("*.*")]),
         (f"share/{package_name}/config", [str(path) for path in Path("config").glob("*.*")]),
     ],
     install_requires=["setuptools"],

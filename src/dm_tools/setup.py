@@ -21,5 +21,8 @@ setup(
         "console_scripts": [
             "dm = dm_tools.cli:main",
         ],
+        "ros2cli.command": [
+            "dm = dm_tools.ros2_command:DmCommand",
+        ],
     },
 )

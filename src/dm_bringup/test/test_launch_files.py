@@ -9,6 +9,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
+import yaml
 
 from dm_bringup.nodes import LAUNCH_ARGUMENTS, NAMES, NODES, arguments_of, nodes_of
 from dm_bringup.suite import ConfigError, load_config
@@ -59,6 +60,13 @@ def test_launch_files_start_what_up_starts(
     assert {action.keywords["parameters"][0] for action in actions} == {str(path)}
     with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
         start_nodes(DEFAULTS | {"config": str(tmp_path / "none.yaml")})
+
+
+def test_the_health_of_every_node_has_its_place_in_the_aggregator() -> None:
+    (section,) = yaml.safe_load((SHARE / "launch" / "diagnostics.yaml").read_text()).values()
+    analyzers = [value for value in section["ros__parameters"].values() if isinstance(value, dict)]
+    assert sorted(name for analyzer in analyzers for name in analyzer["contains"]) == sorted(NAMES)
+    assert all(analyzer["timeout"] > 2.0 and analyzer["path"] for analyzer in analyzers)
 
 
 def test_what_a_fleet_sets_reaches_every_node() -> None:

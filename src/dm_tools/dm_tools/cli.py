@@ -105,12 +105,21 @@ def make_app() -> typer.Typer:
 app = make_app()
 
 
-def main() -> None:
-    """Entry point of `dm`."""
+def run(words: list[str], name: str) -> None:
+    """Run the command with these words, and end the process with its exit status.
+
+    Args:
+        name: by which it was called.
+    """
     try:
-        app(prog_name="dm")
+        app(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
         fail(str(error))
         sys.exit(NOT_RUNNING if isinstance(error, NotRunningError) else REFUSED)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def main() -> None:
+    """Entry point of `dm`."""
+    run(sys.argv[1:], "dm")
