@@ -59,22 +59,21 @@ class CalibrateAction:
         self._driver_facts, self._enough = driver_facts, GoodEnough(0.0)
 
     def run(self, handle: ServerGoalHandle) -> tuple[str, Calibrate.Result]:
-        result = Calibrate.Result()
+        goal, result = handle.request, Calibrate.Result()
         clock = self._node.get_clock()
         started = clock.now()
         try:
             mirror = self._manager.known_mirror(wait_s=START_GRACE_S)
             wait_for_clock(clock)
             started = clock.now()
-            plan, options = self._planned(handle.request, mirror)
-            self._forecast(handle.request, plan, mirror, result)
-            if handle.request.dry_run:
+            plan, options = self._planned(goal, mirror)
+            self._forecast(goal, plan, mirror, result)
+            if goal.dry_run:
                 return "succeed", result
             self._services.check_ready()
-            self._services.settle_time = handle.request.settle_time or self._values["settle_time"]
+            self._services.settle_time = goal.settle_time or self._values["settle_time"]
             self._services.cancelled = lambda: bool(handle.is_cancel_requested)
-            purpose = "cancel the action calibrate to end it"
-            held = self._services.held(handle.request, purpose, result.expected_duration)
+            held = self._services.held(goal, "cancel the action calibrate to end it", result.expected_duration)
             with UnfinishedRuns(self._manager.store.folder) as runs, held:
                 self._run_kept(handle, plan, options, mirror, runs, result)
         except EXPECTED as error:

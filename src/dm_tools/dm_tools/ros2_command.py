@@ -15,7 +15,7 @@ class DmCommand:
         def print_help(_file: Any = None) -> None:
             self._run(["--help"], cli_name)
 
-        parser.print_help = print_help  # type: ignore[method-assign]
+        parser.print_help = print_help  # type: ignore[method-assign, assignment]
         parser.add_argument("words", nargs=argparse.REMAINDER)
         parser.set_defaults(cli_name=cli_name)
 
