@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
-from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, tilt_influence
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, curvature_of_defocus, tilt_influence
 from dm_controller.planning.target import FocusTarget
 
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
@@ -261,12 +261,12 @@ class CalibratedMirror:
         if self.command(target)[1] > tolerance:
             # A mirror that is only pulled does not reach 0.
             defocus = model.zernike_offset[3] + self.limits.middle * model.influence_zernike[3].sum()
-            near = 4.0 * float(defocus) / model.aperture_radius**2
+            near = curvature_of_defocus(float(defocus), model.aperture_radius)
             if self.command(target.with_curvature(near))[1] > tolerance:
                 return (float("nan"), float("nan"))
-        # Beyond this the stroke of all actuators together could not follow (defocus of a sphere is c r^2 / 4).
-        defocus_stroke = float(np.abs(model.influence_zernike[3]).sum())
-        far = 4.0 * (self.limits.high - self.limits.low) * defocus_stroke / model.aperture_radius**2
+        # Beyond this the stroke of all actuators together could not follow.
+        stroke = (self.limits.high - self.limits.low) * float(np.abs(model.influence_zernike[3]).sum())
+        far = curvature_of_defocus(stroke, model.aperture_radius)
         return (self._bisect(target, near, near - far, tolerance), self._bisect(target, near, near + far, tolerance))
 
     def _bisect(self, target: FocusTarget, near: float, far: float, tolerance: float) -> float:
