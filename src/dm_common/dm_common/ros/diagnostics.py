@@ -17,6 +17,8 @@ OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
 STALE = DiagnosticStatus.STALE
+#: How often health is published, s.
+PERIOD_S = 1.0
 #: Names of the levels of rcl_interfaces/Log.
 LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 
@@ -33,12 +35,12 @@ class Health:
 class Diagnostics:
     """Publish `check()` on `/diagnostics` once a second of wall time, whatever ROS time does."""
 
-    def __init__(self, node: Node, hardware_id: str, check: Callable[[], Health], period_s: float = 1.0) -> None:
+    def __init__(self, node: Node, hardware_id: str, check: Callable[[], Health]) -> None:
         self._node = node
         self._check = check
         self.hardware_id = hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(period_s, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = node.create_timer(PERIOD_S, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish(self) -> None:
         """Publish now."""

@@ -28,6 +28,8 @@ from dm_common.values import Fields, without_figures
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
 RESULT_TIMEOUT_S = 10
 
+#: Longest wait for a simulator's first message on /clock, s.
+CLOCK_S = 10.0
 #: Of requests that hold nothing that could be wrong, or are checked by whoever takes them.
 NO_FIELDS = Fields({})
 
@@ -219,16 +221,16 @@ class WorkerActionServer(ActionServer):
             self._worker_node.executor.create_task(ActionServer.notify_execute, self, goal_handle, finish)
 
 
-def wait_for_clock(clock: Clock, timeout_s: float = 10.0) -> None:
+def wait_for_clock(clock: Clock) -> None:
     """Wait in a worker thread until ROS time runs: simulated time stands at 0 until the first message on /clock.
 
     Raises:
-        TimeoutError: no time within `timeout_s`.
+        TimeoutError: no time within CLOCK_S.
     """
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + CLOCK_S
     while clock.now().nanoseconds == 0:
         if time.monotonic() > deadline:
-            raise TimeoutError(f"use_sim_time is set, but nothing came on /clock within {timeout_s:g} s")
+            raise TimeoutError(f"use_sim_time is set, but nothing came on /clock within {CLOCK_S:g} s")
         time.sleep(0.01)
 
 
