@@ -9,3 +9,5 @@ with CameraFocusClient() as camera:
     camera.focus_dioptre(0.1)  # 1 / distance, as libcamera and Android count
     found = camera.autofocus(region=(0.0, 0.2, 0.3, 0.6))  # left, top, width, height as shares of the image
     print(f"sharpest at {found.distance:.2f} m after {found.images} images")
+    result, image, depth = camera.focus_stack()  # sharp everywhere, and metres for each pixel
+    print(f"{100 * result.share:.0f} % of the pixels from {result.distance_near:.2f} to {result.distance_far:.2f} m")

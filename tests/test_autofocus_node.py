@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,16 @@ import defocused_camera
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
-from dm_msgs.action import Autofocus
+from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import GetFocusRange, HoldMirror, SetFocus, SetFocusDistance
 from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
 from sensor_msgs.msg import CameraInfo, Image
 
+from dm_autofocus import CameraFocusClient
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
+from dm_client import DeformableMirrorError
 from dm_common.ros import qos
 from support import NodeProcess, Observer, wait_until
 
@@ -51,6 +54,7 @@ class FilmedScene:
         self.requests: list[FocusRequest] = []
         self.history_known = False
         self.render: Callable[[float], np.ndarray] | None = None  # a curvature's image, instead of the plane's
+        self.stamped = True
         self.texture = 100 + 40 * np.random.default_rng(5).standard_normal((48, 64))
         self._lock = threading.Lock()
         self._noise = np.random.default_rng(6)
@@ -129,7 +133,9 @@ class FilmedScene:
     def _publish_image(self, pixels: np.ndarray, exposed: Any) -> None:
         height, width = pixels.shape
         message = Image(height=height, width=width, encoding="mono8", step=width)
-        message.header.stamp = exposed
+        message.header.frame_id = "camera"
+        if self.stamped:
+            message.header.stamp = exposed
         message.data = array.array("B", pixels.tobytes())
         self._image.publish(message)
 
@@ -180,6 +186,53 @@ def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer:
     assert found.images <= 10 and len(scene.requests) <= found.images + 1, "nothing is passed without an image"
 
 
+def test_a_focus_stack_gives_a_sharp_image_and_its_distances(
+    scene: FilmedScene, observer: Observer, domain: int
+) -> None:
+    """Two planes side by side, at 7 m and at 20 m."""
+    lens, near, far = defocused_camera.LENS, OPTICS.curvature_for(1 / 7), OPTICS.curvature_for(1 / 20)
+    halves = [
+        defocused_camera.DefocusedCamera(defocused_camera.clouds(seed), place) for seed, place in ((1, near), (2, far))
+    ]
+    side = defocused_camera.SIDE // 2
+
+    @cache
+    def render(curvature: float) -> np.ndarray:
+        left, right = (camera.expose(curvature) for camera in halves)
+        return np.hstack([left[:, :side], right[:, side:]]).astype(np.uint8)
+
+    scene.aperture(lens.aperture_radius)
+    scene.render = render
+    infos = observer.record(CameraInfo, "focus_stack/camera_info", qos.LATCHED)
+    scene.request.publish(FocusRequest(curvature=0.004))
+    wait_until(lambda: scene.states[-1].curvature == 0.004, what="the focus that was there before")
+    with CameraFocusClient(domain=domain) as client:
+        result, image, depth = client.focus_stack()
+        assert image.shape == (2 * side, 2 * side, 1) and depth.shape == (2 * side, 2 * side)
+        for distance, columns in ((7.0, np.s_[12 : side - 12]), (20.0, np.s_[side + 12 : -12])):
+            seen = depth[12:-12, columns]
+            assert np.isfinite(seen).mean() > 0.9
+            assert np.nanmedian(seen) == pytest.approx(distance, rel=0.02)
+        assert (result.distance_near, result.distance_far) == (pytest.approx(7, rel=0.05), pytest.approx(20, rel=0.05))
+        assert result.images == len(set(item.curvature for item in scene.requests)) - 1, "one image at each focus"
+        assert scene.requests[-1].curvature == 0.004, "back where it was"
+        wait_until(lambda: infos, what="camera_info")
+        assert (infos[-1].header.stamp, infos[-1].header.frame_id) == (result.stamp, "camera")
+        with pytest.raises(DeformableMirrorError, match="images = 3: must be 5"):
+            client.focus_stack(images=3)
+        scene.render = lambda _curvature: np.full((48, 64), 255, np.uint8)
+        with pytest.raises(DeformableMirrorError, match=r"no texture.* largest value, 255") as blank:
+            client.focus_stack(images=5)
+        assert blank.value.error_code == ErrorCode.NOT_CONVERGED
+
+
+def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer) -> None:
+    scene.stamped = False
+    wait_until(lambda: scene.states[-1].header.stamp.sec == 0, what="an image without a stamp")
+    found = observer.run_goal(FocusStack, "focus_stack", FocusStack.Goal()).result
+    assert found.error_code == ErrorCode.TIMEOUT and "no stamp" in found.message
+
+
 def test_what_the_controller_refuses_is_left_out(scene: FilmedScene, observer: Observer) -> None:
     scene.refuse_beyond = 0.043
     found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
@@ -207,6 +260,8 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedSce
         return last.phase == AutofocusState.PHASE_TRACK and abs(last.curvature + 0.03) < 0.002
 
     wait_until(on_it, 60, "tracking of the moved object")
+    stack = observer.run_goal(FocusStack, "focus_stack", FocusStack.Goal()).result
+    assert (stack.error_code, stack.message) == (ErrorCode.BUSY, "the action autofocus is running; cancel it first")
     handle.cancel_goal_async()
     wait_until(result.done, what="the end after cancel")
     assert result.result().status == GoalStatus.STATUS_CANCELED
@@ -281,3 +336,4 @@ def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) 
     )
     assert done.returncode == 0, done.stderr
     assert f"sharpest at {distance_of(OPTICS.dioptre_for(0.0173)):.1f}" in done.stdout
+    assert "of the pixels from" in done.stdout

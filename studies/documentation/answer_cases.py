@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dm_msgs.action import Autofocus, BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
+from dm_msgs.action import Autofocus, BuildRecipes, Calibrate, Converge, Degauss, FocusStack, MoveFocus
 from dm_msgs.msg import ActuatorCommand, FocusRequest
 from dm_msgs.srv import (
     FitInfluenceFunction,
@@ -291,5 +291,9 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
             "curvature_min: 0.02, curvature_max: -0.02",
             "curvature_min: -1.0, curvature_max: 1.0",
         ),
+    ),
+    "focus_stack": (
+        FocusStack,
+        ("images: 12", "images: 4", "images: 1001", "curvature_min: .nan", "curvature_min: 0.02, curvature_max: -0.02"),
     ),
 }

@@ -43,8 +43,8 @@ a refused request are NaN.
 A program asks by the topic `focus_request` or the service `set_focus` (`dry_run` predicts only), moves with the action
 `move_focus`, and finds what the mirror can do on the latched topic `capabilities`. `actuator_command`, `set_signals`
 and `degauss` go below the controller; `calibrate`, `converge` and `build_recipes` are actions with an interferometer,
-`autofocus` and `set_focus_distance` with a camera. Every refusal carries an `error_code` and a sentence with the value
-and the allowed range.
+`autofocus`, `focus_stack` and `set_focus_distance` with a camera. Every refusal carries an `error_code` and a sentence
+with the value and the allowed range.
 
 ## Nodes
 
@@ -59,7 +59,7 @@ DUTIES = {
     "calibration": "measures influence function, hysteresis and creep, checks the wiring, follows later maps",
     "focus_controller": "curvature, conic constant and Zernike terms in, commands out: bounded least squares, then the "
     "inverse of hysteresis and creep",
-    "autofocus": "camera images in, focus requests out: search, tracking, focus by distance",
+    "autofocus": "camera images in, focus requests out: search, tracking, focus by distance, depth images",
 }
 
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from dm_msgs.action import Autofocus
-from dm_msgs.msg import Capabilities
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_autofocus.autofocus_parameters import focus_lens, search_config
-from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
-from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
+from dm_autofocus.focus_probe import SharpnessSample
+from dm_autofocus.images import exposure_fault, grey
+from dm_autofocus.optics import depth_of_focus, distance_of
+from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
@@ -25,23 +23,10 @@ from dm_autofocus.search.tracking import TrackConfig, Tracker
 from dm_autofocus.sharpness import Region, check_region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.optics.zernike import curvature_of_defocus
-from dm_common.ros.worker import WorkerActionServer
 from dm_common.values import Fields, real, reals
 
-#: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
-MARGIN = 0.002
 #: Uncertainty of the mirror's curvature with which it stands where it is sent, in depths of focus.
 TRUSTED = 2.0
-
-
-def ready_capabilities(probe: FocusProbe) -> Capabilities:
-    """The mirror's capabilities. Raises Refusal when it cannot be focused."""
-    capabilities = probe.capabilities
-    if capabilities is None:
-        raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
-    if capabilities.quality == Capabilities.UNCALIBRATED:
-        raise Refusal(capabilities.error_code or ErrorCode.NOT_CALIBRATED, capabilities.message)
-    return capabilities
 
 
 AUTOFOCUS = Fields(
@@ -49,84 +34,31 @@ AUTOFOCUS = Fields(
 )
 
 
-class AutofocusAction:
-    """Serves `autofocus` in worker threads; the newest goal pre-empts.
+class AutofocusAction(ProbeAction):
+    """Serves `autofocus`."""
 
-    Args:
-        node: hosts the action.
-        probe: moves and measures.
-        values: parameters of the node.
-        optics: from curvatures to distances.
-        publish: (phase, sample): publishes an image that counted.
-    """
+    def __init__(self, node: Node, *shared: Any) -> None:
+        super().__init__(node, Autofocus, "autofocus", AUTOFOCUS, *shared)
 
-    def __init__(
-        self,
-        node: Node,
-        probe: FocusProbe,
-        values: Mapping[str, Any],
-        optics: FocusOptics,
-        publish: Callable[[Phase, SharpnessSample], None],
-    ) -> None:
-        self._log = node.get_logger()
-        self._probe = probe
-        self._values = values
-        self._optics = optics
-        self._publish = publish
-        self._server = WorkerActionServer(
-            node, Autofocus, "autofocus", self._run, exclusive="preempt", fields=AUTOFOCUS
-        )
-
-    @property
-    def busy(self) -> bool:
-        """Whether a goal is running."""
-        return self._server.busy
-
-    def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
-        started = time.monotonic()
-        result = Autofocus.Result()
-        self._probe.start()
-        try:
-            config, region = self._config(goal_handle.request)
-            with self._probe.held(goal_handle.request):
-                peak, config, swept = self._search(goal_handle, config, region)
-                self._fill(result, peak)
-                if goal_handle.request.track:
-                    self._track(goal_handle, config, region, peak, result)
-            outcome, result.error_code = "succeed", ErrorCode.OK
-            result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}"
-            if swept:
-                result.message += f"; the range was swept: {swept}"
-            if peak.at_limit:
-                result.message += "; at the end of the range: the object may lie beyond it"
-        except Refusal as error:
-            outcome = "canceled" if error.error_code == ErrorCode.CANCELED else "abort"
-            result.error_code, result.message = error.error_code, str(error)
-        finally:
-            self._probe.release()
-        result.images, result.images_dropped = self._probe.counted, self._probe.dropped
-        result.duration = time.monotonic() - started
-        return outcome, result
-
-    def _config(self, goal: Any) -> tuple[SearchConfig, Region]:
-        """The search that a goal asks for. Raises Refusal."""
+    def _plan(self, goal: Any) -> tuple[SearchConfig, Region]:
         capabilities = ready_capabilities(self._probe)
-        margin = MARGIN * (capabilities.curvature_max - capabilities.curvature_min)
-        low, high = capabilities.curvature_min + margin, capabilities.curvature_max - margin
-        if goal.curvature_min != 0 or goal.curvature_max != 0:
-            wanted = (goal.curvature_min, goal.curvature_max)
-            if not (low - margin <= wanted[0] < wanted[1] <= high + margin):
-                raise Refusal(
-                    ErrorCode.OUT_OF_RANGE,
-                    f"curvature_min, curvature_max = {wanted[0]:+.4f}, {wanted[1]:+.4f} 1/m: must be a rising range "
-                    f"inside {low:+.4f} to {high:+.4f} 1/m, or both 0",
-                )
-            low, high = max(wanted[0], low), min(wanted[1], high)
+        low, high = range_of(goal, capabilities)
         try:
             region = check_region(goal.region if len(goal.region) else self._values["region"])
             return search_config(self._values, capabilities.aperture_radius, low, high), region
         except ValueError as error:
             raise Refusal(ErrorCode.OUT_OF_RANGE, str(error)) from error
+
+    def _carry_out(self, goal_handle: ServerGoalHandle, plan: tuple[SearchConfig, Region], result: Any) -> None:
+        peak, config, swept = self._search(goal_handle, *plan)
+        self._fill(result, peak)
+        if goal_handle.request.track:
+            self._track(goal_handle, config, plan[1], peak, result)
+        result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}"
+        if swept:
+            result.message += f"; the range was swept: {swept}"
+        if peak.at_limit:
+            result.message += "; at the end of the range: the object may lie beyond it"
 
     def _search(
         self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region
@@ -138,6 +70,7 @@ class AutofocusAction:
             reason why the range was swept, "" = it was not.
         """
         before = self._probe.curvature
+        sample: SharpnessSample | None = None
         approach = self._values["search.approach"]
         search = FocusSearch(replace(config, approach=0.0), self._model(config, region), before)
         while not search.done:
@@ -163,10 +96,11 @@ class AutofocusAction:
         if search.peak is None:
             if math.isfinite(before):
                 self._go(goal_handle, before)
+            fault = exposure_fault(sample.regions[0]) if sample else ""
             raise Refusal(
                 ErrorCode.NOT_CONVERGED,
                 "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
-                "the range; the mirror is back where it was",
+                f"the range{fault and '; '}{fault}; the mirror is back where it was",
             )
         self._go(goal_handle, search.step.curvature)
         return search.peak, search.config, search.reason
@@ -180,8 +114,10 @@ class AutofocusAction:
             return "there was no image yet to show its size"
         try:
             lens = focus_lens(self._values, radius, self._probe.camera_info)
-            shape = cut(np.empty((image.height, image.width), np.uint8), region).shape
-            return DefocusModel(shape, lens, config.high - config.low + BEYOND * config.tolerance)
+            pixels = grey(image)
+            # Of a Bayer sensor every second pixel along a side is green.
+            lens = replace(lens, focal_length_px=lens.focal_length_px * pixels.shape[1] / image.width)
+            return DefocusModel(cut(pixels, region).shape, lens, config.high - config.low + BEYOND * config.tolerance)
         except ValueError as error:  # no focal length, or too small
             return str(error)
 
@@ -227,25 +163,6 @@ class AutofocusAction:
                     position = math.nan
                 tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
             self._fill(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
-
-    def _go(self, goal_handle: ServerGoalHandle, curvature: float) -> None:
-        self._probe.move(curvature, lambda: self._stopping(goal_handle))
-        self._check_stop(goal_handle)
-
-    def _measure(self, goal_handle: ServerGoalHandle, region: Region) -> SharpnessSample:
-        sample = self._probe.measure(region, lambda: self._stopping(goal_handle))
-        self._check_stop(goal_handle)
-        assert sample is not None  # only a stop leaves without one
-        return sample
-
-    def _stopping(self, goal_handle: ServerGoalHandle) -> bool:
-        return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
-
-    def _check_stop(self, goal_handle: ServerGoalHandle) -> None:
-        if goal_handle.is_cancel_requested:
-            raise Refusal(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
-        if self._server.preempted(goal_handle):
-            raise Refusal(ErrorCode.PREEMPTED, "a newer goal took over")
 
     def _report(
         self,

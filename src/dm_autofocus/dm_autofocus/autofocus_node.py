@@ -11,10 +11,13 @@ from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from dm_autofocus.autofocus_action import AutofocusAction, ready_capabilities
+from dm_autofocus.autofocus_action import AutofocusAction
 from dm_autofocus.autofocus_parameters import PARAMETERS, focus_optics, tolerance_of
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
+from dm_autofocus.focus_stack_action import FocusStackAction
+from dm_autofocus.images import exposure_fault
 from dm_autofocus.optics import dioptre_of, distance_of
+from dm_autofocus.probe_action import ready_capabilities
 from dm_autofocus.search.peak_search import Phase
 from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode, Refusal
@@ -40,7 +43,8 @@ class AutofocusNode(Node):
         self._probe = FocusProbe(self, self._values)
         self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.STATE)
         self._set_focus = self.create_client(SetFocus, "set_focus")
-        self._action = AutofocusAction(self, self._probe, self._values, self._optics, self._publish)
+        for action in (AutofocusAction, FocusStackAction):
+            action(self, self._probe, self._values, self._optics, self._publish)
         WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance, SET_FOCUS_DISTANCE)
         answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
         self.create_service(GetFocusRange, "get_focus_range", answer)
@@ -62,8 +66,8 @@ class AutofocusNode(Node):
                 ErrorCode.INVALID_ARGUMENT,
                 f"distance = {request.distance:g} m and dioptre = {request.dioptre:g} 1/m: give one of them",
             )
-        if self._action.busy and not request.take_over:
-            raise Refusal(ErrorCode.BUSY, "a search or tracking (action autofocus) is running; cancel it first")
+        if not request.take_over:
+            self._probe.refuse_if_used()
         response.dioptre = dioptre_of(request.distance) or request.dioptre
         response.distance = distance_of(response.dioptre)
         response.curvature = self._optics.curvature_for(response.dioptre)
@@ -109,7 +113,7 @@ class AutofocusNode(Node):
     def _publish(self, phase: Phase, sample: SharpnessSample) -> None:
         curvature = self._probe.curvature
         state = AutofocusState(phase=int(phase), sharpness=sample.sharpness, curvature=curvature, power=2 * curvature)
-        state.header = sample.header
+        state.header = sample.image.header
         state.dioptre = self._optics.dioptre_for(curvature) if math.isfinite(curvature) else math.nan
         state.distance = distance_of(state.dioptre)
         self._state.publish(state)
@@ -117,12 +121,13 @@ class AutofocusNode(Node):
     def _watch(self) -> None:
         """While idle, a figure of the newest image now and then."""
         image = self._probe.newest
-        if self._action.busy or image is None or image is self._watched:
+        if self._probe.user or image is None or image is self._watched:
             return
         self._watched = image
         try:
-            self._publish(Phase.IDLE, self._probe.sharpness_of(image, check_region(self._values["region"])))
-            self._image_problem = ""
+            sample = self._probe.sharpness_of(image, check_region(self._values["region"]))
+            self._publish(Phase.IDLE, sample)
+            self._image_problem = exposure_fault(sample.regions[0])
         except (Refusal, ValueError) as error:
             self._image_problem = str(error)
             self.get_logger().warning(self._image_problem, throttle_duration_sec=5.0)
@@ -137,7 +142,7 @@ class AutofocusNode(Node):
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, self._image_problem)
         except Refusal as error:
             return diagnostics.Health(diagnostics.WARN, str(error), values)
-        return diagnostics.Health(diagnostics.OK, "searching or tracking" if self._action.busy else "ready", values)
+        return diagnostics.Health(diagnostics.OK, self._probe.user or "ready", values)
 
 
 def main() -> int:

@@ -86,6 +86,18 @@ PARAMETERS: Final = (
     ),
     Parameter("track.drop", real(0.3, 0.01, 0.99), "Tracking: relative loss of sharpness that starts a new search."),
     Parameter("track.patience", whole(3, 1, 1000), "Tracking: images in a row that must have lost it."),
+    Parameter(
+        "stack.step",
+        real(4.0, 0.5, 1000.0),
+        "Focus stack: step between its images, in units of the finest step.",
+        live=True,
+    ),
+    Parameter(
+        "stack.cell",
+        whole(4, 2, 256, "px"),
+        "Focus stack: side of the cells that have one distance each; their sharpness is that of three by three.",
+        live=True,
+    ),
 )
 
 

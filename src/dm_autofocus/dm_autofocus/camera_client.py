@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
-from dm_msgs.action import Autofocus
+from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.srv import GetFocusRange, SetFocusDistance
+from numpy.typing import NDArray
+from sensor_msgs.msg import Image
 
-from dm_client import Claim, DeformableMirrorClient
+from dm_autofocus.images import pixels_of
+from dm_client import Claim, DeformableMirrorClient, DeformableMirrorError
+from dm_common.errors import ErrorCode
+from dm_common.ros import qos
 
 
 class CameraFocusClient(DeformableMirrorClient):
@@ -18,6 +23,7 @@ class CameraFocusClient(DeformableMirrorClient):
         "set_focus_distance": SetFocusDistance,
         "get_focus_range": GetFocusRange,
         "autofocus": Autofocus,
+        "focus_stack": FocusStack,
     }
 
     def focus_range(self) -> GetFocusRange.Response:
@@ -59,3 +65,43 @@ class CameraFocusClient(DeformableMirrorClient):
         goal = Autofocus.Goal(region=[float(value) for value in region], **claim)
         goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
         return self.run_action("autofocus", goal, on_feedback, timeout_s)
+
+    def focus_stack(
+        self,
+        *,
+        images: int = 0,
+        curvature_range: tuple[float, float] = (0.0, 0.0),
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 60.0,
+        **claim: Unpack[Claim],
+    ) -> tuple[FocusStack.Result, NDArray, NDArray]:
+        """Sweep the focus through the scene.
+
+        Args:
+            images: of the stack; 0 = as many as the depth of focus asks for.
+            curvature_range: sweep only here [1/m]; (0, 0) = the whole reachable range.
+            on_feedback: called after each image.
+            timeout_s: longest time the stack may take.
+            claim: where somebody holds the mirror.
+
+        Returns:
+            The result; an image that is sharp everywhere, (H, W, channels) in the camera's encoding; distances [m],
+            (H, W): NaN = not known, inf = infinity or beyond the far end of the range, -inf = nearer than its near end.
+        """
+        goal = FocusStack.Goal(images=images, **claim)
+        goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
+        topics = ("focus_stack/image", "focus_stack/depth")
+        for topic in topics:
+            if topic not in self.messages:
+                self.messages[topic] = None
+                self.hear(topic, Image, qos.LATCHED)
+        result = self.run_action("focus_stack", goal, on_feedback, timeout_s)
+
+        def arrived() -> bool:
+            pictures = [self.messages[topic] for topic in topics]
+            return all(picture is not None and picture.header.stamp == result.stamp for picture in pictures)
+
+        if not self.wait(arrived):
+            raise DeformableMirrorError(ErrorCode.TIMEOUT, "the images did not arrive on focus_stack/image and depth")
+        image, depth = (pixels_of(self.messages[topic]) for topic in topics)
+        return result, image, depth[..., 0]

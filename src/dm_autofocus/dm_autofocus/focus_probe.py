@@ -32,10 +32,10 @@ IMAGES = QoSProfile(depth=1, history=HistoryPolicy.KEEP_LAST, reliability=Reliab
 
 @dataclass(frozen=True)
 class SharpnessSample:
-    """Sharpness of an image, the header it came with, and its region (H, W); of several, all regions."""
+    """Sharpness of an image, the message it came with, and its region (H, W); of several, the last and all regions."""
 
     sharpness: float
-    header: Any
+    image: Image
     regions: tuple[NDArray, ...]
 
 
@@ -49,11 +49,12 @@ class FocusProbe:
     Attributes:
         capabilities: the latest; None before the first.
         curvature: as taken last, whoever asked for it [1/m]; NaN before.
-        target: as asked for by `move` last [1/m]; NaN after `release`.
+        user: action that holds the mirror; "" = none does.
+        target: as asked for by `move` last [1/m]; NaN while nobody holds the mirror.
         newest: the latest image; None before the first.
         camera_info: the latest; None before the first.
         answer: of the controller to the latest `move`; None before it.
-        counted, dropped: images since `start`.
+        counted, dropped: images since it was held.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
@@ -67,9 +68,10 @@ class FocusProbe:
         self.counted = self.dropped = 0
         self._driver: ActuatorState | None = None
         self.answer: FocusState | None = None
+        self.user = ""
         self.target = math.nan
         self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
-        self._other_request: float | None = None  # of another node, since `start` [1/m]
+        self._other_request: float | None = None  # of another node, while held [1/m]
         self._measuring = False
         self._fresh: Image | None = None
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
@@ -127,24 +129,39 @@ class FocusProbe:
 
     # --- moving and measuring ---
 
+    def refuse_if_used(self) -> None:
+        """Raise Refusal while an action of this node holds the mirror."""
+        if self.user:
+            raise Refusal(ErrorCode.BUSY, f"the action {self.user} is running; cancel it first")
+
     @contextmanager
-    def held(self, asked: Any) -> Iterator[None]:
-        """Hold the mirror at the driver for the block, see `MirrorHolder.held`.
+    def held(self, asked: Any, action: str) -> Iterator[None]:
+        """The mirror is that of one action of this node for the block, and held at the driver.
 
-        Raises Refusal: somebody else holds it, or there is no driver.
+        Args:
+            asked: its goal, see `MirrorHolder.held`.
+            action: its name.
+
+        Raises:
+            Refusal: another action or somebody else has it, or there is no driver.
         """
-        purpose = "a search or tracking (action autofocus); cancel it to end it"
-        with ExitStack() as stack:
-            try:
-                stack.enter_context(self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]))
-            except ServiceCallError as error:
-                raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
-            yield
-
-    def start(self) -> None:
-        """The mirror is this node's until `release`; count images from here."""
-        self._other_request = None
-        self.counted = self.dropped = 0
+        with self._changed:
+            self.refuse_if_used()
+            self.user = action
+            self._other_request = None
+            self.counted = self.dropped = 0
+        try:
+            with ExitStack() as stack:
+                purpose = f"action {action}; cancel it to end it"
+                try:
+                    stack.enter_context(self._hold.held(asked, purpose, 0.0, self._values["move_timeout"]))
+                except ServiceCallError as error:
+                    raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, str(error)) from error
+                yield
+        finally:
+            self.target = math.nan
+            self._other_request = None
+            self.user = ""
 
     def move(self, curvature: float, stop: Callable[[], bool] = lambda: False) -> None:
         """Ask for a curvature [1/m] and wait until its shape stands. Returns early when `stop()`.
@@ -178,11 +195,6 @@ class FocusProbe:
             reason = self._driver.message if self._driver is not None else "no actuator_state from pdm_driver"
             raise Refusal(ErrorCode.TIMEOUT, f"the move did not end within {limit:g} s: {reason}")
 
-    def release(self) -> None:
-        """The mirror may be moved by others from here on."""
-        self.target = math.nan
-        self._other_request = None
-
     def measure(self, region: Region, stop: Callable[[], bool] = lambda: False) -> SharpnessSample | None:
         """Median sharpness of the next images that show the settled shape; None when `stop()`.
 
@@ -206,7 +218,7 @@ class FocusProbe:
         finally:
             self._measuring = False
         sharpness = statistics.median(sample.sharpness for sample in samples)
-        return SharpnessSample(sharpness, samples[-1].header, tuple(sample.regions[0] for sample in samples))
+        return SharpnessSample(sharpness, samples[-1].image, tuple(sample.regions[0] for sample in samples))
 
     def sharpness_of(self, message: Image, region: Region) -> SharpnessSample:
         """Sharpness of an image in a region.
@@ -219,7 +231,7 @@ class FocusProbe:
             sharpness = METRICS[self._values["metric"]](part)
         except (ImageError, ValueError) as error:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self._topic}: {error}") from error
-        return SharpnessSample(sharpness, message.header, (part,))
+        return SharpnessSample(sharpness, message, (part,))
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
         """Wait for a condition or `stop()`; False when neither came in time. Raises Refusal on another's move."""
@@ -240,6 +252,8 @@ class FocusProbe:
         text = f"no image of the settled focus on {self._topic} within {self._values['image_timeout']:g} s: "
         if self.newest is None:
             return text + "none came at all; is the camera running?"
+        if seconds(self.newest.header.stamp) == 0:
+            return text + "they carry no stamp, so nobody knows which focus they show"
         early = self._gate.settled_at - seconds(self.newest.header.stamp)
         if early > 0:
             return text + f"the newest is stamped {early:.3f} s before the shape stood; do the clocks agree?"

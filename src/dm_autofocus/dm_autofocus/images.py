@@ -3,33 +3,56 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: encoding -> (number type, channels, channel taken). Of colours the green one: it has most of the luminance, and in a
-#: Bayer sensor half of the pixels.
-ENCODINGS: dict[str, tuple[str, int, int]] = {
-    "mono8": ("u1", 1, 0),
-    "8UC1": ("u1", 1, 0),
-    "mono16": ("u2", 1, 0),
-    "16UC1": ("u2", 1, 0),
-    "32FC1": ("f4", 1, 0),
-    "rgb8": ("u1", 3, 1),
-    "bgr8": ("u1", 3, 1),
-    "8UC3": ("u1", 3, 1),
-    "rgba8": ("u1", 4, 1),
-    "bgra8": ("u1", 4, 1),
+
+@dataclass(frozen=True)
+class _Layout:
+    """How an encoding lies in memory: number type, numbers per pixel, which of them is taken; in a Bayer pattern, the
+    columns of the green pixels in the even and the odd rows."""
+
+    type: str
+    channels: int = 1
+    channel: int = 0
+    green: tuple[int, int] | None = None
+
+
+#: Of colours the green one is taken: it has most of the luminance, and in a Bayer sensor half of the pixels. Of YUV the
+#: luminance.
+ENCODINGS: dict[str, _Layout] = {
+    "mono8": _Layout("u1"),
+    "8UC1": _Layout("u1"),
+    "mono16": _Layout("u2"),
+    "16UC1": _Layout("u2"),
+    "32FC1": _Layout("f4"),
+    "8UC3": _Layout("u1", 3, 1),
+    **{
+        f"{order}{bits}": _Layout(kind, len(order), 1)
+        for order in ("rgb", "bgr", "rgba", "bgra")
+        for bits, kind in ((8, "u1"), (16, "u2"))
+    },
+    **{
+        f"bayer_{pattern}{bits}": _Layout(kind, green=green)
+        for pattern, green in (("rggb", (1, 0)), ("bggr", (1, 0)), ("gbrg", (0, 1)), ("grbg", (0, 1)))
+        for bits, kind in ((8, "u1"), (16, "u2"))
+    },
+    **{name: _Layout("u1", 2, 1) for name in ("uyvy", "yuv422")},
+    **{name: _Layout("u1", 2, 0) for name in ("yuyv", "yuv422_yuy2")},
 }
+#: Share of the pixels that have the largest value from which on its exposure is called wrong.
+CLIPPED = 0.2
 
 
 class ImageError(ValueError):
     """An image that cannot be used; the message says why."""
 
 
-def grey(message: Any) -> NDArray:
-    """Grey levels (height, width) of a `sensor_msgs/Image`: its own numbers, colours by their green channel.
+def pixels_of(message: Any) -> NDArray:
+    """The pixels (height, width, channels) of a `sensor_msgs/Image`, its own numbers in its own order of bytes.
 
     Args:
         message: anything with height, width, encoding, is_bigendian, step (bytes per row) and data.
@@ -37,21 +60,49 @@ def grey(message: Any) -> NDArray:
     Raises:
         ImageError: unknown encoding, or sizes that contradict each other.
     """
-    if message.encoding not in ENCODINGS:
+    layout = ENCODINGS.get(message.encoding)
+    if layout is None:
         raise ImageError(f"encoding = {message.encoding!r}: must be one of {', '.join(ENCODINGS)}")
-    code, channels, channel = ENCODINGS[message.encoding]
-    kind = np.dtype(code).newbyteorder(">" if message.is_bigendian else "<")
+    kind = np.dtype(layout.type).newbyteorder(">" if message.is_bigendian else "<")
     width, height = int(message.width), int(message.height)
-    step = int(message.step) or width * channels * kind.itemsize
+    pixel = layout.channels * kind.itemsize
+    step = int(message.step) or width * pixel
     data = np.frombuffer(message.data, np.uint8)
-    if step < width * channels * kind.itemsize or len(data) < step * height or width * height == 0:
+    if step < width * pixel or len(data) < step * height or width * height == 0:
         raise ImageError(
             f"an image of {width} x {height} px {message.encoding} with {step} bytes per row cannot have "
             f"{len(data)} bytes of data"
         )
-    shape, strides = (height, width), (step, channels * kind.itemsize)
-    pixels: NDArray = np.ndarray(shape, kind, data, channel * kind.itemsize, strides)
-    return pixels if kind.isnative else pixels.astype(kind.newbyteorder("="))
+    return np.ndarray((height, width, layout.channels), kind, data, 0, (step, pixel, kind.itemsize))
+
+
+def grey(message: Any) -> NDArray:
+    """Grey levels (height, width) of a `sensor_msgs/Image`: its own numbers, colours by their green channel.
+
+    Of a Bayer pattern, (height / 2, width / 2): the sum of the two green pixels of every four, so that the noise of
+    neighbours stays independent.
+
+    Raises:
+        ImageError: see `pixels_of`.
+    """
+    pixels, layout = pixels_of(message), ENCODINGS[message.encoding]
+    taken = pixels[..., layout.channel]
+    if layout.green is not None:
+        rows, columns = (side // 2 * 2 for side in taken.shape)
+        upper, lower = (taken[row:rows:2, column:columns:2] for row, column in enumerate(layout.green))
+        return np.add(upper, lower, dtype=np.uint32)
+    return taken if taken.dtype.isnative else taken.astype(taken.dtype.newbyteorder("="))
+
+
+def exposure_fault(image: NDArray) -> str:
+    """What is wrong with the exposure of grey levels (H, W): black, or without differences at the top; "" = nothing."""
+    top = image.max()
+    if top <= 0:
+        return "the image is black"
+    share = float(np.mean(image == top))
+    if share < CLIPPED:
+        return ""
+    return f"{100 * share:.0f} % of its pixels have the largest value, {top:g}: over- or underexposed?"
 
 
 class SettledGate:

@@ -22,6 +22,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode
 
@@ -98,9 +102,25 @@ class FocusOptics:
         """
         if not math.isfinite(curvature):
             raise OpticsError(f"curvature = {curvature} 1/m: must be finite")
-        at_pupil = self.relay_magnification**2 * (2 * curvature * self._oblique + self.rest_dioptre)
+        at_pupil = self._at_pupil(curvature)
         rest = 1 - at_pupil * self.pupil_offset
         return at_pupil / rest if rest > 0 else math.nan
+
+    def distances_for(self, curvature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distances [m] in focus at curvatures [1/m], any shape: inf = infinity and beyond, NaN = inside the camera.
+
+        Curvatures of NaN, -inf and inf give NaN, inf and -inf: "nothing", "too far" and "too near" of REP 117.
+        """
+        with np.errstate(all="ignore"):
+            at_pupil = self._at_pupil(curvature)
+            rest = 1 - at_pupil * self.pupil_offset
+            distance = np.where(at_pupil > 0, rest / at_pupil, np.inf)
+        ends = [curvature == -np.inf, curvature == np.inf, ~(rest > 0)]
+        return np.select(ends, [np.inf, -np.inf, np.nan], distance)
+
+    def _at_pupil(self, curvature: Any) -> Any:
+        """1 / (distance + pupil_offset) in focus at a curvature, or at many."""
+        return self.relay_magnification**2 * (2 * curvature * self._oblique + self.rest_dioptre)
 
     @property
     def _oblique(self) -> float:

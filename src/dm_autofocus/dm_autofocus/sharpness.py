@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 #: Left, top, width and height as shares 0..1 of the image.
@@ -64,11 +65,25 @@ def cut(image: NDArray, region: Region = WHOLE) -> NDArray:
 def tenengrad(image: NDArray, pixel_budget: int = PIXEL_BUDGET) -> float:
     """Mean squared Sobel gradient over the squared mean of an image (H, W) of any number type; no unit, 0 if black."""
     above, here, below = _rows(image, pixel_budget)
-    smooth = above + 2 * here + below
-    along_x = smooth[:, 2:] - smooth[:, :-2]
-    step = below - above
-    along_y = step[:, :-2] + 2 * step[:, 1:-1] + step[:, 2:]
+    along_x, along_y = _sobel(above, here, below)
     return _relative(_mean_square(along_x) + _mean_square(along_y), here)
+
+
+def local_tenengrad(image: NDArray, cell: int) -> NDArray[np.float32]:
+    """`tenengrad` around each cell of an image (H, W), three by three cells wide; of the shape (H / cell, W / cell).
+
+    The mean grey level is that of the whole image. Cells at the right and lower edge may be smaller than others.
+    """
+    framed = np.pad(_finite(image), 1, mode="edge")
+    along_x, along_y = _sobel(framed[:-2], framed[1:-1], framed[2:])
+    value = along_x**2 + along_y**2
+    for axis, side in enumerate(image.shape):
+        starts = np.arange(0, side, cell)
+        sizes = np.diff(starts, append=side).astype(np.float32)
+        value = np.add.reduceat(value, starts, axis) / np.expand_dims(sizes, 1 - axis)
+    mean = float(framed.mean(dtype=np.float64))
+    around = sliding_window_view(np.pad(value, 1, mode="edge"), (3, 3)).mean((2, 3))
+    return around / np.float32(mean**2) if mean != 0 else around
 
 
 def laplacian(image: NDArray, pixel_budget: int = PIXEL_BUDGET) -> float:
@@ -84,10 +99,21 @@ METRICS: dict[str, Callable[[NDArray], float]] = {"tenengrad": tenengrad, "lapla
 def _rows(image: NDArray, pixel_budget: int) -> tuple[NDArray, NDArray, NDArray]:
     """Rows with their neighbours above and below, float32, thinned out to the budget; NaN counts as black."""
     stride = max(1, math.ceil((image.shape[0] - 2) * image.shape[1] / pixel_budget))
-    rows = [image[start : image.shape[0] - 2 + start : stride].astype(np.float32) for start in (0, 1, 2)]
-    if image.dtype.kind == "f":
-        rows = [np.nan_to_num(part, copy=False, nan=0.0, posinf=0.0, neginf=0.0) for part in rows]
-    return rows[0], rows[1], rows[2]
+    above, here, below = (_finite(image[start : image.shape[0] - 2 + start : stride]) for start in (0, 1, 2))
+    return above, here, below
+
+
+def _finite(image: NDArray) -> NDArray[np.float32]:
+    """As float32, what is not a finite number as black."""
+    values = image.astype(np.float32)
+    return np.nan_to_num(values, copy=False, nan=0.0, posinf=0.0, neginf=0.0) if image.dtype.kind == "f" else values
+
+
+def _sobel(above: NDArray, here: NDArray, below: NDArray) -> tuple[NDArray, NDArray]:
+    """Gradients along x and y of rows (H, W) by their neighbours, (H, W - 2)."""
+    smooth = above + 2 * here + below
+    step = below - above
+    return smooth[:, 2:] - smooth[:, :-2], step[:, :-2] + 2 * step[:, 1:-1] + step[:, 2:]
 
 
 def _mean_square(values: NDArray) -> float:

@@ -121,3 +121,14 @@ def test_a_lens_that_focuses_before_the_mirror_is_refused() -> None:
 def test_depth_of_focus_is_a_quarter_wave_at_the_edge(radius: float, wavelength: float) -> None:
     sag = depth_of_focus(radius, wavelength) * radius**2 / 2
     assert 2 * sag == pytest.approx(wavelength / 4)
+
+
+@given(optics=OPTICS, curvatures=st.lists(st.floats(-0.2, 0.2), max_size=5))
+def test_many_distances_are_those_of_each_curvature(optics: FocusOptics, curvatures: list[float]) -> None:
+    each = [distance_of(optics.dioptre_for(curvature)) for curvature in curvatures]
+    np.testing.assert_allclose(optics.distances_for(np.array(curvatures)), each, rtol=1e-6)
+
+
+def test_beyond_the_ends_of_the_focus_distances_are_infinite() -> None:
+    distances = FocusOptics(0.1).distances_for(np.array([np.nan, -np.inf, np.inf, 0.0]))
+    np.testing.assert_array_equal(distances, [np.nan, np.inf, -np.inf, 10.0])

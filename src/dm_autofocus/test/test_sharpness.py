@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from dm_autofocus.images import ImageError, grey
-from dm_autofocus.sharpness import METRICS, check_region, cut, tenengrad
+from dm_autofocus.images import ImageError, exposure_fault, grey
+from dm_autofocus.sharpness import METRICS, check_region, cut, local_tenengrad, tenengrad
 
 
 def texture(seed: int = 0, shape: tuple[int, int] = (64, 80)) -> np.ndarray:
@@ -79,19 +79,63 @@ def message(pixels: np.ndarray, encoding: str, padding: int = 0, big: bool = Fal
 @pytest.mark.parametrize("padding", [0, 6])
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize(
-    ("encoding", "kind", "channels"),
-    [("mono8", "u1", 1), ("16UC1", "u2", 1), ("32FC1", "f4", 1), ("rgb8", "u1", 3), ("bgr8", "u1", 3)],
+    ("encoding", "kind", "channels", "taken"),
+    [
+        ("mono8", "u1", 1, 0),
+        ("16UC1", "u2", 1, 0),
+        ("32FC1", "f4", 1, 0),
+        ("rgb8", "u1", 3, 1),
+        ("bgr8", "u1", 3, 1),
+        ("bgra8", "u1", 4, 1),
+        ("rgb16", "u2", 3, 1),
+        ("yuv422", "u1", 2, 1),
+        ("uyvy", "u1", 2, 1),
+        ("yuyv", "u1", 2, 0),
+        ("yuv422_yuy2", "u1", 2, 0),
+    ],
 )
-def test_every_encoding_gives_its_grey_levels(encoding: str, kind: str, channels: int, padding: int, big: bool) -> None:
-    shape = (5, 7) if channels == 1 else (5, 7, channels)
-    pixels = np.random.default_rng(1).integers(0, 250, shape).astype(kind)
-    wanted = pixels if channels == 1 else pixels[..., 1]
-    np.testing.assert_array_equal(grey(message(pixels, encoding, padding, big)), wanted)
+def test_every_encoding_gives_its_grey_levels(
+    encoding: str, kind: str, channels: int, taken: int, padding: int, big: bool
+) -> None:
+    pixels = np.random.default_rng(1).integers(0, 250, (5, 7, channels)).astype(kind)
+    levels = grey(message(pixels, encoding, padding, big))
+    np.testing.assert_array_equal(levels, pixels[..., taken])
+    assert levels.dtype.isnative
 
 
-def test_an_unknown_encoding_is_named() -> None:
-    with pytest.raises(ImageError, match="'yuv422': must be one of mono8"):
-        grey(message(np.zeros((4, 4), "u1"), "yuv422"))
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_of_a_bayer_pattern_the_green_pixels_count(pattern: str, bits: int) -> None:
+    """Of an odd last row and column there are no four pixels."""
+    mosaic = np.random.default_rng(2).integers(200, 256, (7, 9)).astype(f"u{bits // 8}")
+    wanted = np.zeros((3, 4))
+    for place, colour in enumerate(pattern):
+        if colour == "g":
+            wanted += mosaic[place // 2 : 6 : 2, place % 2 : 8 : 2]
+    np.testing.assert_array_equal(grey(message(mosaic, f"bayer_{pattern}{bits}", padding=3)), wanted)
+
+
+@pytest.mark.parametrize("encoding", ["nv21", "64FC1", "jpeg", ""])
+def test_an_unknown_encoding_is_named(encoding: str) -> None:
+    with pytest.raises(ImageError, match=f"'{encoding}': must be one of mono8"):
+        grey(message(np.zeros((4, 4), "u1"), encoding))
+
+
+def test_wrong_exposures_are_named() -> None:
+    clipped = np.minimum(2 * texture(), 255).astype("u1")
+    assert exposure_fault(np.zeros((4, 4), "u1")) == "the image is black"
+    assert "have the largest value, 255" in exposure_fault(clipped + (255 - clipped) * (clipped > 180))
+    assert exposure_fault(texture().astype("u1")) == exposure_fault(texture().astype("f4")) == ""
+
+
+def test_the_sharpness_of_cells_is_that_of_what_is_around_them() -> None:
+    image = texture(shape=(50, 61))
+    cells = local_tenengrad(image, 10)
+    assert cells.shape == (5, 7)
+    around = tenengrad(image[9:41, 19:51]) * image[10:40, 19:51].mean() ** 2 / image.mean() ** 2
+    assert cells[2, 3] == pytest.approx(around, rel=0.03)
+    assert not local_tenengrad(np.full((50, 61), 7.0), 10).any()
+    assert not local_tenengrad(np.zeros((50, 61), "u1"), 10).any()
 
 
 def test_a_cut_image_is_refused() -> None:

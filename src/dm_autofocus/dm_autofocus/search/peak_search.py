@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 #: Standard deviations of noise that the top of a hill must stand above the median of its sweep.
 SIGNIFICANCE = 6.0
@@ -41,6 +42,7 @@ class Phase(IntEnum):
     COARSE = 1
     FINE = 2
     TRACK = 3
+    STACK = 4
 
 
 @dataclass(frozen=True)
@@ -203,7 +205,7 @@ class PeakSearch:
         best = int(seen.argmax())
         spacing = float(self._positions[1] - self._positions[0])
         if self.phase is Phase.COARSE:
-            hill = _is_hill(seen, self.config.least_contrast)
+            hill = bool(is_hill(seen, self.config.least_contrast))
             self._coarse = seen
         else:
             hill = _is_seen_again(self._coarse, seen)
@@ -234,17 +236,25 @@ class PeakSearch:
         self._begin(low, high, self.config.fine_points)
 
 
-def _is_hill(seen: np.ndarray, least_contrast: float) -> bool:
-    """Whether a sweep rises by the least contrast, and by more than noise does.
+def is_hill(seen: NDArray, least_contrast: float) -> NDArray[np.bool_]:
+    """Whether sweeps rise by the least contrast, and by more than noise does.
 
     The noise is estimated from the second differences: those of a hill are small, or large at a few points only, which
     the median passes over. The top of n points of white noise lies some two standard deviations above their median. Of
     fewer than NOISE_POINTS points a hill may take most, and only the contrast counts.
+
+    Args:
+        seen: sharpness along a sweep, (N, ...).
+        least_contrast: of the largest over the smallest, relative to the largest.
+
+    Returns:
+        For each sweep, (...).
     """
-    top = float(seen.max())
-    rise = top - float(np.median(seen))
-    significant = len(seen) < NOISE_POINTS or rise > SIGNIFICANCE * _noise(seen)
-    return float(np.ptp(seen)) > least_contrast * abs(top) and significant
+    top = seen.max(0)
+    contrasting = np.ptp(seen, axis=0) > least_contrast * np.abs(top)
+    if len(seen) < NOISE_POINTS:
+        return contrasting
+    return contrasting & (top - np.median(seen, axis=0) > SIGNIFICANCE * _noise(seen))
 
 
 def _is_seen_again(coarse: np.ndarray, fine: np.ndarray) -> bool:
@@ -256,13 +266,13 @@ def _is_seen_again(coarse: np.ndarray, fine: np.ndarray) -> bool:
     if len(coarse) < NOISE_POINTS:
         return True
     above = float(fine.mean()) - float(np.median(coarse))
-    return above > CONFIRMATION * _noise(coarse, fine) / math.sqrt(len(fine))
+    return bool(above > CONFIRMATION * _noise(coarse, fine) / math.sqrt(len(fine)))
 
 
-def _noise(*sweeps: np.ndarray) -> float:
-    """Standard deviation of white noise on sweeps over smooth hills."""
-    bends = np.concatenate([np.abs(np.diff(sweep, 2)) for sweep in sweeps])
-    return float(np.median(bends)) / (0.6745 * math.sqrt(6))
+def _noise(*sweeps: NDArray) -> NDArray:
+    """Standard deviation of white noise on sweeps (N, ...) over smooth hills, (...)."""
+    bends = np.concatenate([np.abs(np.diff(sweep, 2, axis=0)) for sweep in sweeps])
+    return np.median(bends, axis=0) / (0.6745 * math.sqrt(6))
 
 
 def _vertex(positions: np.ndarray, values: np.ndarray) -> float:

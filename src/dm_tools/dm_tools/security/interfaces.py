@@ -107,11 +107,14 @@ _DECLARED = (
     NodeInterface(
         "autofocus",
         "autofocus",
-        publish=(*_HEALTH, "autofocus_state", "focus_request"),
+        publish=(
+            *(*_HEALTH, "autofocus_state", "focus_request"),
+            *("focus_stack/camera_info", "focus_stack/depth", "focus_stack/image"),
+        ),
         subscribe=("actuator_state", "capabilities", "focus_state", "camera_info", "image_raw"),
         reply=("get_focus_range", "set_focus_distance"),
         request=("hold_mirror", "set_focus"),
-        execute=("autofocus",),
+        execute=("autofocus", "focus_stack"),
     ),
     NodeInterface(
         "dm_console_*",

@@ -1,0 +1,128 @@
+"""The action `focus_stack`: a sweep of the focus, an image that is sharp everywhere, and how far away each pixel is."""
+
+from __future__ import annotations
+
+import copy
+import math
+import sys
+from array import array
+from typing import Any
+
+import numpy as np
+from dm_msgs.action import FocusStack
+from numpy.typing import NDArray
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image
+
+from dm_autofocus.autofocus_parameters import tolerance_of
+from dm_autofocus.focus_stack import FEWEST, ImageStack
+from dm_autofocus.images import exposure_fault, grey, pixels_of
+from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
+from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
+from dm_autofocus.sharpness import WHOLE
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros import qos
+from dm_common.values import Fields, real, whole
+
+#: Most images of a stack.
+MOST = 1000
+FOCUS_STACK = Fields({"curvature_min": real(0.0), "curvature_max": real(0.0), "images": whole(0, 0, MOST)})
+#: Percentiles of the distances in the result.
+NEAR, FAR = 5, 95
+
+
+class FocusStackAction(ProbeAction):
+    """Serves `focus_stack`, and publishes what comes of it."""
+
+    def __init__(self, node: Node, *shared: Any) -> None:
+        super().__init__(node, FocusStack, "focus_stack", FOCUS_STACK, *shared)
+        self._image = node.create_publisher(Image, "focus_stack/image", qos.LATCHED)
+        self._depth = node.create_publisher(Image, "focus_stack/depth", qos.LATCHED)
+        self._info = node.create_publisher(CameraInfo, "focus_stack/camera_info", qos.LATCHED)
+
+    def _plan(self, goal: Any) -> NDArray[np.float64]:
+        """Curvatures of the images, rising: so that hysteresis that is not known is on one branch."""
+        capabilities = ready_capabilities(self._probe)
+        low, high = range_of(goal, capabilities)
+        if 0 < goal.images < FEWEST:
+            raise Refusal(ErrorCode.OUT_OF_RANGE, f"images = {goal.images}: must be {FEWEST} to {MOST}, or 0")
+        step = self._values["stack.step"] * tolerance_of(self._values, capabilities.aperture_radius)
+        return np.linspace(low, high, goal.images or min(max(NOISE_POINTS, 1 + math.ceil((high - low) / step)), MOST))
+
+    def _carry_out(self, goal_handle: ServerGoalHandle, plan: NDArray[np.float64], result: Any) -> None:
+        before = self._probe.curvature
+        stack, image = self._sweep(goal_handle, plan)
+        if math.isfinite(before):
+            self._go(goal_handle, before)
+        try:
+            places = stack.in_focus(self._values["search.least_contrast"])
+        except ValueError as error:
+            raise Refusal(ErrorCode.UNREACHABLE, f"the mirror reaches too little of the range: {error}") from error
+        depth = stack.enlarge(self._optics.distances_for(places).astype(np.float32))
+        seen = depth[depth > 0]
+        if not seen.size:
+            fault = exposure_fault(grey(image))
+            reason = "focus changes nothing in the image: no texture in it"
+            raise Refusal(ErrorCode.NOT_CONVERGED, f"{reason}; {fault}" if fault else reason)
+        self._publish_stack(image, stack.image, depth)
+        result.share = seen.size / depth.size
+        near, far = np.percentile(seen, (NEAR, FAR), method="nearest")
+        result.distance_near, result.distance_far, result.stamp = float(near), float(far), image.header.stamp
+        result.message = f"{len(stack.positions)} images, {100 * result.share:.0f} % of the pixels have a distance"
+
+    def _sweep(self, goal_handle: ServerGoalHandle, plan: NDArray[np.float64]) -> tuple[ImageStack, Image]:
+        """The stack and its last image. What the mirror refuses at the ends of the range is left out."""
+        stack = ImageStack(self._values["stack.cell"])
+        image = Image()
+        for curvature in plan:
+            try:
+                self._go(goal_handle, float(curvature))
+            except Refusal as error:
+                if error.error_code != ErrorCode.UNREACHABLE:
+                    raise
+                if stack.positions:
+                    break
+                continue
+            sample = self._measure(goal_handle, WHOLE)
+            image = sample.image
+            try:
+                stack.add(float(curvature), np.mean(sample.regions, axis=0), pixels_of(image))
+            except ValueError as error:
+                raise Refusal(ErrorCode.INVALID_ARGUMENT, str(error)) from error
+            self._publish(Phase.STACK, sample)
+            goal_handle.publish_feedback(
+                FocusStack.Feedback(step=len(stack.positions), steps=len(plan), curvature=float(curvature))
+            )
+        return stack, image
+
+    def _publish_stack(self, last: Image, pixels: NDArray, depth: NDArray[np.float32]) -> None:
+        """The images with the header of the last one, as depth_image_proc takes them."""
+        self._info.publish(camera_info_for(last, self._probe.camera_info, self._values["optics.focal_length_px"]))
+        native = sys.byteorder == "big"
+        for publisher, values, encoding, big in (
+            (self._image, pixels, last.encoding, last.is_bigendian),
+            (self._depth, depth, "32FC1", native),
+        ):
+            message = Image(header=last.header, height=last.height, width=last.width, encoding=encoding)
+            message.data = array("B", values.tobytes())
+            message.is_bigendian, message.step = int(big), len(message.data) // last.height
+            publisher.publish(message)
+
+
+def camera_info_for(image: Image, known: CameraInfo | None, focal_length_px: float) -> CameraInfo:
+    """What the camera says of itself, with a projection: from it depths become points.
+
+    Args:
+        image: that it is for.
+        known: what the camera published; None = nothing.
+        focal_length_px: where it published nothing [px]; 0 = not known.
+    """
+    info = copy.deepcopy(known) if known is not None else CameraInfo(height=image.height, width=image.width)
+    info.header = image.header
+    if known is None and focal_length_px > 0:
+        centre = (image.width - 1) / 2, (image.height - 1) / 2
+        info.k = [focal_length_px, 0.0, centre[0], 0.0, focal_length_px, centre[1], 0.0, 0.0, 1.0]
+    if not np.any(info.p):
+        info.p = np.pad(np.reshape(info.k, (3, 3)), [(0, 0), (0, 1)]).ravel()
+    return info

@@ -1,0 +1,130 @@
+"""What the actions of the node have in common: they move the focus and take images until they are done or stopped."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dm_msgs.msg import Capabilities
+from rclpy.action.server import ServerGoalHandle
+from rclpy.node import Node
+
+from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
+from dm_autofocus.optics import FocusOptics
+from dm_autofocus.search.peak_search import Phase
+from dm_autofocus.sharpness import Region
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros.worker import WorkerActionServer
+from dm_common.values import Fields
+
+#: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
+MARGIN = 0.002
+
+
+def ready_capabilities(probe: FocusProbe) -> Capabilities:
+    """The mirror's capabilities. Raises Refusal when it cannot be focused."""
+    capabilities = probe.capabilities
+    if capabilities is None:
+        raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
+    if capabilities.quality == Capabilities.UNCALIBRATED:
+        raise Refusal(capabilities.error_code or ErrorCode.NOT_CALIBRATED, capabilities.message)
+    return capabilities
+
+
+def range_of(goal: Any, capabilities: Capabilities) -> tuple[float, float]:
+    """The range of curvatures [1/m] that a goal asks for by `curvature_min` and `curvature_max`; both 0 = all of it.
+
+    Raises:
+        Refusal: it is not in the reachable range.
+    """
+    margin = MARGIN * (capabilities.curvature_max - capabilities.curvature_min)
+    low, high = capabilities.curvature_min + margin, capabilities.curvature_max - margin
+    if goal.curvature_min != 0 or goal.curvature_max != 0:
+        wanted = (goal.curvature_min, goal.curvature_max)
+        if not (low - margin <= wanted[0] < wanted[1] <= high + margin):
+            raise Refusal(
+                ErrorCode.OUT_OF_RANGE,
+                f"curvature_min, curvature_max = {wanted[0]:+.4f}, {wanted[1]:+.4f} 1/m: must be a rising range "
+                f"inside {low:+.4f} to {high:+.4f} 1/m, or both 0",
+            )
+        low, high = max(wanted[0], low), min(wanted[1], high)
+    return low, high
+
+
+class ProbeAction(ABC):
+    """An action that uses the probe, served in worker threads; its newest goal pre-empts.
+
+    Args:
+        node: hosts the action.
+        action_type, name, fields: of the action.
+        probe: moves and measures.
+        values: parameters of the node.
+        optics: from curvatures to distances.
+        publish: (phase, sample): publishes an image that counted.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        action_type: Any,
+        name: str,
+        fields: Fields,
+        probe: FocusProbe,
+        values: Mapping[str, Any],
+        optics: FocusOptics,
+        publish: Callable[[Phase, SharpnessSample], None],
+    ) -> None:
+        self._log = node.get_logger()
+        self._type = action_type
+        self._name = name
+        self._probe = probe
+        self._values = values
+        self._optics = optics
+        self._publish = publish
+        self._server = WorkerActionServer(node, action_type, name, self._run, exclusive="preempt", fields=fields)
+
+    @abstractmethod
+    def _plan(self, goal: Any) -> Any:
+        """What is to be done. Raises Refusal."""
+
+    @abstractmethod
+    def _carry_out(self, goal_handle: ServerGoalHandle, plan: Any, result: Any) -> None:
+        """Do it and fill the result, its message too. Raises Refusal."""
+
+    def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
+        started = time.monotonic()
+        result = self._type.Result()
+        outcome = "succeed"
+        try:
+            plan = self._plan(goal_handle.request)
+            with self._probe.held(goal_handle.request, self._name):
+                try:
+                    self._carry_out(goal_handle, plan, result)
+                finally:
+                    result.images, result.images_dropped = self._probe.counted, self._probe.dropped
+        except Refusal as error:
+            outcome = "canceled" if error.error_code == ErrorCode.CANCELED else "abort"
+            result.error_code, result.message = error.error_code, str(error)
+        result.duration = time.monotonic() - started
+        return outcome, result
+
+    def _go(self, goal_handle: ServerGoalHandle, curvature: float) -> None:
+        self._probe.move(curvature, lambda: self._stopping(goal_handle))
+        self._check_stop(goal_handle)
+
+    def _measure(self, goal_handle: ServerGoalHandle, region: Region) -> SharpnessSample:
+        sample = self._probe.measure(region, lambda: self._stopping(goal_handle))
+        self._check_stop(goal_handle)
+        assert sample is not None  # only a stop leaves without one
+        return sample
+
+    def _stopping(self, goal_handle: ServerGoalHandle) -> bool:
+        return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
+
+    def _check_stop(self, goal_handle: ServerGoalHandle) -> None:
+        if goal_handle.is_cancel_requested:
+            raise Refusal(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
+        if self._server.preempted(goal_handle):
+            raise Refusal(ErrorCode.PREEMPTED, "a newer goal took over")
