@@ -20,6 +20,7 @@ from dm_common.hysteresis.creep_record import (
 )
 from dm_common.hysteresis.model import CREEP_TIMES, UNSEEN, HysteresisModel
 from dm_common.hysteresis.observer import Applied, HysteresisObserver
+from waiting import wait_until
 
 LAW = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES)
 DAY = 86_400.0
@@ -116,20 +117,39 @@ def test_files_are_named_for_the_mirror(monkeypatch: pytest.MonkeyPatch) -> None
 def test_another_mirror_begins_with_its_own_record_and_no_reports(tmp_path: Path) -> None:
     observer = HysteresisObserver()
     observer.use(LAW, 0.0)
-    recorder = CreepRecorder(str(tmp_path), observer)
+    failures: list[str] = []
+    recorder = CreepRecorder(str(tmp_path), observer, failures.append)
     held = CreepRecord(10.0, CREEP_TIMES, np.full((3, len(CREEP_TIMES)), 0.5), np.zeros(len(CREEP_TIMES)))
     write_record(tmp_path / "a.creep.npz", held)
     (tmp_path / "c.creep.npz").write_bytes(b"torn")
     observer.observe(report(20.0, 0.0))  # reports may come before who the mirror is
-    assert recorder.recall("a", 20.0) == ""
+    recorder.recall("a", 20.0)
     assert observer.state is not None and (observer.state.crept[:, -1] > 0.4).all()
-    assert recorder.recall("a", 30.0) == ""
+    recorder.recall("a", 30.0)
     for other in ("b", "c"):
-        failure = recorder.recall(other, 30.0)
-        assert ("c.creep.npz" in failure) == (other == "c")
+        assert not failures
+        recorder.recall(other, 30.0)
         assert observer.state is None
         observer.observe(report(30.0, 0.0))
         assert (observer.state.crept == 0.0).all()
+    (failure,) = failures
+    assert "c.creep.npz" in failure
+
+
+def test_a_record_is_kept_for_the_mirror_or_said_not_to_be(tmp_path: Path) -> None:
+    observer, failures = HysteresisObserver(), list[str]()
+    observer.use(LAW, 0.0)
+    observer.observe(report(20.0, 0.5))
+    (tmp_path / "file").touch()
+    for folder in (tmp_path, tmp_path / "file"):
+        recorder = CreepRecorder(str(folder), observer, failures.append)
+        recorder.keep(30.0)  # of which mirror is not known yet
+        recorder.recall("a", 20.0)
+        recorder.keep(40.0)
+    wait_until(lambda: len(failures) == 2 and (tmp_path / "a.creep.npz").exists())
+    kept = read_record(tmp_path / "a.creep.npz", 50.0)
+    assert kept is not None and kept.time == 40.0
+    assert failures[1].startswith("state_folder: ")  # after what could not be read
 
 
 def test_a_clock_that_does_not_run_yet_refuses_no_record(tmp_path: Path) -> None:

@@ -9,9 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
@@ -19,7 +17,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_common.errors import Refusal
-from dm_common.hysteresis.creep_record import CreepRecord, CreepRecorder, write_record
+from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, time_message
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.executor import run_node
@@ -64,8 +62,7 @@ class FocusControllerNode(Node):
         self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
         self._controller.degauss_offered = lambda: self._degauss.offered
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._recorder = CreepRecorder(values["state_folder"], self._controller.observer)
-        self._disk = ThreadPoolExecutor(max_workers=1)  # until a disk has a record for sure may take long
+        self._recorder = CreepRecorder(values["state_folder"], self._controller.observer, self._warn)
         self.create_timer(RECORD_PERIOD_S, self._keep_record, clock=steady)
         self._quick = self.create_timer(values["hold.period"], self._tick)
         self.create_timer(SLOW_PERIOD_S, self._tick)
@@ -99,25 +96,17 @@ class FocusControllerNode(Node):
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror, self._diagnostics.hardware_id = message, message.serial
-        self._warn(self._recorder.recall(message.serial, 1e-9 * self.get_clock().now().nanoseconds))
+        self._recorder.recall(message.serial, self._now().time)
         self._use()
 
     def _keep_record(self) -> None:
         with self.controller() as (controller, now):
             # Of a mirror that nobody reports of, the last record stands: what comes after it is in doubt.
-            record = None if controller.monitor.stopped(now.steady) else self._recorder.record(now.time)
-        if record is not None:
-            self._disk.submit(self._write_record, *record)
-
-    def _write_record(self, file: Path, record: CreepRecord) -> None:
-        try:
-            write_record(file, record)
-        except OSError as error:
-            self._warn(f"state_folder: {error}: the next start will not know of creep")
+            if not controller.monitor.stopped(now.steady):
+                self._recorder.keep(now.time)
 
     def _warn(self, text: str) -> None:
-        if text:
-            self.get_logger().warning(text, throttle_duration_sec=60.0)
+        self.get_logger().warning(text, throttle_duration_sec=60.0)
 
     def _on_calibration(self, message: Calibration) -> None:
         self._calibration = message

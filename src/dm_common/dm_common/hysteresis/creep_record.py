@@ -6,6 +6,8 @@ import io
 import os
 import re
 import zipfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -92,30 +94,40 @@ def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -
 
 
 class CreepRecorder:
-    """Keeps the record of the mirror that an observer follows, in `folder`; empty = keeps nothing."""
+    """Keeps the record of the mirror that an observer follows.
 
-    def __init__(self, folder: str, observer: HysteresisObserver) -> None:
-        self._folder, self._observer = folder, observer
+    Args:
+        folder: of the records; empty = nothing is kept.
+        observer: of the mirror.
+        warn: told, from any thread, what could not be done.
+    """
+
+    def __init__(self, folder: str, observer: HysteresisObserver, warn: Callable[[str], None]) -> None:
+        self._folder, self._observer, self._warn = folder, observer, warn
         self._serial: str | None = None
+        self._disk = ThreadPoolExecutor(max_workers=1)  # until a disk has a record for sure may take long
 
-    def recall(self, serial: str, now: float) -> str:
-        """Go on from the record of the mirror `serial`, if there is one; reports of another one are forgotten.
-
-        Returns the reason why that could not be done; "" = it was, or there was none.
-        """
+    def recall(self, serial: str, now: float) -> None:
+        """Go on from the record of the mirror `serial`, if there is one; reports of another one are forgotten."""
         if serial == self._serial:
-            return ""
+            return
         another, self._serial = self._serial is not None, serial
-        file, record, failure = record_file(self._folder, serial), None, ""
+        file, record = record_file(self._folder, serial), None
         try:
             record = read_record(file, now) if file is not None else None
         except ValueError as error:
-            failure = str(error)
+            self._warn(str(error))
         self._observer.recall(record, another)
-        return failure
 
-    def record(self, now: float) -> tuple[Path, CreepRecord] | None:
-        """What is to be kept and where; None = there is nothing to keep."""
+    def keep(self, now: float) -> None:
+        """Have what the actuators have crept to by `now` (s) put on disk, if there is anything to keep."""
         file = record_file(self._folder, self._serial) if self._serial is not None else None
         record = record_of(self._observer.law, self._observer.state, now)
-        return None if file is None or record is None else (file, record)
+        if file is not None and record is not None:
+            self._disk.submit(self._write, file, record)
+
+    def _write(self, file: Path, record: CreepRecord) -> None:
+        try:
+            write_record(file, record)
+        except OSError as error:
+            self._warn(f"state_folder: {error}: the next start will not know of creep")
