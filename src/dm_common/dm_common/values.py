@@ -133,16 +133,11 @@ class Fields:
     """
 
     def __init__(self, table: Mapping[str, Value]) -> None:
-        self._table = dict(table)
         # Each with what is right without another look: a choice, an empty array, or a number within a range.
         self._rules = [
             (name, attrgetter(name), value, value.many, 0 in value.sizes, *_quick(value))
             for name, value in table.items()
         ]
-
-    def within(self, name: str) -> dict[str, Value]:
-        """The table for a message that holds this one as its field `name`."""
-        return {f"{name}.{field}": value for field, value in self._table.items()}
 
     def check(self, message: Any) -> None:
         """Raise Refusal naming the first field that may not be as it is, its value and what is allowed."""
