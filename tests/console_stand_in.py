@@ -15,7 +15,7 @@ from dm_common.geometry import neighbour_pairs
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
-from dm_tools.console.status import NODES
+from dm_tools.running_suite import NEEDED
 
 RADIUS = 8e-3
 
@@ -51,7 +51,7 @@ class StandIn:
         state.applied = state.requested = array("d", self.signals)
         state.volts, state.flags = array("d", [150.0] * len(self.signals)), bytes(len(self.signals))
         self._state.publish(state)
-        health = DiagnosticArray(status=[DiagnosticStatus(name=name, message="well") for name in NODES])
+        health = DiagnosticArray(status=[DiagnosticStatus(name=name, message="well") for name in NEEDED])
         health.header.stamp = now
         self._health.publish(health)
 

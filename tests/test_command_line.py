@@ -23,7 +23,7 @@ from dm_common.errors import ErrorCode
 from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
-from dm_tools.running_suite import Standing, holder, naming_holder, standing, verdict
+from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
 from test_console_external_goals import EXECUTING, FakeNode, Goal
@@ -163,9 +163,9 @@ def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixtur
 def test_what_stands_is_read_from_the_controllers_health() -> None:
     values = {"curvature": 0.02, "stands for": "40.0", "bound": 1.3e-9, "held": True}
     pairs = [SimpleNamespace(key=key, value=str(value)) for key, value in values.items()]
-    assert standing({"focus_controller": SimpleNamespace(values=pairs)}) == Standing(0.02, 40.0, 1.3e-9, True)
-    assert standing({"focus_controller": SimpleNamespace(values=pairs[3:])}) is None
-    assert standing({}) is None
+    assert settled_shape({"focus_controller": SimpleNamespace(values=pairs)}) == SettledShape(0.02, 40.0, 1.3e-9, True)
+    assert settled_shape({"focus_controller": SimpleNamespace(values=pairs[3:])}) is None
+    assert settled_shape({}) is None
 
 
 def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_
 from dm_tools.console.widgets.actuators import towards
 from dm_tools.console.widgets.components import decimal
 from dm_tools.console.widgets.recipes import evenly
+from dm_tools.running_suite import NEEDED
 
 COUNT = 7
 RADIUS = 11e-3
@@ -160,7 +161,7 @@ def test_what_is_missing_is_told_with_its_effect() -> None:
 
 
 def test_a_button_tells_why_it_cannot_be_pressed() -> None:
-    everything = frozenset(status.NODES)
+    everything = frozenset(NEEDED)
     active = Snapshot(actuator_state=state([0.0] * COUNT), present=everything)
     assert status.reason_against("move", active, "") == ""
     assert status.reason_against("move", active, "Calibration") == "Calibration is under way."

@@ -197,3 +197,8 @@ def test_interpolation_on_the_disc_keeps_a_smooth_shape() -> None:
     inside = np.hypot(x, y) <= 1.0
     assert np.isnan(shown[~inside]).all()
     np.testing.assert_allclose(shown[inside], (x**2 - 0.5 * y)[inside], atol=5e-3)
+
+
+def test_a_length_above_the_wavelength_is_a_multiple_of_it() -> None:
+    assert content.length(2e-6, 632.8e-9) == "2000.00 nm (3.2 λ)"
+    assert content.length(1.3e-9, 632.8e-9) == "1.30 nm (λ/487)"

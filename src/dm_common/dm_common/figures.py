@@ -11,3 +11,10 @@ def rounded(value: float) -> str:
 def in_nanometres(length: float) -> str:
     """A length (m) with two significant digits, such as 1.3 nm."""
     return f"{rounded(length * 1e9)} nm"
+
+
+def in_wavelengths(length: float, wavelength: float) -> str:
+    """A length (m) as a fraction of the wavelength, such as λ/50, or as a multiple where it is longer, such as 2 λ."""
+    if length > wavelength:
+        return f"{rounded(length / wavelength)} λ"
+    return f"λ/{wavelength / length:.0f}" if length > 0 else "0"

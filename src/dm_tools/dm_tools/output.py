@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from dm_common.figures import rounded
+from dm_common.figures import in_wavelengths
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 errors = Console(stderr=True, highlight=False)
@@ -108,7 +108,5 @@ def nanometres(length: float) -> float:
 
 
 def as_wavelengths(length: float) -> str:
-    """A length as a fraction of the wavelength, such as λ/50, or as a multiple where it is longer, such as 2 λ."""
-    if length > WAVELENGTH:
-        return f"{rounded(length / WAVELENGTH)} λ"
-    return f"λ/{WAVELENGTH / length:.0f}" if length > 0 else "0"
+    """A length (m) by the wavelength of the interferometer, such as λ/50."""
+    return in_wavelengths(length, WAVELENGTH)

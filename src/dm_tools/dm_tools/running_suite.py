@@ -22,6 +22,14 @@ BUSY_S = 5.0
 #: Time in which every node reports its health, and an action what it is doing, s.
 REPORT_S = 1.5
 
+#: Nodes without which there is no bench, and what follows where one is missing.
+NEEDED = {
+    "pdm_driver": "nothing can move, and what stands at the electronics is not known",
+    "interferometer": "no maps can be measured",
+    "calibration": "no calibration can be made or loaded",
+    "focus_controller": "no curvature can be asked for",
+}
+
 
 def nodes_of_suite(client: DeformableMirrorClient) -> Counter[str]:
     """How often each node of the suite runs in the client's namespace."""
@@ -146,7 +154,7 @@ def hear_health(client: DeformableMirrorClient) -> dict[str, Any]:
     return heard
 
 
-class Standing(NamedTuple):
+class SettledShape(NamedTuple):
     """The shape that stands, as the controller reports it.
 
     Attributes:
@@ -162,13 +170,13 @@ class Standing(NamedTuple):
     held: bool
 
 
-def standing(health: dict[str, Any]) -> Standing | None:
+def settled_shape(health: dict[str, Any]) -> SettledShape | None:
     """The shape that stands; None = not one that was asked for as a curvature."""
     values = (
         {pair.key: pair.value for pair in health["focus_controller"].values} if "focus_controller" in health else {}
     )
     if "curvature" not in values:
         return None
-    return Standing(
+    return SettledShape(
         float(values["curvature"]), float(values["stands for"]), float(values["bound"]), values["held"] == "True"
     )

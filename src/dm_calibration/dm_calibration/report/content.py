@@ -11,6 +11,7 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.report.document import Section, Table
+from dm_common.figures import in_wavelengths
 
 NM = 1e9
 #: What the sentences of a poke check begin with.
@@ -28,7 +29,7 @@ def length(metres: float, wavelength: float) -> str:
     """A length in nm, and as a share of the wavelength where that is known."""
     if not np.isfinite(metres):
         return "not known"
-    share = f" (λ/{wavelength / metres:.0f})" if wavelength > 0.0 and metres > 0.0 else ""
+    share = f" ({in_wavelengths(metres, wavelength)})" if wavelength > 0.0 and metres > 0.0 else ""
     return f"{metres * NM:.2f} nm{share}"
 
 

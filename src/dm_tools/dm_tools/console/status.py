@@ -12,15 +12,8 @@ from dm_msgs.msg import ActuatorState, Calibration
 
 from dm_common.figures import in_nanometres
 from dm_tools.console.view_models import QUALITIES
-from dm_tools.running_suite import ago, standing
+from dm_tools.running_suite import NEEDED, ago, settled_shape
 
-#: What each node does for the console, in words, when it is missing.
-NODES = {
-    "pdm_driver": "nothing can move, and what stands at the electronics is not known",
-    "interferometer": "no maps can be measured",
-    "calibration": "no calibration can be made or loaded",
-    "focus_controller": "no curvature can be asked for",
-}
 DRIVER_STATES = {
     ActuatorState.STATE_UNCONFIGURED: "not configured",
     ActuatorState.STATE_INACTIVE: "inactive",
@@ -84,9 +77,9 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
 
 def missing(present: frozenset[str], mirror_known: bool) -> list[str]:
     """What is not there, and what follows from it, in sentences."""
-    if not present & NODES.keys():
+    if not present & NEEDED.keys():
         return ["No node of the suite is heard. Start them (./dm up) or check the namespace and the ROS domain."]
-    lines = [f"The node {name} is not heard: {effect}." for name, effect in NODES.items() if name not in present]
+    lines = [f"The node {name} is not heard: {effect}." for name, effect in NEEDED.items() if name not in present]
     if "pdm_driver" in present and not mirror_known:
         lines.append("The driver has not published which mirror it drives (topic mirror_info).")
     return lines
@@ -162,7 +155,7 @@ def log_rows(lines: Sequence[tuple[str, str, str, str]], everything: bool) -> li
 def now_text(snapshot: Any) -> str:
     """Where the mirror stands, in one line."""
     names = {name.rpartition("/")[2]: status for name, status in snapshot.diagnostics.items()}
-    shape, state = standing(names) if "focus_controller" in snapshot.present else None, snapshot.actuator_state
+    shape, state = settled_shape(names) if "focus_controller" in snapshot.present else None, snapshot.actuator_state
     if "pdm_driver" not in snapshot.present or state is None:
         return "now: not known, the driver is not heard"
     if state.moving:

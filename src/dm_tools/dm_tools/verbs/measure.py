@@ -15,7 +15,7 @@ from dm_tools.output import (
     next_step,
     write_json,
 )
-from dm_tools.running_suite import hear_health, kept, naming_holder, running_suite, standing, verdict
+from dm_tools.running_suite import hear_health, kept, naming_holder, running_suite, settled_shape, verdict
 
 
 def measure(
@@ -72,7 +72,7 @@ def check(
         health = hear_health(client)
         response = client.update_calibration(dry_run=dry_run, forget=forget, take_over=take_over)
         calibration = client.latest("calibration")
-    shape, capabilities = standing(health), client.messages.get("capabilities")
+    shape, capabilities = settled_shape(health), client.messages.get("capabilities")
     if shape is not None:
         promised = shape.bound
     elif capabilities is not None:

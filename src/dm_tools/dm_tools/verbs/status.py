@@ -8,20 +8,18 @@ from typing import Any
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
 from dm_tools.running_suite import (
     BUSY_S,
+    NEEDED,
     REPORT_S,
-    Standing,
+    SettledShape,
     ago,
     hear_health,
     holder,
     nodes_of_suite,
     promise,
     running_suite,
-    standing,
+    settled_shape,
     where,
 )
-
-#: Nodes without which there is no bench.
-NEEDED = ("pdm_driver", "interferometer", "calibration", "focus_controller")
 
 
 def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
@@ -37,7 +35,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         client.messages.get(name) for name in ("mirror_info", "calibration", "capabilities", "actuator_state")
     )
     calibration = calibration if calibration is not None and calibration.id else None
-    shape, lacking = standing(health), [name for name in NEEDED if not found[name]]
+    shape, lacking = settled_shape(health), [name for name in NEEDED if not found[name]]
     rows = {
         "nodes": f"{', '.join(found)}: running {place}"
         + (f"; [red]not running: {', '.join(lacking)}[/]" if lacking else ""),
@@ -62,7 +60,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     write_json(json, {"status": figures})
 
 
-def _now(by: Any, shape: Standing | None, state: Any) -> str:
+def _now(by: Any, shape: SettledShape | None, state: Any) -> str:
     if by is not None:
         return str(by)
     if shape is not None:
