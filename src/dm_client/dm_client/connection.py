@@ -140,49 +140,50 @@ class Connection:
 
     def call(self, name: str, request: Any, timeout_s: float | None = None) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
+        gone = self._since_now(name)
         try:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
-            return checked(call(self.clients[name], request, timeout_s, lambda: self._lost(name)))
+            return checked(call(self.clients[name], request, timeout_s, lambda: bool(gone())))
         except ServiceCallError as error:
-            self._check_server(name)
+            self._check(name, gone)
             raise DeformableMirrorError(ErrorCode.TIMEOUT, str(error)) from error
 
-    def _lost(self, name: str) -> bool:
-        """Whether the node that serves `name` has died."""
-        return name in self._servers and self._servers[name].missing()
+    def _since_now(self, name: str) -> Callable[[], str]:
+        """What became of the node that serves `name` since this call, see `Liveliness.since_now`."""
+        return self._servers[name].since_now() if name in self._servers else lambda: ""
 
-    def _check_server(self, name: str) -> None:
-        """Raise DeformableMirrorError when the node that serves `name` has died."""
-        if self._lost(name):
+    def _check(self, name: str, gone: Callable[[], str]) -> None:
+        """Raise DeformableMirrorError when the node that serves `name` is `gone`."""
+        if text := gone():
             answers_arrive(self.clients[name], lambda: False)  # the next one has to discover the client anew
-            server = self._servers[name]
-            raise DeformableMirrorError(UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {server.text}")
+            code = UNAVAILABLE.get(self._servers[name].name, ErrorCode.TIMEOUT)
+            raise DeformableMirrorError(code, f"{name}: {text}")
 
     def run_action(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float) -> Any:
         """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
 
         Ctrl-C cancels it first, so that the mirror is left safe.
         """
-        client = self.clients[name]
-        self._check_server(name)
+        client, gone = self.clients[name], self._since_now(name)
+        self._check(name, gone)
         if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
         finished = None
         try:
-            self.wait(lambda: accepted.done() or self._lost(name))
+            self.wait(lambda: accepted.done() or gone())
             if not accepted.done():
-                self._check_server(name)
+                self._check(name, gone)
                 raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no answer to the goal")
             if not accepted.result().accepted:
                 raise DeformableMirrorError(ErrorCode.BUSY, f"{name}: refused, another goal is running")
             finished = accepted.result().get_result_async()
-            self.wait(lambda: finished.done() or self._lost(name), timeout_s)
+            self.wait(lambda: finished.done() or gone(), timeout_s)
             if not finished.done():
-                self._check_server(name)
+                self._check(name, gone)
                 raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: not finished within {timeout_s:g} s")
         except BaseException:
-            if not self._lost(name):
+            if not gone():
                 self._cancel(accepted, finished)
             raise
         return checked(finished.result().result)

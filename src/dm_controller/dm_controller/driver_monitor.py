@@ -88,14 +88,16 @@ class DriverMonitor:
         """Take the driver's next report; returns whether the latency is known from now on."""
         before, self.latest, self._heard = self.latest, report, now
         self.gone = ""  # who reports lives
-        if before is not None and report.sequence < before.sequence:
-            self.starts += 1
+        anew = before is not None and report.sequence < before.sequence
+        self.starts += anew
         self._trust()
         if self.shape is None or self.shape.sent.confirmed:
             return False
         sent = self.shape.sent
         sent.confirmed = same_signals(report.requested, sent.command.signals)
         seconds = 1e-9 * (report.stamp_ns - sent.command.stamp_ns)
+        # A driver that was active before the command was sent may have it on the way.
+        sent.lost |= anew and (report.driver_state != _ACTIVE or report.stamp_ns > sent.command.stamp_ns)
         if not sent.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
             return False
         self._latencies.append(seconds)
@@ -204,10 +206,12 @@ class DriverMonitor:
         if self.shape is None:
             return None
         limit, sent = self._values["driver_timeout"] or CONFIRM_S, self.shape.sent
-        if sent.confirmed or sent.given_up or (now - sent.steady <= limit and not self.gone):
+        if sent.confirmed or sent.given_up or not (sent.lost or self.gone or now - sent.steady > limit):
             return None
         sent.given_up = True
         text = "the driver has not confirmed the command"
+        if sent.lost:
+            return sent.order, Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"{text}: pdm_driver was restarted meanwhile")
         if (refusal := self.refusal(now)) is not None:
             return sent.order, Refusal(refusal.error_code, f"{text}: {refusal}")
         report = self.latest

@@ -184,7 +184,8 @@ class Sent:
         order: that it answers; None = it corrects a shape for creep, or stops its move.
         time, steady: s, when.
         confirmed: the driver reported it as its own.
-        given_up: the driver did not in time, and that was said.
+        lost: the driver was started anew since, and knows nothing of it.
+        given_up: the driver did not report it in time, and that was said.
     """
 
     command: SendCommand
@@ -192,6 +193,7 @@ class Sent:
     time: float
     steady: float
     confirmed: bool = False
+    lost: bool = False
     given_up: bool = False
 
 

@@ -113,6 +113,26 @@ def test_a_driver_that_was_started_anew_is_noticed() -> None:
     assert driver.starts == 1
 
 
+@pytest.mark.parametrize(
+    ("state", "stamp_ns", "lost"),
+    [
+        (ActuatorState.STATE_UNCONFIGURED, 0, True),
+        (ActuatorState.STATE_ACTIVE, 2 * 10**9, True),
+        (ActuatorState.STATE_ACTIVE, 10**9 - 1, False),  # it was active before the command, which may be on its way
+    ],
+)
+def test_a_command_that_a_driver_started_anew_cannot_know_is_lost_at_once(
+    state: int, stamp_ns: int, lost: bool
+) -> None:
+    driver = monitor()
+    driver.observe(report(sequence=7), BEGAN)
+    driver.observe(report(sequence=1, driver_state=state, stamp_ns=stamp_ns), BEGAN + 0.1)
+    untaken = driver.untaken(BEGAN + 0.1)
+    assert (untaken is not None) == lost
+    if untaken is not None:
+        assert untaken[1].error_code == ErrorCode.DRIVER_UNAVAILABLE and "was restarted" in str(untaken[1])
+
+
 def test_the_latency_is_from_the_command_to_its_first_write() -> None:
     driver = monitor()
     assert driver.latency == 0.0

@@ -270,15 +270,16 @@ class BenchServices:
             server: of the node that serves it.
             ready: whether it is served.
         """
+        gone = server.since_now(ready)
         try:
-            yield lambda: self._stopping() or server.missing(ready)
+            yield lambda: self._stopping() or bool(gone())
         except ServiceCallError as error:
             if self.cancelled():
                 raise Cancelled("cancelled") from error
             if self._hold.lost is not None:
                 raise self._hold.lost from error
             code = ErrorCode.DRIVER_UNAVAILABLE if server is self._driver else ErrorCode.INTERFEROMETER_UNAVAILABLE
-            raise Refusal(code, f"{what}: {server.text}" if server.missing(ready) else str(error)) from error
+            raise Refusal(code, f"{what}: {text}" if (text := gone()) else str(error)) from error
 
     @staticmethod
     def _check(what: str, response: Any) -> None:

@@ -72,11 +72,11 @@ class Liveliness:
     Attributes:
         name: of the node that is watched.
         lost: there was a publisher, and now there is none.
-        seen: there was one at all.
+        starts: how many came one after the other; 0 = there was none yet.
     """
 
     def __init__(self, node: Node, name: str, message_type: Any, topic: str, profile: QoSProfile) -> None:
-        self.name, self.lost, self.seen = name, False, False
+        self.name, self.lost, self.starts = name, False, 0
         self._born = self._lost_at = time.monotonic()
         node.create_subscription(
             message_type,
@@ -97,15 +97,31 @@ class Liveliness:
         """
         if self.lost:
             return time.monotonic() - self._lost_at > SURE_S
-        return not self.seen and time.monotonic() - self._born > APPEAR_S and not served()
+        return not self.starts and time.monotonic() - self._born > APPEAR_S and not served()
 
     @property
     def text(self) -> str:
         """What became of a node that is missing, and what to do."""
-        return f"the node {self.name} {GONE if self.seen else 'is not running: start it'}"
+        return f"the node {self.name} {GONE if self.starts else 'is not running: start it'}"
+
+    def since_now(self, served: Callable[[], bool] = lambda: True) -> Callable[[], str]:
+        """What says whether the node is missing, or was started anew since this call: then no answer comes any more.
+
+        It returns what became of the node and what to do, as a sentence; "" = it may answer.
+        """
+        starts = max(self.starts, 1)
+
+        def gone() -> str:
+            if self.starts > starts:
+                return f"the node {self.name} was restarted meanwhile: ask again"
+            return self.text if self.missing(served) else ""
+
+        return gone
 
     def _on_change(self, info: Any) -> None:
         lost = info.alive_count == 0
-        self.seen = self.seen or not lost
+        # A publisher that comes back after its lease lapsed only leaves the other count.
+        if info.alive_count_change + info.not_alive_count_change > 0:
+            self.starts += 1
         if lost != self.lost:
             self.lost, self._lost_at = lost, time.monotonic()

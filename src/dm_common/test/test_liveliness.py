@@ -1,0 +1,60 @@
+"""Whether a node that one waits for has died, or was started anew meanwhile."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from dm_msgs.msg import MirrorInfo
+
+from dm_common.ros import qos
+from dm_common.ros.qos import Liveliness
+
+
+class Watched(Liveliness):
+    """The publishers of a topic as DDS counts them."""
+
+    def __init__(self) -> None:
+        node: Any = SimpleNamespace(create_subscription=lambda *_arguments, **_keywords: None)
+        super().__init__(node, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
+        self.alive = self.not_alive = 0
+
+    def change(self, alive: int, not_alive: int) -> None:
+        """So many more, or fewer, than before."""
+        self.alive, self.not_alive = self.alive + alive, self.not_alive + not_alive
+        info = SimpleNamespace(alive_count=self.alive, not_alive_count=self.not_alive)
+        info.alive_count_change, info.not_alive_count_change = alive, not_alive
+        self._on_change(info)
+
+
+@pytest.fixture
+def watched() -> Watched:
+    return Watched()
+
+
+def test_a_node_that_comes_at_last_is_what_was_waited_for(watched: Watched) -> None:
+    gone = watched.since_now()
+    watched.change(1, 0)
+    assert gone() == "" and not watched.lost
+
+
+@pytest.mark.parametrize("lapsed_before", [False, True])
+def test_a_node_that_was_started_anew_within_its_lease_counts_as_gone(watched: Watched, lapsed_before: bool) -> None:
+    watched.change(1, 0)
+    gone = watched.since_now()
+    if lapsed_before:
+        watched.change(-1, 1)
+    watched.change(1, 0)
+    assert not watched.missing()
+    assert gone() == "the node pdm_driver was restarted meanwhile: ask again"
+    assert watched.since_now()() == ""
+
+
+def test_a_lease_that_lapses_on_a_busy_machine_is_no_new_start(watched: Watched) -> None:
+    watched.change(1, 0)
+    gone = watched.since_now()
+    watched.change(-1, 1)
+    assert watched.lost
+    watched.change(1, -1)
+    assert not watched.lost and gone() == ""
