@@ -21,6 +21,7 @@ from dm_msgs.msg import Capabilities, ErrorCode, FocusRequest
 from dm_msgs.srv import HoldMirror, SetFocus, SetSignals
 from std_srvs.srv import SetBool
 
+from dm_autofocus import CameraFocusClient
 from dm_bringup.suite import Suite
 from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_common.ros import qos
@@ -65,7 +66,7 @@ class Running:
 class Bench:
     """The suite, a client, and what restarts nodes meanwhile, as `./dm up` does."""
 
-    def __init__(self, suite: Suite, client: DeformableMirrorClient) -> None:
+    def __init__(self, suite: Suite, client: CameraFocusClient) -> None:
         self.suite, self.client = suite, client
         self.said: list[str] = []
         self.paused = False
@@ -89,11 +90,18 @@ class Bench:
         answer = self.focus()
         return answer is not None and answer.state.applied
 
-    def lists_calibrations(self) -> bool:
+    def ask(self, node: str) -> Any:
+        """The answer to what this node serves. Raises DeformableMirrorError."""
+        if node == "calibration":
+            return self.client.list_calibrations()
+        return self.client.focus_range() if node == "autofocus" else self.client.focus(0.01)
+
+    def all_serve(self) -> bool:
         try:
-            return bool(self.client.list_calibrations().ids)
+            served = bool(self.ask("calibration").ids) and self.ask("autofocus").distance_near > 0.0
         except DeformableMirrorError:
             return False
+        return served and self.applies()
 
     def focus(self, curvature: float = 0.01, **fields: Any) -> Any:
         """The answer of `set_focus`; None = there was none."""
@@ -120,10 +128,11 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     folder: Path = tmp_path_factory.mktemp("suite")
     config = fast_bench(folder, 5)
     config["calibration"]["load_on_start"] = "newest"
+    config["autofocus"] = {"use_sim_time": True}
     with (
         own_domain() as domain,
         ForkedSuite(config, folder, domain) as suite,
-        DeformableMirrorClient(domain=domain, timeout_s=60.0) as client,
+        CameraFocusClient(domain=domain, timeout_s=60.0) as client,
     ):
         client.wait_until_active()
         client.calibrate(Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True))
@@ -243,14 +252,23 @@ def test_a_check_without_an_interferometer_says_so_at_once(bench: Bench) -> None
     bench.paused = False
 
 
-@pytest.mark.parametrize("node", ["calibration", "focus_controller"])
+@pytest.mark.parametrize("node", ["calibration", "focus_controller", "autofocus"])
 def test_the_others_go_on_when_it_is_back(bench: Bench, node: str) -> None:
     bench.paused = True
     bench.kill(node)
     time.sleep(KNOWN_S)
     with pytest.raises(DeformableMirrorError, match=f"the node {node} has died"):
-        bench.client.list_calibrations() if node == "calibration" else bench.client.focus(0.01)
+        bench.ask(node)
     bench.paused = False
     wait_until(lambda: any(f"{node} is started again" in text for text in bench.said), 30.0)
-    assert bench.client.wait(bench.applies, 60.0)
-    assert bench.client.wait(bench.lists_calibrations, 60.0)
+    assert bench.client.wait(bench.all_serve, 60.0)
+
+
+def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(bench: Bench) -> None:
+    bench.paused = True
+    bench.kill("virtual_bench")
+    lost = ErrorCode.ELECTRONICS_UNREACHABLE
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code == lost, KNOWN_S + 1.0)
+    assert bench.focus().error_code == lost
+    bench.paused = False
+    assert bench.client.wait(bench.all_serve, 60.0)

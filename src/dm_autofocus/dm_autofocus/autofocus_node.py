@@ -41,7 +41,7 @@ class AutofocusNode(Node):
         self._values = declare(self, PARAMETERS)
         self._optics = focus_optics(self._values)
         self._probe = FocusProbe(self, self._values)
-        self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.STATE)
+        self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.with_lease(qos.STATE))
         self._set_focus = self.create_client(SetFocus, "set_focus")
         for action in (AutofocusAction, FocusStackAction):
             action(self, self._probe, self._values, self._optics, self._publish)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
 from dm_msgs.action import Autofocus, FocusStack
+from dm_msgs.msg import AutofocusState
 from dm_msgs.srv import GetFocusRange, SetFocusDistance
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
@@ -15,15 +16,21 @@ from dm_client import Claim, DeformableMirrorClient, DeformableMirrorError
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 
+_OWN: dict[str, Any] = {
+    "set_focus_distance": SetFocusDistance,
+    "get_focus_range": GetFocusRange,
+    "autofocus": Autofocus,
+    "focus_stack": FocusStack,
+}
+
 
 class CameraFocusClient(DeformableMirrorClient):
     """A client of one mirror's nodes and of the node `autofocus` beside them, made and used as its base class."""
 
-    interfaces = DeformableMirrorClient.interfaces | {
-        "set_focus_distance": SetFocusDistance,
-        "get_focus_range": GetFocusRange,
-        "autofocus": Autofocus,
-        "focus_stack": FocusStack,
+    interfaces = DeformableMirrorClient.interfaces | _OWN
+    watched = {
+        **DeformableMirrorClient.watched,
+        "autofocus": (AutofocusState, "autofocus_state", qos.STATE, tuple(_OWN)),
     }
 
     def focus_range(self) -> GetFocusRange.Response:

@@ -29,7 +29,7 @@ from dm_msgs.srv import (
 )
 from sensor_msgs.msg import Image
 
-from dm_client.connection import Connection, DeformableMirrorError
+from dm_client.connection import WATCHED, Connection, DeformableMirrorError, Watched
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 
@@ -81,9 +81,13 @@ class DeformableMirrorClient(Connection):
 
     #: What it calls, made at once.
     interfaces: dict[str, Any] = INTERFACES
+    #: Who serves that.
+    watched: Watched = WATCHED
 
     def __init__(self, namespace: str = "", domain: int | None = None, timeout_s: float = 10.0) -> None:
-        super().__init__("dm_client", namespace, domain, TOPICS, self.interfaces, timeout_s=timeout_s)
+        super().__init__(
+            "dm_client", namespace, domain, TOPICS, self.interfaces, timeout_s=timeout_s, watched=self.watched
+        )
         self.start()
 
     def __enter__(self) -> Self:

@@ -19,8 +19,9 @@ from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, answer
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.qos import Liveliness
 
-#: Topics by which the nodes are known to live, and what they serve.
-WATCHED: dict[str, tuple[Any, str, Any, tuple[str, ...]]] = {
+#: By the name of the node: message type, name and profile of a topic by which it is known to live, and what it serves.
+Watched = Mapping[str, tuple[Any, str, Any, tuple[str, ...]]]
+WATCHED: Watched = {
     "pdm_driver": (MirrorInfo, "mirror_info", qos.LATCHED, ("set_signals", "degauss")),
     "interferometer": (SurfaceMapInfo, "surface_map_info", qos.STATE, ("measure", "ingest_file")),
     "calibration": (
@@ -77,6 +78,7 @@ class Connection:
             time the first is used.
         on_message: called with topic and message in the executor's thread, after `messages` has it.
         timeout_s: how long to wait for an answer that should come at once.
+        watched: the nodes that serve the interfaces.
 
     Attributes:
         messages: {topic: latest message}.
@@ -92,6 +94,7 @@ class Connection:
         interfaces: Mapping[str, Any],
         on_message: Callable[[str, Any], None] = lambda topic, message: None,
         timeout_s: float = 10.0,
+        watched: Watched = WATCHED,
     ) -> None:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
@@ -102,9 +105,8 @@ class Connection:
         for topic, (message_type, profile) in topics.items():
             self.hear(topic, message_type, profile)
         self._servers: dict[str, Liveliness] = {}
-        for server, (message_type, topic, profile, served) in WATCHED.items():
-            watched = Liveliness(self.node, server, message_type, topic, profile)
-            self._servers |= dict.fromkeys(served, watched)
+        for server, (message_type, topic, profile, served) in watched.items():
+            self._servers |= dict.fromkeys(served, Liveliness(self.node, server, message_type, topic, profile))
         for interface_name, interface in interfaces.items():
             make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
             self.clients[interface_name] = make(self.node, interface, interface_name)
