@@ -25,7 +25,7 @@ from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, ident
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.mirror import Mirror
-from dm_common.ros.bench_services import BenchServices, told_by
+from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import wait_for_clock
 
 #: Least time between two feedback messages, s.
@@ -189,7 +189,7 @@ class CalibrateAction:
             # Reference frames belong to the phase around them.
             report(_PHASES.get(now.kind, feedback.phase), now.label, now.done)
 
-        self._services.waiting = told_by(handle, feedback)
+        self._services.publish_waits(handle, feedback)
 
         def told(reached: float) -> None:
             feedback.reached_max_zernike = reached

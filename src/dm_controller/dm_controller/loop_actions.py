@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -71,15 +71,12 @@ class LoopBench(BenchServices):
         self._goal = threading.Lock()
 
     @contextmanager
-    def reserved(
-        self, asked: Any, text: str, cancelled: Callable[[], bool], waiting: Callable[[str], None]
-    ) -> Iterator[None]:
-        """Keep the bench for one goal, whose waits end when `cancelled()` becomes true.
+    def reserved(self, handle: ServerGoalHandle, feedback: Any, asked: Any, text: str) -> Iterator[None]:
+        """Keep the bench for one goal: its cancellation ends waits, and its feedback says what is waited for.
 
         Args:
             asked: says who asks, see `BenchServices.held`.
-            text: what requests of others are told meanwhile.
-            waiting: called with what is waited for.
+            text: the answer to requests of others meanwhile.
 
         Raises:
             Refusal: another goal has it, or somebody else holds the mirror.
@@ -87,7 +84,8 @@ class LoopBench(BenchServices):
         if not self._goal.acquire(blocking=False):
             raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
         try:
-            self.cancelled, self.waiting = cancelled, waiting
+            self.cancelled = lambda: bool(handle.is_cancel_requested)
+            self.publish_waits(handle, feedback)
             with self.held(asked, f"{text}; cancel it to end it"):
                 yield
         finally:

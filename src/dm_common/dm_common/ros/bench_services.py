@@ -49,16 +49,6 @@ def _not_shown(_text: str) -> None:
     pass
 
 
-def told_by(handle: Any, feedback: Any) -> Callable[[str], None]:
-    """Puts what is waited for in the `message` of an action's feedback, which is published."""
-
-    def tell(text: str) -> None:
-        feedback.message = text
-        handle.publish_feedback(feedback)
-
-    return tell
-
-
 class BenchServices:
     """Driver and interferometer of one calibration; implements :class:`dm_common.measurement.Bench`.
 
@@ -92,6 +82,15 @@ class BenchServices:
 
     def _on_state(self, message: ActuatorState) -> None:
         self.state = message
+
+    def publish_waits(self, handle: Any, feedback: Any) -> None:
+        """Publish what is waited for from now on as the `message` of the feedback of a goal."""
+
+        def publish(text: str) -> None:
+            feedback.message = text
+            handle.publish_feedback(feedback)
+
+        self.waiting = publish
 
     @contextmanager
     def held(self, asked: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:

@@ -17,7 +17,6 @@ from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.messages import doubles
-from dm_common.ros.bench_services import told_by
 from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.goals import ending
@@ -52,8 +51,7 @@ class ConvergeRun:
             handle.publish_feedback(feedback)
 
         try:
-            cancelled, waiting = lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)
-            with self._bench.reserved(handle.request.request, BUSY, cancelled, waiting):
+            with self._bench.reserved(handle, feedback, handle.request.request, BUSY):
                 outcome, error_code, message = self._judge(self._loop(handle.request, report))
         except Exception as error:
             outcome, error_code, message = ending(error)

@@ -20,7 +20,6 @@ from rclpy.node import Node
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
-from dm_common.ros.bench_services import told_by
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.worker import wait_for_clock
 from dm_controller.converge.goals import ending, recipe_targets
@@ -54,8 +53,7 @@ class RecipeRun:
         feedback = BuildRecipes.Feedback()
 
         try:
-            cancelled, waiting = lambda: bool(handle.is_cancel_requested), told_by(handle, feedback)
-            with self._bench.reserved(handle.request, BUSY, cancelled, waiting):
+            with self._bench.reserved(handle, feedback, handle.request, BUSY):
                 outcome, result = self._build_and_store(handle, feedback)
         except Exception as error:
             outcome, error_code, message = ending(error)
