@@ -7,6 +7,7 @@ no scatter explains fails.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,9 +15,13 @@ from typing import Any
 
 import pytest
 
+from dm_common.ros.executor import BackgroundExecutor
+from dm_controller.focus_controller_node import FocusControllerNode
 from studies.benchmarks import rivals
 from studies.benchmarks.jobs.influence_maps import peak_memory
 from studies.benchmarks.page import growth_table, target_table
+from studies.benchmarks.ros_jobs.request_to_command import FocusPeer
+from studies.benchmarks.ros_jobs.ros_processes import laboratory
 from studies.benchmarks.suite import JOBS, run
 from studies.benchmarks.targets import TARGETS, rows
 from studies.benchmarks.timing import Effort, medians
@@ -122,3 +127,14 @@ def test_rivals_that_are_not_there_are_skipped_with_a_word(tmp_path: Path, monke
     said: list[str] = []
     assert rivals.load(tmp_path, True, said.append) == {}
     assert said == ["skipped, because they are not installed: nothing (requirements/bench.txt names the versions)"]
+
+
+def test_the_stand_ins_of_a_request_make_the_controller_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_HOME", str(tmp_path))
+    with laboratory() as room:
+        controller = BackgroundExecutor(FocusControllerNode(context=room.node.context, namespace="focus"))
+        peer = FocusPeer(room, "focus")
+        room.wait_for("the focus controller", peer.connected)
+        peer.calibrate()
+        assert math.isfinite(peer.round_trip(0.01))
+        controller.destroy_node()
