@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorHysteresis, MirrorInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorHysteresis, MirrorInfo, RecipeBook, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.recalibration.drift_filter import Drift
+from dm_calibration.recalibration.drift import Drift
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.messages import doubles, recipe_book_message, time_message
 
@@ -72,7 +72,7 @@ def calibration_message(
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
     message.quality = CalibrationMsg.CALIBRATED if good else CalibrationMsg.APPROXIMATE
-    message.actuator_grade = array("B", fit.grades.astype(np.uint8).tobytes())
+    message.actuator_grade = _grades(fit)
     message.known_limitations = list(calibration.limitations)
     message.region_weights = doubles(calibration.region_weights)
     if calibration.hysteresis is not None:
@@ -106,8 +106,15 @@ def put_updates(
     message.gain_drift = abs(updates.largest_gain[0])
     message.offset_drift = updates.offset_rms
     message.known_limitations = [*message.known_limitations, *doubts]
-    if mirror_changed:
+    message.actuator_grade = _grades(fit)
+    if updates.given_up:
+        message.recipes = RecipeBook()  # of a mirror with all its actuators
+    if mirror_changed or updates.given_up:
         message.quality = CalibrationMsg.APPROXIMATE
+
+
+def _grades(fit: InfluenceFit) -> array[int]:
+    return array("B", fit.grades.astype(np.uint8).tobytes())
 
 
 def _slopes(law: HysteresisModel) -> Floats:

@@ -12,8 +12,9 @@ import pytest
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.influence.fit import InfluenceFit
+from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.drift_filter import Drift, DriftRates
+from dm_calibration.recalibration.drift import Drift, DriftRates
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.atomic_write import StoreError
@@ -126,6 +127,47 @@ def test_actuators_that_stick_are_named(
         assert f"actuator {actuator + 1} stands at " in verdict.reason
         assert f"instead of {wanted:+.2f}, as if it were dead" in verdict.reason or abs(wanted) < 0.1
         assert verdict.comparison.probability[actuator] > 0.99
+
+
+def test_it_goes_on_without_actuators_that_stick(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:
+    updates, stuck = begun(made, tmp_path), [6, 11]
+    settled = bench.settled()
+    at = bench.signals.copy()
+    at[stuck] = [0.0, 0.3]
+    bench.apply(at)
+    map_ = bench.measure("stuck")
+    assert "./dm check --without 7 --without 12 goes on without" in updates.take(map_, settled, dry_run=True).reason
+    verdict = updates.take(map_, settled, without=stuck)
+    assert verdict.accepted and not updates.mirror_changed
+    assert "Goes on without actuators 7 (stands at " in verdict.reason and ", 12 (stands at +0.30)" in verdict.reason
+    for manager in (updates, begun(made, tmp_path)):  # it is stored
+        fit = changed_fit(manager)
+        np.testing.assert_allclose(known(manager).stuck[stuck], [0.0, 0.3], atol=0.01)
+        assert not fit.influence_sag[:, stuck].any() and (fit.grades[stuck] == GRADE_DEAD).all()
+        assert error(bench, fit) < 3e-9
+        message = calibration_message(manager.calibration, None, "mirror", 1.0)
+        put_updates(message, known(manager), fit, manager.doubts, False, 0.0)
+        assert message.quality == message.APPROXIMATE and message.actuator_grade[6] == message.GRADE_DEAD
+        assert any("Goes on without actuators 7" in sentence for sentence in message.known_limitations)
+    for _ in range(2):  # later maps agree, whatever is asked of the two
+        wanted = np.random.default_rng(8).uniform(-0.7, 0.7, bench.mirror.actuators)
+        at = np.where(np.isin(np.arange(wanted.size), stuck), at, wanted)
+        bench.apply(at)
+        later = updates.take(bench.measure("later"), replace(settled, effective=wanted))
+        assert later.accepted, later.reason
+    bench.apply(wanted)
+    back = updates.take(bench.measure("back"), replace(settled, effective=wanted))
+    assert f"actuator 12 stands at {wanted[11]:+.2f} instead of +0.30" in back.reason
+    updates.forget()
+    assert updates.take(bench.measure("whole"), replace(settled, effective=wanted)).accepted
+
+
+def test_an_actuator_that_stands_where_it_should_is_not_given_up(
+    bench: SteadyMirror, updates: RecalibrationManager
+) -> None:
+    with pytest.raises(MapNotUsableError, match=r"actuator 7 stands at .*: this shape does not show that it fails"):
+        updates.take(bench.measure("fine"), bench.settled(), without=[6])
+    assert known(updates).revision == 0 and not known(updates).given_up
 
 
 def test_a_weakened_actuator_is_named_with_its_probability(bench: SteadyMirror, updates: RecalibrationManager) -> None:

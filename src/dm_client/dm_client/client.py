@@ -212,13 +212,20 @@ class DeformableMirrorClient(Connection):
         return self.call("load_calibration", LoadCalibration.Request(calibration=name))
 
     def update_calibration(
-        self, *, dry_run: bool = False, forget: bool = False, timeout_s: float = 70.0, **claim: Unpack[Claim]
+        self,
+        *,
+        dry_run: bool = False,
+        forget: bool = False,
+        without: Sequence[int] = (),
+        timeout_s: float = 70.0,
+        **claim: Unpack[Claim],
     ) -> UpdateCalibration.Response:
         """Compare the calibration in use with a map taken now, and let it improve the calibration unless `dry_run`.
 
-        `forget` takes no map but drops all earlier updates.
+        `forget` takes no map but drops all earlier updates. `without` are numbers, from 1, of actuators that do not
+        move any more: from now on they count as without effect, standing where the map shows them.
         """
-        request = UpdateCalibration.Request(dry_run=dry_run, forget=forget, **claim)
+        request = UpdateCalibration.Request(dry_run=dry_run, forget=forget, without=list(without), **claim)
         return self.call("update_calibration", request, timeout_s)
 
     # --- actions ---

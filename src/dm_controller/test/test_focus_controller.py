@@ -271,6 +271,22 @@ def test_a_dry_run_changes_nothing(bench: Bench) -> None:
     assert not bench.controller.hold.active
 
 
+def test_it_goes_on_without_an_actuator_that_does_not_move_and_says_so(bench: Bench) -> None:
+    whole = capabilities_message(bench.controller, MIRROR, VALUES, bench.now)
+    without = calibration("without", actuator_grade=[0] * 5 + [Calibration.GRADE_DEAD] + [0] * 31)
+    moves = np.arange(ACTUATORS) != 5
+    for name in ("influence_zernike", "influence_sag"):
+        matrix = np.array(getattr(without, name)).reshape(-1, ACTUATORS)
+        setattr(without, name, doubles(matrix * moves))
+    bench.do(bench.controller.use(without, MIRROR))
+    message = capabilities_message(bench.controller, MIRROR, VALUES, bench.now)
+    assert message.message.endswith("; without actuator 6")
+    assert 0.0 < message.curvature_max < whole.curvature_max
+    move = move_of(bench.ask(0.9 * message.curvature_max))
+    assert bench.outcomes[-1].refusal is None and move.plan.max_zernike < VALUES["reachable_tolerance"]
+    assert abs(move.effective[5]) < 1e-9
+
+
 def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None:
     host = LoopHost(cast(Any, SimpleNamespace(order=lambda message, dry_run: bench.ask(message.curvature, dry_run))))
     assert host.target(FocusRequest(curvature=0.01)).curvature == 0.01

@@ -1,6 +1,8 @@
-"""Which single actuators a map that disagrees comes from, and how probable that is."""
+"""Which single actuators a map that disagrees comes from, how probable that is, and where they stand."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,10 @@ Floats = NDArray[np.float64]
 DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 #: How far an actuator that stands elsewhere is from where it should be, normalised.
 DISPLACED_SIGMA = 0.5
+#: Smallest signal that tells a weak actuator from one that is displaced, and what is left of the move of a dead one.
+TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
+#: Of this probability on it is named how to go on without what does not move.
+SURE = 0.9
 
 
 def displaced_actuators(
@@ -57,3 +63,41 @@ def _probability(columns: Floats, power: Floats, white: Floats, actuator: int) -
     something = 0.5 * (whole - size) - 0.5 * size * np.log(whole / size) if whole > size else 0.0
     all_of_them = np.append(evidence - np.log(evidence.size), something)
     return float(np.exp(all_of_them[actuator] - np.logaddexp.reduce(all_of_them)))
+
+
+def displacement(
+    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], actuators: list[int]
+) -> tuple[Floats, Floats]:
+    """How far each of `actuators` stands from where it should, and its standard deviation.
+
+    By generalised least squares; other args as those of :func:`displaced_actuators`.
+    """
+    white = solve_triangular(factor[0], np.column_stack((gain[:, actuators], innovation)), trans="T")
+    inverse = np.linalg.pinv(white[:, :-1])
+    return np.asarray(inverse @ white[:, -1]), np.sqrt(np.square(inverse).sum(axis=1))
+
+
+def described(displaced: Mapping[int, float], probability: Mapping[int, float], expected: Floats) -> str:
+    """What a map that disagrees shows, where actuators should stand at `expected` (N,)."""
+    if not displaced:
+        return "bad map, or the mirror has changed"
+    faults = {actuator: _fault(expected[actuator], more) for actuator, more in displaced.items()}
+    found = ", ".join(
+        f"actuator {actuator + 1} stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
+        f"{faults[actuator]} ({probability[actuator]:.0%})"
+        for actuator, more in displaced.items()
+    )
+    if any("weakened" in faults[actuator] or probability[actuator] < SURE for actuator in displaced):
+        return found
+    without = " ".join(f"--without {actuator + 1}" for actuator in sorted(displaced))
+    return f"{found}; ./dm check {without} goes on without what does not move"
+
+
+def _fault(signal: float, more: float) -> str:
+    """What an actuator does that stands `more` beyond its effective `signal`; "" = no single map tells."""
+    if abs(signal) < TELLING_SIGNAL:
+        return ""
+    share = 1.0 + more / signal
+    if abs(share) < DEAD_SHARE:
+        return ", as if it were dead"
+    return f", as if weakened to {share:.0%}" if DEAD_SHARE <= share < 1.0 - DEAD_SHARE else ""

@@ -18,6 +18,7 @@ must not take it in.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,10 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_ma
 from dm_calibration.hysteresis.reduction import Reduction
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.recalibration.displaced import displaced_actuators
+from dm_calibration.influence.quality import GRADE_DEAD
+from dm_calibration.procedure.applied_history import MapNotUsableError
+from dm_calibration.recalibration.displaced import displaced_actuators, displacement
+from dm_calibration.recalibration.drift import Drift, DriftRates
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
@@ -41,66 +45,10 @@ NOISE_SHARE_MIN = 0.1
 NOISE_MIN = 1e-24
 #: What evidence counts for after one more map: it is of the last thirty maps or so.
 EVIDENCE_KEPT = 0.97
+#: An actuator that fails stands further from where it should than this many standard deviations.
+DISPLACED_SIGMAS = 4.0
 #: Gains of actuators that hardly show are not known worse than this.
 GAIN_SIGMA_MAX = 0.05
-
-
-@dataclass(frozen=True)
-class DriftRates:
-    """How fast a mirror is expected to change; standard deviations after one day, growing with the root of time.
-
-    Attributes:
-        gain: relative, of each gain; half of the variance is common to all (temperature).
-        figure: m rms.
-    """
-
-    gain: float = 3e-4
-    figure: float = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """What later maps have shown of a mirror. Never changed in place.
-
-    Attributes:
-        gain: (N,) relative changes.
-        offset: (R,) m rms, change of the figure in reduced values.
-        covariance: (N + R, N + R) of both.
-        stamp_ns: time it holds for.
-        revision: maps taken in.
-        checked_ns: stamp of the last of them; 0 = none.
-        surprising: maps in a row, the last ones, that disagreed.
-        foretold: sum of squares of the changes that were foretold to maps, in standard deviations.
-        borne_out: sum of their products with the changes that the maps showed.
-    """
-
-    gain: Floats
-    offset: Floats
-    covariance: Floats
-    stamp_ns: int
-    revision: int = 0
-    checked_ns: int = 0
-    surprising: int = 0
-    foretold: float = 0.0
-    borne_out: float = 0.0
-
-    @property
-    def trust(self) -> float:
-        """The share of gain and offset that maps not used for them have borne out, 0 to 1."""
-        if self.foretold <= 0.0:
-            return 0.0
-        return float(np.clip((self.borne_out - np.sqrt(self.foretold)) / self.foretold, 0.0, 1.0))
-
-    @property
-    def largest_gain(self) -> tuple[float, int]:
-        """The largest relative change of a gain as it is used, and the index of its actuator."""
-        index = int(np.abs(self.gain).argmax())
-        return self.trust * float(self.gain[index]), index
-
-    @property
-    def offset_rms(self) -> float:
-        """Change of the figure as it is used, m rms."""
-        return self.trust * float(np.linalg.norm(self.offset))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +72,28 @@ class Comparison:
     updated: Drift
     displaced: dict[int, float]
     probability: dict[int, float]
+
+
+class _Innovation(NamedTuple):
+    """A map against its prediction, in R reduced values.
+
+    Attributes:
+        prior: (N + R, N + R) covariance of gains and figure at its time.
+        design: (R, N + R) what it shows of them.
+        foretold, shown: (R,) change that the maps before foretell, and that it shows, m rms.
+        expected: (R, R) covariance of their difference.
+        factor: Cholesky factor of that.
+        zernike_error, sag_error: (K,) and (P,) m, from the calibration as it is used.
+    """
+
+    prior: Floats
+    design: Floats
+    foretold: Floats
+    shown: Floats
+    expected: Floats
+    factor: tuple[Floats, bool]
+    zernike_error: Floats
+    sag_error: Floats
 
 
 class DriftFilter:
@@ -161,7 +131,10 @@ class DriftFilter:
         share = np.divide(fit.standard_error, fit.response, out=np.full(fit.actuators, GAIN_SIGMA_MAX), where=shows)
         gain = np.square(np.minimum(share, GAIN_SIGMA_MAX))
         offset = (self._noise + np.diag(self._law)) / max(int(fit.used.sum()), 1) + fit.drift_rms**2 / values
-        return Drift(np.zeros(fit.actuators), np.zeros(values), np.diag(np.concatenate((gain, offset))), stamp_ns)
+        moving = np.full(fit.actuators, np.nan)
+        return Drift(
+            np.zeros(fit.actuators), np.zeros(values), np.diag(np.concatenate((gain, offset))), stamp_ns, moving
+        )
 
     def compare(
         self, drift: Drift, coefficients: Floats, sag: Floats, effective: Floats, stamp_ns: int, repeat: int = 0
@@ -176,66 +149,107 @@ class DriftFilter:
             repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
                 does not average out, so repeats count for less and less.
         """
-        actuators = len(effective)
-        elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns)) / DAY_S
-        prior = drift.covariance + elapsed * self._growth
-        design = np.hstack((self._gain * effective, np.eye(self.reduction.size)))
-        changed = self.changed(drift)
-        predicted_sag = changed.sag_offset + changed.influence_sag @ effective
-        predicted = changed.zernike_offset + changed.influence_zernike @ effective
-        filled = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0]
-        foretold = design @ np.concatenate((drift.gain, drift.offset))
-        shown = self.reduction.reduce(coefficients - predicted, filled - predicted_sag) + drift.trust * foretold
-        innovation = shown - foretold
-
+        seen = self._innovation(drift, coefficients, sag, effective, stamp_ns, repeat)
+        prior, design, innovation, factor = seen.prior, seen.design, seen.shown - seen.foretold, seen.factor
         shared = prior @ design.T
-        # What the calibration itself does not know of its influence function, beyond gains.
-        leverage = effective @ self._fit.signal_covariance @ effective
-        expected = design @ shared + (1.0 + leverage) * np.diag(self._noise) + (1.0 + repeat) ** 2 * self._law
-        factor = cho_factor(expected)
         correction = shared @ cho_solve(factor, innovation)
         # Joseph form: symmetric and positive whatever the rounding.
         kalman = cho_solve(factor, shared.T).T
         left = np.eye(len(prior)) - kalman @ design
-        noise = expected - design @ shared
+        noise = seen.expected - design @ shared
         covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
         evidence = (drift.foretold, drift.borne_out)
         if not repeat:  # a repeat shares the error of the law with the map before it
-            weighed = cho_solve(factor, foretold)
-            new = (float(weighed @ foretold), float(weighed @ shown))
+            weighed = cho_solve(factor, seen.foretold)
+            new = (float(weighed @ seen.foretold), float(weighed @ seen.shown))
             evidence = (EVIDENCE_KEPT * evidence[0] + new[0], EVIDENCE_KEPT * evidence[1] + new[1])
-        departure = remove_piston_tilt((filled - predicted_sag)[None], self._fit.points)[0]
-        updated = Drift(
-            drift.gain + correction[:actuators],
-            drift.offset + correction[actuators:],
-            0.5 * (covariance + covariance.T),
-            max(stamp_ns, drift.stamp_ns),
-            drift.revision + 1,
-            stamp_ns,
-            0,
-            *evidence,
+        updated = replace(
+            drift,
+            gain=drift.gain + correction[: len(effective)],
+            offset=drift.offset + correction[len(effective) :],
+            covariance=0.5 * (covariance + covariance.T),
+            stamp_ns=max(stamp_ns, drift.stamp_ns),
+            revision=drift.revision + 1,
+            checked_ns=stamp_ns,
+            surprising=0,
+            foretold=evidence[0],
+            borne_out=evidence[1],
         )
         displaced, probability = displaced_actuators(innovation, self._gain, factor)
+        departure = remove_piston_tilt(seen.sag_error[None], self._fit.points)[0]
         return Comparison(
-            max_zernike=float(np.abs(coefficients - predicted)[PISTON_TILT:].max()),
+            max_zernike=float(np.abs(seen.zernike_error)[PISTON_TILT:].max()),
             rms=float(rms(departure, self._fit.points.weight)),
-            surprise=_surprise(innovation, expected, factor),
+            surprise=_surprise(innovation, seen.expected, factor),
             updated=updated,
             displaced=displaced,
             probability=probability,
         )
 
+    def give_up(
+        self,
+        drift: Drift,
+        actuators: list[int],
+        coefficients: Floats,
+        sag: Floats,
+        effective: Floats,
+        stamp_ns: int,
+        repeat: int = 0,
+    ) -> Drift:
+        """`drift` of a mirror on which `actuators` have no effect any more and stand where a map shows them.
+
+        Other args as those of :meth:`compare`.
+
+        Raises:
+            MapNotUsableError: one stands where it should, as far as the map shows.
+        """
+        seen = self._innovation(drift, coefficients, sag, effective, stamp_ns, repeat)
+        away, sigma = displacement(seen.shown - seen.foretold, self._gain, seen.factor, actuators)
+        at = drift.standing(effective)
+        stuck = drift.stuck.copy()
+        for actuator, more, error in zip(actuators, away, sigma, strict=True):
+            if np.isnan(stuck[actuator]) and abs(more) < DISPLACED_SIGMAS * error:
+                raise MapNotUsableError(
+                    f"actuator {actuator + 1} stands at {at[actuator] + more:+.2f} +- {error:.2f}, and should at "
+                    f"{at[actuator]:+.2f}: this shape does not show that it fails; ask for another first"
+                )
+            stuck[actuator] = at[actuator] + more
+        return replace(drift, stuck=stuck)
+
+    def _innovation(
+        self, drift: Drift, coefficients: Floats, sag: Floats, effective: Floats, stamp_ns: int, repeat: int
+    ) -> _Innovation:
+        elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns)) / DAY_S
+        prior = drift.covariance + elapsed * self._growth
+        design = np.hstack((self._gain * np.where(np.isnan(drift.stuck), effective, 0.0), np.eye(self.reduction.size)))
+        changed = self.changed(drift)
+        predicted_sag = changed.sag_offset + changed.influence_sag @ effective
+        zernike_error = coefficients - changed.zernike_offset - changed.influence_zernike @ effective
+        sag_error = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0] - predicted_sag
+        foretold = design @ np.concatenate((drift.gain, drift.offset))
+        shown = self.reduction.reduce(zernike_error, sag_error) + drift.trust * foretold
+        # What the calibration itself does not know of its influence function, beyond gains.
+        leverage = effective @ self._fit.signal_covariance @ effective
+        expected = design @ prior @ design.T + (1.0 + leverage) * np.diag(self._noise) + (1.0 + repeat) ** 2 * self._law
+        return _Innovation(prior, design, foretold, shown, expected, cho_factor(expected), zernike_error, sag_error)
+
     def changed(self, drift: Drift) -> InfluenceFit:
-        """The influence function with gains and figure as far as what `drift` has found of them is borne out."""
-        fit = self._fit
+        """The influence function with gains and figure as far as what `drift` has found of them is borne out.
+
+        Actuators that do not move have none: what they do where they stand is part of the figure.
+        """
+        fit, moves = self._fit, np.isnan(drift.stuck)
         coefficients, sag = self.reduction.expand(drift.trust * drift.offset)
         gain = 1.0 + drift.trust * drift.gain
+        zernike, surface = fit.influence_zernike * gain, fit.influence_sag * gain
+        at = np.where(moves, 0.0, drift.stuck)
         return replace(
             fit,
-            influence_zernike=fit.influence_zernike * gain,
-            influence_sag=fit.influence_sag * gain,
-            zernike_offset=fit.zernike_offset + coefficients,
-            sag_offset=fit.sag_offset + sag,
+            influence_zernike=zernike * moves,
+            influence_sag=surface * moves,
+            zernike_offset=fit.zernike_offset + coefficients + zernike @ at,
+            sag_offset=fit.sag_offset + sag + surface @ at,
+            grades=np.where(moves, fit.grades, GRADE_DEAD).astype(np.uint8),
         )
 
     def _scatter(self, maps: MapSet) -> Floats:

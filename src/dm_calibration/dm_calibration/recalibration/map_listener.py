@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -28,6 +28,7 @@ from dm_common.messages import applied_from, measurement_from, stamp_ns
 from dm_common.ros import diagnostics, qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerService
+from dm_common.values import wholes
 
 #: Wall time for the driver to report after a map, s (it does so every 0.5 s).
 REPORT_WAIT_S = 3.0
@@ -111,13 +112,7 @@ class MapListener:
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""
-        doubts = []
-        updates = self._updates.updates
-        if updates is not None and self._updates.mirror_changed:
-            doubts.append(
-                f"The last {updates.surprising} maps disagree with this calibration: the mirror has changed, "
-                "calibrate again."
-            )
+        doubts = self._updates.doubts
         if self._stale:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
         return doubts
@@ -186,8 +181,10 @@ class MapListener:
             self._refuse(f"{type(error).__name__}: {error}")
             log.error(f"map not taken: {type(error).__name__}: {error}")
 
-    def _judge(self, measured: Measurement, dry_run: bool) -> Verdict:
+    def _judge(self, measured: Measurement, dry_run: bool, without: Sequence[int] = ()) -> Verdict:
         """Compare a map with the calibration and take it in; `_turn` must be held.
+
+        Args as of :meth:`RecalibrationManager.take`.
 
         Raises:
             Refusal: a calibration is running, or the driver is silent.
@@ -203,7 +200,7 @@ class MapListener:
             time.sleep(0.01)
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
-        verdict = self._updates.take(measured, self._history.settled(at, still), dry_run)
+        verdict = self._updates.take(measured, self._history.settled(at, still), dry_run, without)
         if dry_run:
             return verdict
         if verdict.accepted:
@@ -234,16 +231,18 @@ class MapListener:
         return response
 
     def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
-        if request.dry_run:
-            raise Refusal(ErrorCode.INVALID_ARGUMENT, "forget and dry_run: only one of them may be set")
-        self._check_calibrated()
+        if request.dry_run or request.without:
+            other = "dry_run" if request.dry_run else "without"
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"forget and {other}: only one of them may be set")
+        self._calibration()
         with self._turn:
             self._updates.forget()
         self._changed()
         response.message = "all updates are forgotten"
 
     def _check(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
-        self._check_calibrated()
+        actuators = self._calibration().fit.actuators
+        wholes([], 1, actuators, sizes=range(actuators)).check("without", request.without)
         with self._turn:
             if self._busy():
                 raise Refusal(ErrorCode.BUSY, "a calibration is running")
@@ -251,7 +250,7 @@ class MapListener:
                 self._wait_for_rest()
                 measured = self._services.measure_as_it_stands("calibration check")
             try:
-                verdict = self._judge(measured, request.dry_run)
+                verdict = self._judge(measured, request.dry_run, [number - 1 for number in request.without])
             except MapNotUsableError as error:
                 if not request.dry_run:
                     self._refuse(str(error))
@@ -270,9 +269,10 @@ class MapListener:
                 return  # the map will be refused, with the reason
             time.sleep(0.01)
 
-    def _check_calibrated(self) -> None:
-        if self._updates.calibration is None:
+    def _calibration(self) -> Calibration:
+        if (calibration := self._updates.calibration) is None:
             raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
+        return calibration
 
     # --- health ---
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.recalibration.drift_filter import Drift
+from dm_calibration.recalibration.drift import Drift
 from dm_calibration.store.hdf5_image import Attribute, Column, ImageError, content_hash, read_image, write_image
 from dm_calibration.store.hysteresis_storage import hysteresis_columns
 from dm_common.atomic_write import write_whole
@@ -40,7 +40,7 @@ def write_updates(path: Path, identifier: str, basis: str, updates: Drift) -> No
     Raises:
         OSError: what stood there before still does.
     """
-    columns: dict[str, Column] = {name: getattr(updates, name) for name in _ARRAYS}
+    columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, "stuck")}
     attributes: dict[str, Attribute] = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -82,9 +82,12 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         shape = getattr(like, name).shape
         if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
+    stuck = columns.get("stuck", like.stuck)  # before it was kept all moved
+    if not isinstance(stuck, np.ndarray) or stuck.shape != like.stuck.shape or np.isinf(stuck).any():
+        raise UpdatesFileError(f"{path.name}: stuck must be {like.stuck.shape} numbers, NaN where an actuator moves")
     evidence = {name: attributes.get(name, before) for name, before in _EVIDENCE.items()}
     for name, number in evidence.items():
         if not isinstance(number, float) or not np.isfinite(number):
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")
-    found: dict[str, Any] = {**arrays, **numbers, **evidence}
+    found: dict[str, Any] = {**arrays, **numbers, **evidence, "stuck": stuck}
     return Drift(**found)

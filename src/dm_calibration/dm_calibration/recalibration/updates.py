@@ -6,7 +6,7 @@ The calibration's own file is never touched. What later maps have shown stands b
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,7 +18,9 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
 from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
-from dm_calibration.recalibration.drift_filter import Comparison, Drift, DriftFilter, DriftRates
+from dm_calibration.recalibration.displaced import described
+from dm_calibration.recalibration.drift import Drift, DriftRates
+from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
 from dm_common.atomic_write import storing
 from dm_common.measurement import Measurement
@@ -30,8 +32,6 @@ Floats = NDArray[np.float64]
 REPEAT_S = 3600.0
 #: Moves that are nearer to each other in time are one, s.
 SAME_MOVE_S = 0.2
-#: Smallest signal that tells a weak actuator from one that is displaced, and what is left of the move of a dead one.
-TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
 SUFFIX = ".updates.hdf5"
 
 
@@ -115,6 +115,20 @@ class RecalibrationManager:
         with self._lock:
             return self._disagreement
 
+    @property
+    def doubts(self) -> list[str]:
+        """Sentences on why the calibration may not hold any more, or only in part."""
+        with self._lock:
+            doubts = []
+            if self._updates is not None and self.mirror_changed:
+                doubts.append(
+                    f"The last {self._updates.surprising} maps disagree with this calibration: the mirror has changed, "
+                    "calibrate again."
+                )
+            if self._updates is not None and self._updates.given_up:
+                doubts.append(f"{self._updates.given_up}.")
+            return doubts
+
     def begin(self, calibration: Calibration | None) -> str:
         """Keep `calibration` true from now on, with what is stored of it. Returns a remark on damaged files, "" = none.
 
@@ -148,14 +162,19 @@ class RecalibrationManager:
                 return None
             return self._filter.changed(self._updates)
 
-    def take(self, measured: Measurement, settled: SettledState, dry_run: bool = False) -> Verdict:
+    def take(
+        self, measured: Measurement, settled: SettledState, dry_run: bool = False, without: Sequence[int] = ()
+    ) -> Verdict:
         """Compare a map of the mirror at `settled` with the calibration, and take it in when it agrees.
 
         Args:
             dry_run: compare only.
+            without: indices of actuators that do not move any more: from now on without effect, standing where the
+                map shows them.
 
         Raises:
-            MapNotUsableError: there is no calibration, or the map cannot be compared with it.
+            MapNotUsableError: there is no calibration, or the map cannot be compared with it, or does not show that
+                the actuators fail.
             StoreError: the update could not be stored; nothing has changed.
         """
         with self._lock:
@@ -170,16 +189,21 @@ class RecalibrationManager:
                     f"{calibration.fit.actuators}"
                 )
             repeat = self._repeats(measured.stamp_ns, settled)
-            comparison = drift_filter.compare(
-                updates, measured.coefficients, measured.sag, settled.effective, measured.stamp_ns, repeat
-            )
+            seen = measured.coefficients, measured.sag, settled.effective, measured.stamp_ns, repeat
+            if without:
+                updates = drift_filter.give_up(updates, list(without), *seen)
+            comparison = drift_filter.compare(updates, *seen)
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
             if not accepted:
-                reason += f", more than {options.surprise_max:g}: {_cause(comparison, settled.effective)}"
+                reason += f", more than {options.surprise_max:g}: "
+                reason += described(comparison.displaced, comparison.probability, updates.standing(settled.effective))
+            elif without:
+                reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:
                 return Verdict(accepted, reason, comparison)
-            changed = comparison.updated if accepted else replace(updates, surprising=updates.surprising + 1)
+            before = self._updates or updates
+            changed = comparison.updated if accepted else replace(before, surprising=before.surprising + 1)
             with storing(f"the update of {calibration.id} was not stored in {self._folder}"):
                 write_updates(self._file(calibration.id), calibration.id, self._basis, changed)
             self._updates = changed
@@ -214,27 +238,6 @@ class RecalibrationManager:
 
     def _file(self, identifier: str) -> Path:
         return self._folder / f"{identifier}{SUFFIX}"
-
-
-def _cause(comparison: Comparison, effective: Floats) -> str:
-    """What a map that disagrees shows, for the settled effective signals (N,)."""
-    if not comparison.displaced:
-        return "bad map, or the mirror has changed"
-    return ", ".join(
-        f"actuator {actuator + 1} stands at {effective[actuator] + more:+.2f} instead of {effective[actuator]:+.2f}"
-        f"{_fault(effective[actuator], more)} ({comparison.probability[actuator]:.0%})"
-        for actuator, more in comparison.displaced.items()
-    )
-
-
-def _fault(signal: float, more: float) -> str:
-    """What an actuator does that stands `more` beyond its effective `signal`; "" = no single map tells."""
-    if abs(signal) < TELLING_SIGNAL:
-        return ""
-    share = 1.0 + more / signal
-    if abs(share) < DEAD_SHARE:
-        return ", as if it were dead"
-    return f", as if weakened to {share:.0%}" if DEAD_SHARE <= share < 1.0 - DEAD_SHARE else ""
 
 
 def check_map(measured: Measurement, calibration: Calibration, options: UpdateOptions) -> None:

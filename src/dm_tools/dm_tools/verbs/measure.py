@@ -57,6 +57,13 @@ def measure(
 def check(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Compare only; the calibration stays as it is.")] = False,
     forget: Annotated[bool, typer.Option("--forget", help="Drop all earlier updates; no map is taken.")] = False,
+    without: Annotated[
+        list[int] | None,
+        typer.Option(
+            metavar="NUMBER",
+            help="Go on without this actuator, which does not move any more; repeatable. --forget takes it back.",
+        ),
+    ] = None,
     take_over: TakeOverOption = False,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
@@ -66,11 +73,11 @@ def check(
     Needs the running suite (`dm up`) with an interferometer. Nothing moves. Exit status 1 when the map disagrees,
     or shows a larger error than is promised.
     """
-    if dry_run and forget:
-        raise typer.BadParameter("--dry-run and --forget: only one of them")
+    if forget and (dry_run or without):
+        raise typer.BadParameter(f"--{'dry-run' if dry_run else 'without'} and --forget: only one of them")
     with running_suite(namespace) as client, naming_holder(client):
         health = hear_health(client)
-        response = client.update_calibration(dry_run=dry_run, forget=forget, take_over=take_over)
+        response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
         calibration = client.latest("calibration")
     shape, capabilities = settled_shape(health), client.messages.get("capabilities")
     if shape is not None:
@@ -85,17 +92,23 @@ def check(
         console.print(f"largest coefficient: {verdict(promised, response.max_zernike)}")
         if not response.accepted:
             console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)
+        elif without:
+            console.print(response.message, soft_wrap=True)
     console.print(
         f"since the calibration was made: {response.revision} maps taken in, gains changed by up to "
         f"{response.gain_drift:.2%}, the figure by {nanometres(response.offset_drift):.2f} nm rms"
     )
     write_json(json, {"check": figures_of(response) | {"promised_nm": nanometres(promised)}})
     if not (response.accepted or forget):
-        next_step("./dm degauss and ./dm check again; if it still disagrees, ./dm calibrate")
+        cure = "as the message says, or ./dm calibrate" if "--without" in response.message else "./dm calibrate"
+        next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}")
         raise typer.Exit(1)
     if not (forget or kept(promised, response.max_zernike)):
         next_step("one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate")
         raise typer.Exit(1)
+    if without and not dry_run:
+        next_step("ask for the shape again: the command that stands counts on all actuators; ./dm status has the range")
+        return
     next_step(
         "./dm report writes what the calibration holds"
         if calibration.hysteresis.play_radius
