@@ -181,6 +181,15 @@ def test_the_store_with_the_youngest_calibration_is_taken(tmp_path: Path) -> Non
     assert folder_with("", (older, newer)) == folder_with("d", (older, newer)) == newer
 
 
+def test_its_nodes_run_as_those_of_launch_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    with pytest.raises(SystemExit):
+        cli.run(["--version"], "dm")
+    assert Path(os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "2", "what the user has set stays"
+
+
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [

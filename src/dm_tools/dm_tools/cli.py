@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import sys
+from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -105,12 +108,24 @@ def make_app() -> typer.Typer:
 app = make_app()
 
 
+def _set_environment() -> None:
+    """What every process of the suite runs with, unless `./dm` or the user has set it."""
+    from ament_index_python.packages import get_package_share_directory
+
+    from dm_bringup.nodes import node_environment
+
+    with suppress(LookupError, OSError):  # nothing is sourced: help is all that one gets
+        for name, value in node_environment(Path(get_package_share_directory("dm_bringup")) / "config").items():
+            os.environ.setdefault(name, value)
+
+
 def run(words: list[str], name: str) -> None:
     """Run the command with these words, and end the process with its exit status.
 
     Args:
         name: by which it was called.
     """
+    _set_environment()
     try:
         app(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
