@@ -140,7 +140,7 @@ PARSED = {
     "./dm bench --json runs/bench.json --plot runs/growth.png": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm bench --only focus": _LONG + "test_benchmark_ratios.py runs its jobs",
     "./dm paper --out runs/paper --json runs/paper.json": _LONG + "test_paper.py runs it",
-    "./dm doctor --config my_bench.yaml": "must complain while the scene runs; test_doctor.py runs it",
+    "./dm doctor --config my_bench.yaml": "test_doctor.py runs it",
     "./dm exec python -m studies.simulation_plot --output simulation.png": "draws for a minute",
     "./dm exec python -m pytest -q src/dm_driver/test/test_electronics_contract.py": "is a test of its own",
 }

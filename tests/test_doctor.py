@@ -31,6 +31,7 @@ from dm_simulation.interferometer.zygo_files import encode_dat
 from dm_tools.doctor import bench as doctor_bench
 from dm_tools.doctor import machine as doctor_machine
 from dm_tools.doctor.finding import Finding
+from dm_tools.verbs.doctor import held_by_the_nodes
 from dm_tools.verbs.up import shared_config
 from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
@@ -214,6 +215,15 @@ def test_a_port_in_use_is_named() -> None:
     assert finding is not None and f"trigger.port = {port}: Address already in use" in finding.problem
     gone = doctor_bench.tcp("127.0.0.1", port)
     assert gone is not None and "Connection refused" in gone.problem
+
+
+def test_what_the_running_nodes_hold_is_worth_a_note_only() -> None:
+    refused, alone = Finding("no EDAC40 answers", "check power"), Finding("none in the ROS domain 0", "", note=True)
+    running = Finding("virtual_bench, pdm_driver, in the ROS domain 0", "")
+    held = held_by_the_nodes("electronics at 127.0.0.1:1", refused, running._asdict())
+    assert held is not None and held.note and held.problem == refused.problem and "./dm status" in held.cure
+    for check, others in (("electronics at 127.0.0.1:1", alone), ("watched folder /maps", running)):
+        assert held_by_the_nodes(check, refused, others._asdict()) == refused
 
 
 def test_serial_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

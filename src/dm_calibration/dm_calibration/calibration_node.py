@@ -77,7 +77,8 @@ class CalibrationNode(Node):
         self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._ticker = self.create_timer(PUBLISH_PERIOD_S, self._listener.tick, clock=steady)
-        self._publish(None, None)
+        if not self._start_pending:  # else nobody shall take for uncalibrated what is about to be loaded
+            self._publish(None, None)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
 
     def make_safe(self) -> None:
@@ -131,6 +132,8 @@ class CalibrationNode(Node):
                 self.get_logger().info(f"{error}: calibrate first")
             else:
                 self.get_logger().warning(f"load_on_start = {name!r}: {error}")
+            if self._manager.in_use is None:
+                self._publish(None, None)
 
     def _on_list(self, _request: Any, response: Any) -> Any:
         in_use = self._manager.in_use

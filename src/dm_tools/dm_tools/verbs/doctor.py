@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from dm_tools.doctor.finding import Finding
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
+
+#: Checks of what only one can have at a time: the nodes, while they run.
+EXCLUSIVE = ("electronics", "serial port", "ports of the virtual bench")
 
 
 def doctor(
@@ -25,9 +29,9 @@ def doctor(
     checks = machine_checks(namespace)
     if config is not None:
         checks += bench_checks(config)
-    findings = {}
+    findings: dict[str, dict[str, Any] | None] = {}
     for name, run in checks:
-        finding = run()
+        finding = held_by_the_nodes(name, run(), findings.get("nodes that are running"))
         findings[name] = None if finding is None else finding._asdict()
         if finding is None or not finding.cure:
             console.print("[green]ok[/]   ", end=" ")
@@ -42,3 +46,10 @@ def doctor(
         raise typer.Exit(1)
     running = findings["nodes that are running"]
     next_step("./dm status" if running and not running["cure"] else f"./dm up{f' --config {config}' if config else ''}")
+
+
+def held_by_the_nodes(check: str, finding: Finding | None, running: dict[str, Any] | None) -> Finding | None:
+    """What a check has found, which is no more than a note where the nodes of the bench run and hold it."""
+    if finding is None or not check.startswith(EXCLUSIVE) or "pdm_driver" not in (running or {}).get("problem", ""):
+        return finding
+    return finding._replace(cure="none, if that is for the nodes that run; ./dm status says how they are", note=True)

@@ -20,12 +20,12 @@ STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
 def running_calibration(namespace: str) -> Path | None:
     """File of the calibration that the running suite uses; None = nothing runs, it has none, or it runs elsewhere."""
     from dm_client import DeformableMirrorClient
-    from dm_tools.running_suite import FIND_S, nodes_of_suite
+    from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
 
     with DeformableMirrorClient(namespace) as client:
         if not client.wait(lambda: nodes_of_suite(client), FIND_S):
             return None
-        client.wait(lambda: "calibration" in client.messages, FIND_S)
+        client.wait(lambda: "calibration" in client.messages, BUSY_S)
         message = client.messages.get("calibration")
     file = Path(message.file if message is not None else "")
     return file if file.name and file.is_file() else None

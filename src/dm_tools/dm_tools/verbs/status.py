@@ -79,9 +79,9 @@ def _calibration(calibration: Any) -> str:
         return "none in use"
     age = time.time() - calibration.header.stamp.sec
     doubtful = sum(grade != 0 for grade in calibration.actuator_grade)
-    law = "with hysteresis" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
+    law = f"law {calibration.hysteresis.law}" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
     return (
-        f"{calibration.id}: {calibration.maps_used} maps {ago(age)} ago, {law}, "
+        f"{calibration.id}: {calibration.maps_used} maps {ago(age)} ago, {law}; "
         f"{calibration.actuators - doubtful} of {calibration.actuators} actuators good"
     )
 

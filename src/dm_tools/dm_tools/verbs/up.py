@@ -104,6 +104,7 @@ def up(
 def say_when_ready(namespace: str, stop: threading.Event) -> None:
     """Wait until the suite of this namespace takes requests, and say so and what to do next."""
     from dm_client import DeformableMirrorClient
+    from dm_common.errors import ErrorCode
 
     started, late = time.monotonic(), False
     option = f" --namespace {namespace}" if namespace else ""
@@ -115,6 +116,8 @@ def say_when_ready(namespace: str, stop: threading.Event) -> None:
                 return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
             if {"mirror_info", "calibration", "capabilities"} - client.messages.keys():
                 return "calibration and focus_controller have not said yet what the mirror can do"
+            if client.messages["calibration"].id and client.capabilities.error_code == ErrorCode.NOT_CALIBRATED:
+                return "focus_controller has not taken the calibration yet"
             return ""
 
         while (lacking := lacks()) and not stop.wait(0.2):
