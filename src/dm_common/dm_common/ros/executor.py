@@ -219,5 +219,6 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
                 make_safe()
             if executor is not None:
                 executor.shutdown(WAKE_PERIOD_S)
+        rclpy.try_shutdown()  # worker threads know by it that the node is about to go
+        if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()

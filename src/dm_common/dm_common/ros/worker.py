@@ -36,7 +36,8 @@ NO_FIELDS = Fields({})
 
 def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
     """Log an exception of the body of `what`; answer it as ErrorCode.INTERNAL where the answer has a place for that."""
-    node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
+    if node.context.ok():  # else the process is ending: what a worker still used is gone, and so is who asked
+        node.get_logger().error(f"{what}:\n{traceback.format_exc()}")
     if hasattr(answer, "error_code"):
         answer.error_code = ErrorCode.INTERNAL
         answer.message = f"{type(error).__name__}: {error}"
