@@ -52,6 +52,7 @@ class FilmedScene:
         self.object_curvature = object_curvature
         self.refuse_beyond = HIGH
         self.requests: list[FocusRequest] = []
+        self.asked: list[FocusRequest] = []  # by the service `set_focus`
         self.history_known = False
         self.render: Callable[[float], np.ndarray] | None = None  # a curvature's image, instead of the plane's
         self.stamped = True
@@ -109,6 +110,7 @@ class FilmedScene:
         self._state.publish(state)
 
     def _on_set_focus(self, request: SetFocus.Request, response: SetFocus.Response) -> SetFocus.Response:
+        self.asked.append(request.request)
         response.state = self._judge(request.request)
         response.error_code, response.message = response.state.error_code, response.state.message
         return response
@@ -260,6 +262,11 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedSce
         return last.phase == AutofocusState.PHASE_TRACK and abs(last.curvature + 0.03) < 0.002
 
     wait_until(on_it, 60, "tracking of the moved object")
+    other = SetFocusDistance.Request(distance=7.0, holder="operator")
+    assert observer.call(SetFocusDistance, "set_focus_distance", other).error_code == ErrorCode.BUSY
+    other.take_over = True
+    assert observer.call(SetFocusDistance, "set_focus_distance", other).error_code == ErrorCode.OK
+    assert [(request.holder, request.take_over) for request in scene.asked] == [("operator", True)]
     stack = observer.run_goal(FocusStack, "focus_stack", FocusStack.Goal()).result
     assert (stack.error_code, stack.message) == (ErrorCode.BUSY, "the action autofocus is running; cancel it first")
     handle.cancel_goal_async()
