@@ -115,6 +115,7 @@ PARSED = {
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
     "./dm up --camera": "test_many_mirrors.py checks what it adds; test_autofocus_node.py runs such nodes",
     "./dm exec python examples/camera_focus.py": "test_autofocus_node.py runs it",
+    "./dm check --without 5": "that actuator is well; test_drift_updates.py checks such updates",
     "./dm test": "would run this test again",
     "./dm test --fast": "would run tests within a test",
     "./dm test src/dm_common/test/test_zernike_terms.py": "would run tests within a test",
