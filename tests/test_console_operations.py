@@ -98,11 +98,12 @@ def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser) -> No
     page.wait_for("Move: +0.0150 1/m stands after", 120)
 
 
-def test_the_surface_converges_on_the_interferometer(page: Browser) -> None:
+def test_the_surface_converges_on_the_interferometer(page: Browser, shots: Path) -> None:
     page.press("Converge")
     wait_until(lambda: page.text.startswith("Deformable") and "Converge: " in page.text, 120, "its outcome")
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
+    page.shoot(shots / "console.png")
     page.dismiss_all()
 
 
@@ -123,7 +124,6 @@ def test_the_loop_of_an_actuator_is_measured(page: Browser, shots: Path) -> None
     wait_until(functools.partial(page.pictures, "hysteresis loop of actuator 8"), 60, "the loop")
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
-    page.shoot(shots / "console-hysteresis.png")
     page.resize(*PHONE)
     page.shoot(shots / "console-hysteresis-phone.png")
     page.resize(*DESKTOP)

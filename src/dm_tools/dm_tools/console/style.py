@@ -22,6 +22,7 @@ h2 { font-size: 1.02rem; line-height: 1.4rem; font-weight: 650; margin: 0; }
 summary { cursor: pointer; }
 summary h2 { display: inline; }
 details.card:not([open]) { gap: 0; }
+.pair > details.card:not([open]) { align-self: start; }
 .state { display: flex; flex-wrap: wrap; gap: 8px; }
 .line { display: flex; flex-wrap: wrap; gap: 8px; align-items: center; width: 100%; }
 .badge { border: 1px solid var(--faint); border-radius: 999px; padding: 1px 10px; font-size: .85rem;

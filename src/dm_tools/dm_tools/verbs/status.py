@@ -92,7 +92,7 @@ def _promise(capabilities: Any) -> str:
     if capabilities.error_code:
         return f"none now: {capabilities.message}"
     return (
-        f"largest coefficient within {promise(capabilities.error_bound)} just after the calibration, from "
+        f"largest coefficient within {promise(capabilities.error_bound)} and what creep adds, from "
         f"{capabilities.curvature_min:+.4f} to {capabilities.curvature_max:+.4f} 1/m; each move says its own"
     )
 
