@@ -187,6 +187,17 @@ def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer:
     assert found.curvature == pytest.approx(0.0173, abs=depth_of_focus(lens.aperture_radius) / 2)
     assert found.images <= 10 and len(scene.requests) <= found.images + 1, "nothing is passed without an image"
 
+    handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
+    wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    tracked = len(scene.states)
+    while (images := len(scene.states) - tracked) < 30:
+        camera.place = 0.0173 - 0.0005 * images  # a third of a depth of focus from image to image
+        time.sleep(0.002)
+    assert scene.states[-1].curvature == pytest.approx(camera.place, abs=0.003)
+    assert {state.phase for state in scene.states[tracked:]} == {AutofocusState.PHASE_TRACK}, "without a new search"
+    handle.cancel_goal_async()
+    wait_until(result.done, what="the end after cancel")
+
 
 def test_a_focus_stack_gives_a_sharp_image_and_its_distances(
     scene: FilmedScene, observer: Observer, domain: int

@@ -67,18 +67,24 @@ class _Stage:
         return cut(self.camera.expose(self._place), self.camera.region())
 
 
-def _config(scene: Scene) -> SearchConfig:
+def search_of(scene: Scene) -> SearchConfig:
+    """The search of a scene, as the node has it where the hysteresis is known."""
     depth = scene.depth_of_focus
     points = max(NOISE_POINTS, 1 + math.ceil(2 * RANGE / (COARSE_STEP * depth)))
     return SearchConfig(-RANGE, RANGE, depth, points, approach=0.0)
 
 
-def _few_images(stage: _Stage) -> tuple[float | None, str]:
-    scene, config = stage.camera.scene, _config(stage.camera.scene)
+def model_of(scene: Scene) -> DefocusModel:
+    """The camera of a scene, as it is told."""
     told = FocusLens(
         scene.aperture_radius * scene.misinformed[1], scene.wavelength, scene.focal_length_px * scene.misinformed[0]
     )
-    model = DefocusModel((scene.region_px,) * 2, told, 2 * RANGE + BEYOND * config.tolerance)
+    return DefocusModel((scene.region_px,) * 2, told, 2 * RANGE + BEYOND * scene.depth_of_focus)
+
+
+def _few_images(stage: _Stage) -> tuple[float | None, str]:
+    scene = stage.camera.scene
+    config, model = search_of(scene), model_of(scene)
     search = FocusSearch(config, model, scene.start)
     while not search.done:
         stage.go(search.step.curvature)
@@ -88,7 +94,7 @@ def _few_images(stage: _Stage) -> tuple[float | None, str]:
 
 
 def _sweep_from_below(stage: _Stage) -> tuple[float | None, str]:
-    config = _config(stage.camera.scene)
+    config = search_of(stage.camera.scene)
     search = PeakSearch(SearchConfig(config.low, config.high, config.tolerance, config.coarse_points))
     while not search.done:
         stage.go(search.step.curvature)

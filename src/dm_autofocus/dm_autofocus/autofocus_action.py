@@ -18,10 +18,12 @@ from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
+from dm_autofocus.search.motion_tracking import MotionTracker
 from dm_autofocus.search.peak_search import Peak, Phase, SearchConfig
 from dm_autofocus.search.tracking import TrackConfig, Tracker
 from dm_autofocus.sharpness import Region, check_region, cut
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.messages import seconds
 from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.values import Fields, real, reals
 
@@ -139,9 +141,7 @@ class AutofocusAction(ProbeAction):
         self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region, peak: Peak, result: Any
     ) -> None:
         """Stay on the peak until cancelled or pre-empted: ends by Refusal only."""
-        values = self._values
-        trials = TrackConfig(values["track.dither"] * config.tolerance, values["track.drop"], values["track.patience"])
-        tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
+        tracker = self._tracker(peak, config, region)
         position = peak.curvature
         while True:
             wanted = tracker.step.curvature
@@ -149,7 +149,7 @@ class AutofocusAction(ProbeAction):
                 self._go(goal_handle, wanted)
                 position = wanted
             sample = self._measure(goal_handle, region)
-            tracker.feed(sample.sharpness)
+            tracker.feed(sample.sharpness, sample.regions, seconds(sample.image.header.stamp))
             self._report(goal_handle, Phase.TRACK, sample, wanted, 0, 0)
             if tracker.lost:
                 try:
@@ -161,8 +161,17 @@ class AutofocusAction(ProbeAction):
                     # Nothing to see now: what is seen here from now on is the new normal.
                     peak = Peak(tracker.centre, sample.sharpness, False)
                     position = math.nan
-                tracker = Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
+                tracker = self._tracker(peak, config, region)
             self._fill(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
+
+    def _tracker(self, peak: Peak, config: SearchConfig, region: Region) -> Tracker:
+        """What stays on a peak: by the optics where camera and mirror are known, else by sharpness alone."""
+        values = self._values
+        trials = TrackConfig(values["track.dither"] * config.tolerance, values["track.drop"], values["track.patience"])
+        model = self._model(config, region)
+        if isinstance(model, DefocusModel) and trials.dither > 0 and self._stands_where_sent():
+            return MotionTracker(peak, config, trials, model)
+        return Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
 
     def _report(
         self,

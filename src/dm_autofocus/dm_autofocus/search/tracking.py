@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dm_autofocus.search.peak_search import Step
 
@@ -63,12 +65,26 @@ class Tracker:
         self._trial: deque[float] = deque()
         self.step = Step(self.centre)
 
-    def feed(self, sharpness: float) -> None:
-        """Report the sharpness at `step`.
+    def feed(self, sharpness: float, images: Sequence[NDArray] = (), time: float = math.nan) -> None:
+        """Report what was measured at `step`.
+
+        Args:
+            sharpness: of the images.
+            images: grey levels, (H, W) each; what knows the camera learns from them.
+            time: when they were exposed [s].
 
         Raises:
-            ValueError: not a finite number.
+            ValueError: the sharpness is not a finite number.
         """
+        self._watch(sharpness)
+        if self.config.dither > 0:
+            self._trial.append(sharpness)
+            if len(self._trial) == 3:
+                self._move()
+            self.step = Step(min(max(self.centre + self._offset(), self.low), self.high))
+
+    def _watch(self, sharpness: float) -> None:
+        """Whether the peak is lost, by the sharpness of an image."""
         if not math.isfinite(sharpness):
             raise ValueError(f"sharpness = {sharpness}: must be a finite number")
         dull = sharpness < (1 - self.config.drop) * self.sharpness
@@ -76,11 +92,6 @@ class Tracker:
         self.lost = self.lost or self._dull >= self.config.patience
         if not dull:
             self.sharpness += self.FORGETTING * (sharpness - self.sharpness)
-        if self.config.dither > 0:
-            self._trial.append(sharpness)
-            if len(self._trial) == 3:
-                self._move()
-            self.step = Step(min(max(self.centre + self._offset(), self.low), self.high))
 
     def _offset(self) -> float:
         return (0.0, -self.config.dither, self.config.dither)[len(self._trial)]

@@ -1,0 +1,67 @@
+"""An object that moves is followed by how blurred the images are; one that stands still is not left."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from defocused_camera import DEPTH, LENS, SIDE, DefocusedCamera, clouds
+
+from dm_autofocus.search.defocus_model import DefocusModel
+from dm_autofocus.search.motion_tracking import MotionTracker
+from dm_autofocus.search.peak_search import Peak, SearchConfig
+from dm_autofocus.search.tracking import TrackConfig
+from dm_autofocus.sharpness import tenengrad
+
+LOW, HIGH = -0.05, 0.05
+PERIOD = 1 / 30
+
+
+@pytest.fixture(scope="module")
+def model() -> DefocusModel:
+    return DefocusModel((SIDE, SIDE), LENS, HIGH - LOW)
+
+
+def tracker_at(place: float, model: DefocusModel, sharpness: float) -> MotionTracker:
+    return MotionTracker(Peak(place, sharpness, False), SearchConfig(LOW, HIGH, DEPTH), TrackConfig(DEPTH / 2), model)
+
+
+def follow(model: DefocusModel, start: float, speed: float, images: int) -> tuple[MotionTracker, np.ndarray]:
+    """A tracker after that many images, and by how much each was off, in depths of focus."""
+    camera = DefocusedCamera(clouds(3), start)
+    tracker = tracker_at(start, model, tenengrad(camera.expose(start)))
+    off = []
+    for number in range(images):
+        camera.place = start + speed * number * PERIOD
+        off.append(tracker.step.curvature - camera.place)
+        image = camera.expose(tracker.step.curvature)
+        tracker.feed(tenengrad(image), (image,), 100.0 + number * PERIOD)
+    return tracker, np.abs(off) / DEPTH
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.02, -0.02])
+def test_the_focus_stays_on_an_object_that_moves(model: DefocusModel, speed: float) -> None:
+    """An object that comes nearer by 1 m/s at 5 m: 0.02 1/m per second, half a depth of focus from image to image."""
+    tracker, off = follow(model, 0.0, speed, 40)
+    assert not tracker.lost
+    assert np.all(off[10:] < 1.5) and np.median(off[10:]) < 0.8
+    assert tracker.speed == pytest.approx(speed, abs=0.005)
+
+
+def test_it_ends_at_the_end_of_the_range(model: DefocusModel) -> None:
+    tracker, _off = follow(model, HIGH - 0.01, 0.03, 30)
+    assert tracker.centre == HIGH and LOW <= tracker.step.curvature <= HIGH
+
+
+def test_what_is_seen_no_more_is_lost(model: DefocusModel) -> None:
+    tracker = tracker_at(0.0, model, 1.0)
+    blank = np.full((SIDE, SIDE), 100.0)
+    for number in range(3):
+        tracker.feed(0.0, (blank,), number * PERIOD)
+    assert tracker.lost
+    other = tracker_at(0.0, model, 1.0)
+    other.feed(1.0, (blank[1:],), 0.0)
+    assert other.lost, "images of another size"
+    with pytest.raises(ValueError, match="finite"):
+        other.feed(math.nan, (blank,), 0.0)
