@@ -78,6 +78,7 @@ WIRING = list(range(1, 38))
 TWO_RINGS = {"mirror.actuators": 19, "mirror.wiring": "custom", "mirror.channels": WIRING[:19]}
 LINK = {"electronics.pty_link": "tty", "framed.channels": 40}
 
+NO_FILES: dict[str, Any] = {"watch_folder": "", "trigger_command": []}
 _FOLDER = TemporaryDirectory()
 #: A map of 632.8 nm.
 FLAT = Path(_FOLDER.name) / "flat.dat"
@@ -94,6 +95,9 @@ CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
         "reference_surface: /nowhere/flat.dat: No such file",
     ),
     ("interferometer", {"reference_surface": str(FLAT), "wavelength.expected": 532e-9}, "must be 532.000 nm"),
+    ("interferometer", {"zernike_topic": "/wavefront/zernike"}, "must be empty beside it"),
+    ("interferometer", {"zernike_topic": "/zernike", **NO_FILES}, "is what this node itself publishes"),
+    ("interferometer", {"zernike_topic": "wave front", **NO_FILES}, "zernike_topic = 'wave front'"),
     ("interferometer", {"trigger_output_suffix": "../x"}, "must be an ending such as .datx"),
     ("pdm_driver", {"mirror.serial": " "}, "mirror.serial is empty"),
     ("pdm_driver", {"mirror.actuators": 19}, "lists 37 channels: must be 19"),

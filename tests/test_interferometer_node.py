@@ -18,7 +18,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from sensor_msgs.msg import Image
 
 from dm_common.errors import ErrorCode
-from dm_common.optics.zernike import basis
+from dm_common.optics.zernike import basis, born_wolf_to_fringe
 from dm_common.ros import qos
 from map_fixtures import WAVELENGTH, dat_bytes, disc_counts, write_datx
 from support import NodeProcess, Observer, wait_until
@@ -338,3 +338,25 @@ def test_neither_trigger_nor_folder(observer: Observer, start: Start) -> None:
     answer = StartedInterferometer(observer, start).measure()
     assert answer.error_code == ErrorCode.NOT_SUPPORTED
     assert "neither trigger_command nor watch_folder" in answer.message
+
+
+def test_a_sensor_on_a_topic_takes_the_place_of_map_files(observer: Observer, start: Start) -> None:
+    bench = StartedInterferometer(observer, start, zernike_topic="wavefront/zernike")
+    publisher = observer.node.create_publisher(ZernikeCoefficients, "wavefront/zernike", 10)
+    coefficients = 1e-7 * np.arange(21.0)
+    seen = ZernikeCoefficients(convention=ZernikeCoefficients.FRINGE, radius=0.011, residual_rms=5e-9)
+    seen.coefficients = born_wolf_to_fringe(coefficients).tolist()
+
+    def stream() -> None:
+        seen.header.stamp = observer.node.get_clock().now().to_msg()
+        publisher.publish(seen)
+
+    timer = observer.node.create_timer(0.02, stream)
+    answer = bench.measure(label="poke")
+    observer.node.destroy_timer(timer)
+    assert answer.error_code == ErrorCode.OK and answer.message.startswith("measured poke: topic /"), answer.message
+    np.testing.assert_allclose(answer.zernike.coefficients, coefficients, atol=1e-12)
+    assert answer.zernike.convention == ZernikeCoefficients.BORN_WOLF and answer.zernike.residual_rms == 5e-9
+    assert answer.info.aperture_radius == pytest.approx(0.011) and not answer.info.file
+    bench.wait_for_maps(1)
+    assert len(bench.zernikes) == 1  # not everything that the sensor sees

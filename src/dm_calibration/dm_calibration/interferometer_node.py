@@ -19,25 +19,26 @@ from dm_msgs.msg import MirrorInfo, SurfaceMapInfo, SurfaceSamples, ZernikeCoeff
 from dm_msgs.srv import IngestFile, Measure
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.subscription import Subscription
 from rclpy.time import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from dm_calibration.acquisition import interferometer_messages as messages
-from dm_calibration.acquisition.acquisition import Acquisition
-from dm_calibration.acquisition.ingest import Ingest, too_large
+from dm_calibration.acquisition.acquisition import Acquisition, measured_ns
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings, too_large
 from dm_calibration.acquisition.reference_surface import reference_name
+from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
 from dm_calibration.interferometer_parameters import PARAMETERS, configure, ingest_settings
 from dm_calibration.map_files import MapFileError, SurfaceMap
 from dm_calibration.requests import INGEST_FILE, MEASURE
 from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.measurement import Measurement
+from dm_common.messages import stamp_ns
 from dm_common.ros import diagnostics, parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.worker import WorkerService
-
-#: A watched file's modification time further in the past is not believed (clocks of two machines differ).
-_RECENT_NS = 60 * 10**9
 
 
 class InterferometerNode(LifecycleNode):
@@ -52,7 +53,8 @@ class InterferometerNode(LifecycleNode):
         )
         self._ingest = Ingest()
         self._reference: SurfaceMap | None = None
-        self._acquisition: Acquisition | None = None
+        self._acquisition: Acquisition | SensorAcquisition | None = None
+        self._sensor: Subscription | None = None
         self._publishing = threading.Lock()  # the four messages of one map stay together
         self._taken = self._bad = 0
         self._last_file = self._last_refusal = ""
@@ -90,6 +92,8 @@ class InterferometerNode(LifecycleNode):
             self._values.check()
             settings, self._reference = configure(self._values)
             self._acquisition = Acquisition(settings, self._read, self._now_ns, self._on_new_file, self._warn_of_file)
+            if topic := self._values["zernike_topic"]:
+                self._listen_to(topic)
         except ValueError as error:
             self.get_logger().error(f"cannot configure: {error}")
             return TransitionCallbackReturn.FAILURE
@@ -99,14 +103,25 @@ class InterferometerNode(LifecycleNode):
         self._configured = True
         return TransitionCallbackReturn.SUCCESS
 
+    def _listen_to(self, topic: str) -> None:
+        """Take measurements from a sensor in place of map files."""
+        source = f"topic {self.resolve_topic_name(topic)}"
+        self._acquisition = sensor = SensorAcquisition(
+            source, lambda seen: read_sensor(seen, self._ingest, self._settings()), self._now_ns
+        )
+
+        def heard(message: ZernikeCoefficients) -> None:
+            sensor.offer(lambda: messages.sensor_map(message, source), stamp_ns(message.header.stamp))
+
+        self._sensor = self.create_subscription(ZernikeCoefficients, topic, heard, qos_profile_sensor_data)
+
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         assert self._acquisition is not None
         result = super().on_activate(state)
         self._active = True
         self._acquisition.start()
-        source = self._acquisition.settings.folder or "files named to ingest_file only"
         less = f", less {reference_name(self._reference)}" if self._reference is not None else ""
-        self.get_logger().info(f"active; maps from {source}{less}")
+        self.get_logger().info(f"active; maps from {self._acquisition.source}{less}")
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -132,13 +147,11 @@ class InterferometerNode(LifecycleNode):
         if self._configured:
             self._configured = False
             with self._publishing:
-                for publisher in (
-                    self._map_publisher,
-                    self._zernike_publisher,
-                    self._samples_publisher,
-                ):
+                for publisher in (self._map_publisher, self._zernike_publisher, self._samples_publisher):
                     self.destroy_lifecycle_publisher(publisher)
-        self._acquisition = None
+        if self._sensor is not None:
+            self.destroy_subscription(self._sensor)
+        self._acquisition = self._sensor = None
 
     def _on_ingest_file(self, request: IngestFile.Request, response: IngestFile.Response) -> IngestFile.Response:
         if not self._configured:
@@ -188,17 +201,19 @@ class InterferometerNode(LifecycleNode):
             self._published.pop(next(iter(self._published)))
 
     def _read(self, path: Path) -> tuple[SurfaceMap, Measurement]:
-        return self._ingest.read(path, ingest_settings(self._values, self._mirror_radius, self._reference))
+        return self._ingest.read(path, self._settings())
+
+    def _settings(self) -> IngestSettings:
+        return ingest_settings(self._values, self._mirror_radius, self._reference)
 
     def _accept(self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str) -> Any:
         if self._active:
             self._publish(surface, measured, header)
         self._log_taken(surface, measured, what)
         response.error_code = ErrorCode.OK
-        response.message = (
-            f"{what}: {Path(surface.file).name}, rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
-            f"{_mended(surface)}"
-        )
+        name = Path(surface.file).name or surface.instrument
+        shown = f"rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
+        response.message = f"{what}: {name}, {shown}{_mended(surface)}"
         response.info = messages.info_message(surface, measured, header)
         response.zernike = messages.zernike_message(measured, header)
         response.samples = messages.samples_message(measured, header)
@@ -218,10 +233,8 @@ class InterferometerNode(LifecycleNode):
     def _log_taken(self, surface: SurfaceMap, measured: Measurement, what: str) -> None:
         self._taken += 1
         self._last_file, self._last_refusal = surface.file, ""
-        self.get_logger().info(
-            f"{what}: {surface.file}: PV {surface.pv * 1e9:.1f} nm, rms {surface.rms * 1e9:.1f} nm, "
-            f"{100 * measured.valid_fraction:.1f} % valid{_mended(surface)}"
-        )
+        shown = f"PV {surface.pv * 1e9:.1f} nm, rms {surface.rms * 1e9:.1f} nm, {measured.valid_fraction:.1%} valid"
+        self.get_logger().info(f"{what}: {surface.file or surface.instrument}: {shown}{_mended(surface)}")
         if surface.pitch is None and not self._warned_of_pitch:
             self._warned_of_pitch = True
             self.get_logger().warning(
@@ -251,16 +264,7 @@ class InterferometerNode(LifecycleNode):
 
     def _file_time(self, surface: SurfaceMap, believe_header: bool) -> int:
         now = self._now_ns()
-        if self.get_clock().ros_time_is_active:
-            return now
-        if believe_header and surface.time_stamp is not None and 0 < surface.time_stamp * 1e9 <= now:
-            return round(surface.time_stamp * 1e9)
-        try:
-            modified = Path(surface.file).stat().st_mtime_ns
-        except OSError:
-            return now
-        oldest = 0 if believe_header else now - _RECENT_NS
-        return modified if oldest < modified <= now else now
+        return now if self.get_clock().ros_time_is_active else measured_ns(surface, now, believe_header)
 
     def _health(self) -> diagnostics.Health:
         acquisition = self._acquisition

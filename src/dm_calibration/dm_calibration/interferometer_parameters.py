@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.validate_topic_name import validate_topic_name
+
 from dm_calibration.acquisition.acquisition import AcquisitionSettings
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.reference_surface import load_reference
@@ -32,6 +35,12 @@ PARAMETERS = (
         texts([]),
         "Command that makes the instrument take a map, as an argument list (no shell); {path} in an argument is "
         "replaced by the file in watch_folder it must write. Empty = measure waits for the next new file.",
+    ),
+    Parameter(
+        "zernike_topic",
+        text(""),
+        "Topic of ZernikeCoefficients, in any convention, from a sensor such as a Shack-Hartmann, in place of map "
+        "files; empty = none.",
     ),
     Parameter("trigger_output_suffix", text(".datx"), "Ending of the file name that replaces {path}."),
     Parameter("trigger_timeout", real(30.0, 0.1, 3600.0, "s"), "Time limit of trigger_command."),
@@ -106,6 +115,16 @@ def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMa
     Raises:
         ValueError: values that contradict each other, a folder of an unknown user, or no map to refer to.
     """
+    topic = values["zernike_topic"]
+    if topic and (values["watch_folder"] or values["trigger_command"] or values["reference_surface"]):
+        others = "watch_folder, trigger_command and reference_surface"
+        raise ValueError(f"zernike_topic = {topic!r}: {others} must be empty beside it")
+    if topic.strip("/") == "zernike":
+        raise ValueError(f"zernike_topic = {topic!r}: is what this node itself publishes")
+    try:
+        validate_topic_name(topic or "none")
+    except InvalidTopicNameException as error:
+        raise ValueError(f"zernike_topic = {topic!r}: {error}") from error
     path, unit = values["reference_surface"], values["xyz_unit"]
     expected = values["wavelength.expected"], values["wavelength.tolerance"]
     return acquisition_settings(values), load_reference(path, unit, *expected) if path else None

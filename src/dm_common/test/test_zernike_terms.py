@@ -83,10 +83,21 @@ def test_converters_describe_the_same_surface(convention: str) -> None:
 @settings(max_examples=20, deadline=None)
 @given(arrays(float, (3, 21), elements=st.floats(-1e3, 1e3)))
 def test_converters_there_and_back(coefficients: np.ndarray) -> None:
-    for name in ("noll", "ansi"):
+    for name in ("noll", "ansi", "fringe"):
         there = getattr(zernike, f"born_wolf_to_{name}")(coefficients)
         back = getattr(zernike, f"{name}_to_born_wolf")(there)
         np.testing.assert_allclose(back, coefficients, rtol=1e-12, atol=1e-12)
+
+
+def test_fringe_order_is_that_of_the_book() -> None:
+    """J. C. Wyant and K. Creath, Basic wavefront aberration theory, table III: piston to secondary trefoil."""
+    polar = [(0, 0), (1, 1), (1, -1), (2, 0), (2, 2), (2, -2), (3, 1), (3, -1), (4, 0), (3, 3), (3, -3)]
+    polar += [(4, 2), (4, -2), (5, 1), (5, -1), (6, 0), (4, 4), (4, -4), (5, 3), (5, -3)]
+    index = {(term.n, -term.m if term.kind == "sin" else term.m): term.fringe_index for term in TERMS}
+    assert [index.get(term, 16) for term in polar] == list(range(1, 21))
+    assert (index[5, 5], index[5, -5]) == (26, 27)
+    fringe = np.arange(1.0, 38.0)
+    np.testing.assert_array_equal(zernike.fringe_to_born_wolf(fringe), [term.fringe_index for term in TERMS])
 
 
 def test_wrong_number_of_coefficients_is_refused() -> None:

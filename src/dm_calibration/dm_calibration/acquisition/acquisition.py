@@ -21,6 +21,8 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.measurement import Measurement
 
 _POLL_OUTPUT_S = 0.01
+#: A watched file's modification time further in the past is not believed (clocks of two machines differ).
+_RECENT_NS = 60 * 10**9
 #: A folder that cannot be read for so long is worth a warning, s: who makes it may be starting at the same time.
 FOLDER_PATIENCE_S = 5.0
 
@@ -113,6 +115,11 @@ class Acquisition:
         self._waiting: queue.SimpleQueue[Path] | None = None
         self._waiting_since = 0.0
         self._numbers = count(1)
+
+    @property
+    def source(self) -> str:
+        """Where maps come from."""
+        return str(self.settings.folder or "files named to ingest_file only")
 
     def start(self) -> None:
         """Begin to watch; what is in the folder now is not new."""
@@ -273,3 +280,18 @@ class Acquisition:
                 self._waiting = None  # one file per request
                 return
         self._on_file(event.path)
+
+
+def measured_ns(surface: SurfaceMap, now_ns: int, believe_header: bool) -> int:
+    """When the map in a file was measured, ns: by the file where that can be right, else `now_ns`.
+
+    Args:
+        believe_header: the time in the file, however old; else when the file was written, if that was recent.
+    """
+    if believe_header and surface.time_stamp is not None and 0 < surface.time_stamp * 1e9 <= now_ns:
+        return round(surface.time_stamp * 1e9)
+    try:
+        modified = Path(surface.file).stat().st_mtime_ns
+    except OSError:
+        return now_ns
+    return modified if (0 if believe_header else now_ns - _RECENT_NS) < modified <= now_ns else now_ns

@@ -92,6 +92,11 @@ class Ingest:
             except (InsufficientDataError, MapRejectedError, PhaseStepError) as error:
                 raise type(error)(f"{path}: {error}") from error
 
+    def measure_once(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
+        """As :meth:`measure`, for any number of threads."""
+        with self._turn:
+            return self.measure(source, settings)
+
     def measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
         """Orient and fit a map that was read; not for two threads at a time. Raises as :meth:`read`."""
         difference = abs(source.wavelength - settings.wavelength)

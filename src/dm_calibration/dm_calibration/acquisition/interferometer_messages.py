@@ -3,14 +3,34 @@
 from __future__ import annotations
 
 import array
+from collections.abc import Callable
 
+import numpy as np
 from dm_msgs.msg import SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
+from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
+from dm_calibration.acquisition.reference_surface import MapRejectedError
+from dm_calibration.acquisition.sensor import sensor_surface
 from dm_calibration.map_files import SurfaceMap
 from dm_common.measurement import Measurement
 from dm_common.messages import doubles
+from dm_common.optics.zernike import TERMS, ansi_to_born_wolf, fringe_to_born_wolf, noll_to_born_wolf
+
+
+def _born_wolf(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    if coefficients.shape != (len(TERMS),):
+        raise ValueError(f"coefficients: {coefficients.size}, must be {len(TERMS)}")
+    return coefficients
+
+
+_TO_BORN_WOLF: dict[int, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+    ZernikeCoefficients.BORN_WOLF: _born_wolf,
+    ZernikeCoefficients.NOLL: noll_to_born_wolf,
+    ZernikeCoefficients.ANSI: ansi_to_born_wolf,
+    ZernikeCoefficients.FRINGE: fringe_to_born_wolf,
+}
 
 
 def image_message(surface: SurfaceMap, header: Header) -> Image:
@@ -65,6 +85,33 @@ def zernike_message(measured: Measurement, header: Header) -> ZernikeCoefficient
         residual_rms=measured.residual_rms,
         valid_fraction=measured.valid_fraction,
     )
+
+
+def coefficients_of(message: ZernikeCoefficients) -> NDArray[np.float64]:
+    """(21,) m in the order of Born & Wolf, of a message in any convention.
+
+    Raises:
+        MapRejectedError: an unknown convention, too few terms, or values that are not finite.
+    """
+    try:
+        convert = _TO_BORN_WOLF[message.convention]
+        coefficients = convert(np.array(message.coefficients, dtype=np.float64))
+    except KeyError as error:
+        raise MapRejectedError(f"convention = {error}: must be one of {sorted(_TO_BORN_WOLF)}") from error
+    except ValueError as error:
+        raise MapRejectedError(str(error)) from error
+    if not (np.isfinite(coefficients).all() and np.isfinite([message.radius, message.wavelength]).all()):
+        raise MapRejectedError("coefficients, radius and wavelength: must be finite")
+    return coefficients
+
+
+def sensor_map(message: ZernikeCoefficients, source: str) -> tuple[SurfaceMap, float]:
+    """The surface that a sensor has seen, and what its terms leave unexplained, m. Raises MapRejectedError."""
+    try:
+        coefficients = coefficients_of(message)
+    except MapRejectedError as error:
+        raise MapRejectedError(f"{source}: {error}") from error
+    return sensor_surface(coefficients, message.radius, message.wavelength, source), message.residual_rms
 
 
 def samples_message(measured: Measurement, header: Header) -> SurfaceSamples:

@@ -1,4 +1,4 @@
-"""The 21 Zernike terms to order 5 in the convention of Born & Wolf, and converters to Noll and OSA/ANSI.
+"""The 21 Zernike terms to order 5 in the convention of Born & Wolf, and converters to Noll, OSA/ANSI and Fringe order.
 
 Born & Wolf ([2], section 9.2.1): peak-normalised, every term is 1 at most on the unit disc. The order
 is that of [1]: n rising, m rising, cosine before sine. x points right, y up, the angle counts from x to y. Coefficients
@@ -74,6 +74,11 @@ class Term(NamedTuple):
         azimuthal = -self.m if self.kind == "sin" else self.m
         return (self.n * (self.n + 2) + azimuthal) // 2
 
+    @property
+    def fringe_index(self) -> int:
+        """Fringe (University of Arizona) index j = 1, 2, 3, ...: by n + m, of those with the same sum by falling m."""
+        return ((self.n + self.m) // 2 + 1) ** 2 - 2 * self.m + (self.kind == "sin")
+
 
 TERMS: tuple[Term, ...] = tuple(
     Term(n, m, kind)
@@ -141,42 +146,58 @@ def rms_beyond_tilt(coefficients: ArrayLike, residual: float = 0.0) -> float:
     return float(np.hypot(np.linalg.norm((_checked(coefficients) * TERM_RMS)[PISTON_TILT:]), residual))
 
 
-def _checked(coefficients: ArrayLike) -> NDArray[np.float64]:
+def _checked(coefficients: ArrayLike, count: int = len(TERMS), more: bool = False) -> NDArray[np.float64]:
+    """As an array, with `count` terms on the last axis, or `more`."""
     values = np.asarray(coefficients, dtype=float)
-    if values.ndim < 1 or values.shape[-1] != len(TERMS):
-        raise ValueError(f"coefficients of shape {values.shape}: the last axis must have {len(TERMS)} terms")
+    if values.ndim < 1 or not (values.shape[-1] == count or (more and values.shape[-1] > count)):
+        least = "at least " if more else ""
+        raise ValueError(f"coefficients of shape {values.shape}: the last axis must have {least}{count} terms")
     return values
 
 
 _FROM_NOLL = np.array([term.noll_index - 1 for term in TERMS])
 _FROM_ANSI = np.array([term.ansi_index for term in TERMS])
+_FROM_FRINGE = np.array([term.fringe_index - 1 for term in TERMS])
 
 
 def born_wolf_to_noll(coefficients: ArrayLike) -> NDArray[np.float64]:
     """(..., 21) peak-normalised in Born & Wolf's order to (..., 21) rms-normalised, Noll index 1 to 21."""
-    return _to_rms_normalised(coefficients, _FROM_NOLL)
+    return _in_order(_checked(coefficients) * TERM_RMS, _FROM_NOLL)
 
 
 def noll_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """Inverse of :func:`born_wolf_to_noll`."""
-    return _checked(coefficients)[..., _FROM_NOLL] / TERM_RMS
+    """Inverse of :func:`born_wolf_to_noll`; terms beyond order 5 are left out."""
+    return _from_order(coefficients, _FROM_NOLL) / TERM_RMS
 
 
 def born_wolf_to_ansi(coefficients: ArrayLike) -> NDArray[np.float64]:
     """(..., 21) peak-normalised in Born & Wolf's order to (..., 21) rms-normalised, OSA/ANSI index 0 to 20."""
-    return _to_rms_normalised(coefficients, _FROM_ANSI)
+    return _in_order(_checked(coefficients) * TERM_RMS, _FROM_ANSI)
 
 
 def ansi_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """Inverse of :func:`born_wolf_to_ansi`."""
-    return _checked(coefficients)[..., _FROM_ANSI] / TERM_RMS
+    """Inverse of :func:`born_wolf_to_ansi`; terms beyond order 5 are left out."""
+    return _from_order(coefficients, _FROM_ANSI) / TERM_RMS
 
 
-def _to_rms_normalised(coefficients: ArrayLike, position: NDArray[np.intp]) -> NDArray[np.float64]:
-    values = _checked(coefficients)
-    result = np.empty_like(values)
-    result[..., position] = values * TERM_RMS
+def born_wolf_to_fringe(coefficients: ArrayLike) -> NDArray[np.float64]:
+    """(..., 21) in Born & Wolf's order to (..., 27) in Fringe order, peak-normalised both; 0 beyond order 5."""
+    return _in_order(_checked(coefficients), _FROM_FRINGE)
+
+
+def fringe_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
+    """Inverse of :func:`born_wolf_to_fringe`, of (..., 27) or more; terms beyond order 5 are left out."""
+    return _from_order(coefficients, _FROM_FRINGE)
+
+
+def _in_order(values: NDArray[np.float64], position: NDArray[np.intp]) -> NDArray[np.float64]:
+    result = np.zeros((*values.shape[:-1], position.max() + 1))
+    result[..., position] = values
     return result
+
+
+def _from_order(coefficients: ArrayLike, position: NDArray[np.intp]) -> NDArray[np.float64]:
+    return _checked(coefficients, int(position.max()) + 1, more=True)[..., position]
 
 
 def tilt_influence(

@@ -1,0 +1,120 @@
+"""Measurements from a sensor that publishes Zernike coefficients, on request. Knows no ROS."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.acquisition.acquisition import Acquired
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
+from dm_calibration.map_files import SurfaceMap
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.measurement import Measurement
+from dm_common.optics.zernike import basis
+
+#: Pixels along a side of the map that coefficients are drawn as.
+PIXELS = 256
+
+#: A surface and what the sensor leaves unexplained, m rms.
+Seen = tuple[SurfaceMap, float]
+
+
+@cache
+def _terms() -> NDArray[np.float64]:
+    """(PIXELS, PIXELS, 21), NaN outside the disc that touches the edges; row 0 = top."""
+    centres = (2.0 * np.arange(PIXELS) + 1.0) / PIXELS - 1.0
+    x, y = np.meshgrid(centres, -centres)
+    return np.where((x**2 + y**2 <= 1.0)[..., None], basis(x, y), np.nan)
+
+
+def sensor_surface(coefficients: NDArray[np.float64], radius: float, wavelength: float, source: str) -> SurfaceMap:
+    """The sag of `coefficients` (21,), m, over a disc of `radius`, m (0 = not known)."""
+    pitch = 2.0 * radius / PIXELS if radius > 0.0 else None
+    return SurfaceMap(_terms() @ coefficients, wavelength, pitch, "zernike", instrument=source)
+
+
+def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
+    """Map and measurement of what a sensor has seen: over the aperture that is configured, else over its own.
+
+    Raises:
+        MapRejectedError, InsufficientDataError: see :class:`Ingest`.
+    """
+    surface, residual_rms = seen
+    if not settings.aperture_radius and surface.pitch:
+        settings = replace(settings, aperture_radius=0.5 * PIXELS * surface.pitch, aperture_centre=(0.0, 0.0))
+    surface, measured = ingest.measure_once(surface, settings)
+    sag = basis(measured.points.x, measured.points.y) @ measured.coefficients  # exactly, also between pixels
+    return surface, replace(measured, residual_rms=residual_rms, sag=sag)
+
+
+class SensorAcquisition:
+    """Takes the first measurement that was begun after a request; those between requests are let go.
+
+    Args:
+        source: what the sensor is called.
+        read: makes a map of its aperture, and what was found in it, of what the sensor has seen.
+        now_ns: the clock of its stamps.
+    """
+
+    #: The sensor leaves no files.
+    folder_trouble = ""
+
+    def __init__(
+        self, source: str, read: Callable[[Seen], tuple[SurfaceMap, Measurement]], now_ns: Callable[[], int]
+    ) -> None:
+        self.source = source
+        self._read, self._now_ns = read, now_ns
+        self._changed = threading.Condition()
+        self._stopped, self._since = True, -1  # ns; -1 = nobody waits
+        self._seen: tuple[Callable[[], Seen], int] | None = None
+
+    def start(self) -> None:
+        """Take measurements from now on."""
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End a measurement that is under way."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+    def offer(self, seen: Callable[[], Seen], stamp_ns: int) -> None:
+        """Something the sensor has seen at `stamp_ns`; made out where somebody waits for it."""
+        with self._changed:
+            if 0 <= self._since <= stamp_ns and self._seen is None:
+                self._seen = seen, stamp_ns
+                self._changed.notify_all()
+
+    def acquire(self, timeout_s: float) -> Acquired:
+        """The next measurement.
+
+        Raises:
+            MapRejectedError and what else `read` raises: it is no good.
+            Refusal: MAP_TIMEOUT when none came in time, INTERFEROMETER_INACTIVE when :meth:`stop` was called meanwhile.
+        """
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            self._seen, self._since = None, self._now_ns()
+            try:
+                while self._seen is None and not self._stopped and (left := deadline - time.monotonic()) > 0.0:
+                    self._changed.wait(left)
+            finally:
+                self._since = -1
+            found = self._seen
+        if self._stopped:
+            raise Refusal(
+                ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer was deactivated during the measurement"
+            )
+        if found is None:
+            raise Refusal(
+                ErrorCode.MAP_TIMEOUT,
+                f"nothing with a later stamp than the request came on {self.source} within {timeout_s:g} s; is the "
+                "sensor running, and does its clock agree with this one?",
+            )
+        return Acquired(*self._read(found[0]()), found[1])

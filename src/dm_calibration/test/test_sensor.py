@@ -1,0 +1,102 @@
+"""Zernike coefficients from a sensor as measurements: every convention, waiting, refusals."""
+
+from __future__ import annotations
+
+import threading
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from dm_msgs.msg import ZernikeCoefficients
+
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
+from dm_calibration.acquisition.interferometer_messages import sensor_map
+from dm_calibration.acquisition.reference_surface import MapRejectedError
+from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.optics import zernike
+from dm_common.optics.zernike import basis
+
+RADIUS = 0.011
+WANTED = 1e-7 * np.random.default_rng(5).standard_normal(21)
+CONVERTED = {
+    ZernikeCoefficients.BORN_WOLF: WANTED,
+    ZernikeCoefficients.NOLL: np.append(zernike.born_wolf_to_noll(WANTED), [3e-8] * 15),
+    ZernikeCoefficients.ANSI: zernike.born_wolf_to_ansi(WANTED),
+    ZernikeCoefficients.FRINGE: np.append(zernike.born_wolf_to_fringe(WANTED), [3e-8] * 10),
+}
+
+
+def message(convention: int = 0, **fields: Any) -> ZernikeCoefficients:
+    values = {"coefficients": list(CONVERTED[convention]), "radius": RADIUS, "residual_rms": 4e-9, **fields}
+    return ZernikeCoefficients(convention=convention, **values)
+
+
+@pytest.mark.parametrize("convention", CONVERTED)
+@pytest.mark.parametrize("settings", [IngestSettings(), IngestSettings(aperture_radius=RADIUS)])
+def test_coefficients_in_any_convention_become_a_measurement(convention: int, settings: IngestSettings) -> None:
+    surface, found = read_sensor(sensor_map(message(convention), "topic /wavefront"), Ingest(), settings)
+    np.testing.assert_allclose(found.coefficients, WANTED, atol=1e-14)
+    np.testing.assert_allclose(found.sag, basis(found.points.x, found.points.y) @ WANTED, atol=1e-14)
+    assert (found.radius, found.residual_rms, found.instrument) == (pytest.approx(RADIUS), 4e-9, "topic /wavefront")
+    assert found.valid_fraction > 0.99 and surface.file == found.file == ""
+
+
+def test_a_smaller_aperture_of_the_mirror_is_cut_out() -> None:
+    _, found = read_sensor(sensor_map(message(), "t"), Ingest(), IngestSettings(aperture_radius=0.8 * RADIUS))
+    inside = basis(0.8 * found.points.x, 0.8 * found.points.y) @ WANTED
+    np.testing.assert_allclose(found.sag, inside, atol=1e-14)
+    assert found.radius == pytest.approx(0.8 * RADIUS)
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"coefficients": [0.0] * 20}, "topic /wavefront: coefficients: 20, must be 21"),
+        ({"convention": 3, "coefficients": [0.0] * 26}, "must have at least 27 terms"),
+        ({"convention": 9}, "convention = 9: must be one of"),
+        ({"coefficients": [np.nan] * 21}, "must be finite"),
+        ({"radius": np.inf}, "must be finite"),
+    ],
+)
+def test_what_is_no_measurement_is_refused(fields: dict[str, Any], text: str) -> None:
+    bad = message()
+    for name, value in fields.items():
+        setattr(bad, name, value)
+    with pytest.raises(MapRejectedError, match=text):
+        sensor_map(bad, "topic /wavefront")
+
+
+def test_the_first_measurement_after_the_request_counts() -> None:
+    sensor = SensorAcquisition(
+        "topic /wavefront", lambda seen: read_sensor(seen, Ingest(), IngestSettings()), lambda: 100
+    )
+    sensor.start()
+    waiting = threading.Event()
+
+    def stream() -> None:
+        waiting.wait(5.0)
+        for stamp in (99, 150, 160):
+            sensor.offer(partial(sensor_map, message(coefficients=[1e-9 * stamp] * 21), "t"), stamp)
+
+    thread = threading.Thread(target=stream)
+    thread.start()
+    sensor.offer(lambda: pytest.fail("nobody waits"), 200)
+    threading.Timer(0.05, waiting.set).start()
+    acquired = sensor.acquire(5.0)
+    thread.join()
+    assert acquired.taken_ns == 150
+    assert acquired.measurement.coefficients[3] == pytest.approx(150e-9)
+
+
+def test_waiting_ends_in_time_and_when_it_is_stopped() -> None:
+    sensor = SensorAcquisition("topic /wavefront", lambda seen: pytest.fail("nothing was seen"), lambda: 100)
+    sensor.start()
+    with pytest.raises(Refusal, match=r"came on topic /wavefront within 0.01 s") as late:
+        sensor.acquire(0.01)
+    assert late.value.error_code == ErrorCode.MAP_TIMEOUT
+    threading.Timer(0.05, sensor.stop).start()
+    with pytest.raises(Refusal) as stopped:
+        sensor.acquire(5.0)
+    assert stopped.value.error_code == ErrorCode.INTERFEROMETER_INACTIVE
