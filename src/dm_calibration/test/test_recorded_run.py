@@ -47,6 +47,15 @@ def test_a_hysteresis_plan_is_known_by_its_length() -> None:
     assert_same_maps(repeat_run(run)[1].maps(), outcome.maps())
 
 
+def test_a_run_that_was_accurate_enough_ends_where_it_did() -> None:
+    options = PlanOptions(hysteresis_maps=300, until=2e-9)
+    run, outcome = recorded(PlanKind.HYSTERESIS, options, enough=lambda outcome: len(outcome.records) > 150)
+    assert 150 < len(outcome.records) < 220
+    assert_same_maps(repeat_run(run)[1].maps(), outcome.maps())
+    with pytest.raises(RecordingError, match="no plan of"):
+        repeat_run(replace(run, moves=(*run.moves[:150], *run.moves[151:])))
+
+
 def test_states_without_a_map_stay_without_one() -> None:
     run, outcome = recorded(PlanKind.POKES, PlanOptions(), failing=frozenset({"poke+03", "reference 2"}))
     again = repeat_run(run)[1]

@@ -169,7 +169,8 @@ def _candidates(run: RecordedRun, configured: PlanOptions) -> Iterator[tuple[Pla
     if any(label.startswith((StepKind.EXCITATION.value, StepKind.CHECK.value, "rest")) for label in labels):
         for maps in range(MAPS_MIN, MAPS_MAX + 1):
             if 2 + REPEATS + maps + maps // HYSTERESIS_REFERENCE_EVERY == run.steps:
-                yield PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=maps)
+                # In one part, or in those after which it may end.
+                yield from ((PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=maps, until=m)) for m in (0.0, 1.0))
         return
     surfaces = tuple(label for label in labels if label[0] == "p" and not label.startswith("poke"))
     if any(label.startswith("poke") for label in labels):
@@ -209,15 +210,24 @@ def _agreement(plan: Plan, moves: Sequence[Move]) -> tuple[int, str]:
 
     Solved steps agree with any move.
     """
-    for index, (step, move) in enumerate(zip(plan.steps, moves, strict=False)):
+    end = _end(plan, moves)
+    for index, (step, move) in enumerate(zip(plan.steps[:end], moves, strict=False)):
         if step.kind is StepKind.DEGAUSS:
             if not move.degauss:
                 return index, "the recorded run does not begin with a degauss"
         elif step.signals is not None and not step.needs_model and not np.array_equal(move.requested, step.signals):
             return index, f"step {step.label!r}: other signals were commanded"
-    if len(moves) < len(plan.steps):
+    if len(moves) < end:
         return len(moves), f"step {plan.steps[len(moves)].label!r}: the recording ends before it"
     return len(plan.steps), ""
+
+
+def _end(plan: Plan, moves: Sequence[Move]) -> int:
+    """The step before which the run ended: one that was accurate enough there went back to rest and no further."""
+    last = len(moves) - 1
+    rest = next((step.signals for step in plan.steps if step.kind is StepKind.REFERENCE), None)
+    ended = last in plan.ends and rest is not None and np.array_equal(moves[last].requested, rest)
+    return last if ended else len(plan.steps)
 
 
 def repeat_run(
@@ -232,5 +242,10 @@ def repeat_run(
     plan = find_plan(run, configured)
     # As live: a full plan solves its shapes on its own pokes.
     model = run.model if plan.kind is PlanKind.SURFACES else None
-    procedure = Procedure(plan, run.mirror, RecordedBench(run), options, model=model)
+    end = _end(plan, run.moves)
+
+    def enough(outcome: Outcome) -> bool:
+        return outcome.records[-1].step + 1 >= end
+
+    procedure = Procedure(plan, run.mirror, RecordedBench(run), options, model=model, enough=enough)
     return plan, procedure.run()
