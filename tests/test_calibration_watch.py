@@ -185,6 +185,26 @@ def test_the_command_checks_and_tells_by_its_exit_status(suite: Suite, tmp_path:
     assert "the map disagrees" in done.stdout
 
 
+def test_it_goes_on_without_an_actuator_that_died(suite: Suite) -> None:
+    moved = suite.bench.plant.influence
+    suite.bench.plant.influence = moved * (np.arange(suite.bench.mirror.actuators) != 6)
+    suite.bench.move(np.full(suite.bench.mirror.actuators, 0.4))
+    time.sleep(2 * STILL_S)
+    named = suite.call()
+    assert not named.accepted and named.message.endswith("./dm check --without 7 goes on without what does not move")
+    assert suite.call(without=[99]).error_code == ErrorCode.OUT_OF_RANGE
+    assert suite.call(without=[7], forget=True).error_code == ErrorCode.INVALID_ARGUMENT
+    command = [sys.executable, "-m", "dm_tools", "check", "--without", "7"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and "Goes on without actuator 7 (stands at " in done.stdout, done.stdout + done.stderr
+    suite.expect(1)
+    assert suite.calibration.actuator_grade[6] == CalibrationMsg.GRADE_DEAD
+    assert any("Goes on without actuator 7" in sentence for sentence in suite.calibration.known_limitations)
+    suite.shape()
+    assert suite.call().accepted
+    suite.status("Goes on without actuator 7")
+
+
 def test_switched_off_only_the_service_takes_maps(begin: Callable[..., Suite]) -> None:
     suite = begin(**{"updates.enable": False})
     suite.shape()
