@@ -12,8 +12,14 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class _Layout:
-    """How an encoding lies in memory: number type, numbers per pixel, which of them is taken; in a Bayer pattern, the
-    columns of the green pixels in the even and the odd rows."""
+    """How the pixels of an encoding lie in memory.
+
+    Attributes:
+        type: of their numbers.
+        channels: numbers per pixel.
+        channel: the number that is taken.
+        green: of a Bayer pattern, the columns of the green pixels in the even and the odd rows.
+    """
 
     type: str
     channels: int = 1
