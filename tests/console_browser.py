@@ -24,6 +24,13 @@ from selenium.webdriver.common.keys import Keys
 from dm_tools.demo.demo_bench import free_ports
 from support import wait_until
 
+#: Whether every chart in sight is as wide as its place.
+CHARTS_FILL = """
+return [...document.querySelectorAll('[role=img]')].every((place) => {
+  const svg = place.querySelector('svg');
+  return !svg || !place.checkVisibility() || svg.getBoundingClientRect().width > 0.9 * place.clientWidth;
+});
+"""
 BROWSERS = ("chromium", "google-chrome", "google-chrome-stable", "chromium-browser")
 CHROMIUM, DRIVER = next(filter(None, map(shutil.which, BROWSERS)), None), shutil.which("chromedriver")
 needs_browser = pytest.mark.skipif(
@@ -185,15 +192,15 @@ class Browser:
 
     def shoot(self, path: Path) -> None:
         """The whole page as a PNG."""
-        width, height = self.driver.execute_script(
-            "return [innerWidth, Math.min(document.documentElement.scrollHeight, 8000)]"
+        width, shown, height = self.driver.execute_script(
+            "scrollTo(0, 0); return [innerWidth, innerHeight, Math.min(document.documentElement.scrollHeight, 8000)]"
         )
-        clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
-        self.driver.execute_script("scrollTo(0, 0)")
-        # The first one lays the page out anew, and the charts follow only after it.
-        for _again in range(2):
-            shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})
-            time.sleep(0.5)
+        # A window as high as the page: what Chromium takes beyond its window comes before the charts follow.
+        self.resize(width, height)
+        time.sleep(0.5)
+        wait_until(lambda: self.driver.execute_script(CHARTS_FILL), 20, "the charts to fill their places")
+        shot = self.driver.execute_cdp_cmd("Page.captureScreenshot", {})
+        self.resize(width, shown)
         path.write_bytes(base64.b64decode(shot["data"]))
 
 

@@ -86,7 +86,7 @@ def test_without_a_recipe_a_conditioned_move_is_refused(page: Browser) -> None:
     wait_until(lambda: page.alerts() == "", 60, "the dismissal")
 
 
-def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser) -> None:
+def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser, shots: Path) -> None:
     page.unfold("Recipes")
     page.enter("First, 1/m", "0,015")  # as half of Europe writes it
     page.enter("Recipes", "1")
@@ -96,14 +96,16 @@ def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser) -> No
     page.press("Move")
     page.wait_for("Mode: conditioned.", 120)
     page.wait_for("Move: +0.0150 1/m stands after", 120)
+    page.press("Measure")
+    page.wait_for("Measure: rms", 60)
+    page.shoot(shots / "console.png")
 
 
-def test_the_surface_converges_on_the_interferometer(page: Browser, shots: Path) -> None:
+def test_the_surface_converges_on_the_interferometer(page: Browser) -> None:
     page.press("Converge")
     wait_until(lambda: page.text.startswith("Deformable") and "Converge: " in page.text, 120, "its outcome")
     page.press("Measure")
     page.wait_for("Measure: rms", 60)
-    page.shoot(shots / "console.png")
     page.dismiss_all()
 
 
