@@ -6,7 +6,7 @@ then belongs to single actuators: dead, weak, inverted, exchanged with another, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +114,7 @@ def check_pokes(
             f"only {active.size} of {active.size + quiet.sum()} actuators answer above the noise: the pokes are too "
             "small, or the drive is off; wiring and orientation cannot be checked (poke_amplitude)"
         )
-        return _with(nothing, [problem, *findings])
+        return replace(nothing, findings=(problem, *findings))
     registration = register(unit[active], active, points, x, y, radius)
     expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points)
     height = np.maximum(height, np.finfo(float).tiny)
@@ -128,7 +128,7 @@ def check_pokes(
             "the responses do not fit the configured positions however the mirror is turned: check mirror.pitch or "
             "mirror.actuator_x and _y, and that the maps show the whole working aperture of this mirror"
         )
-        return _with(nothing, [*findings, problem])
+        return replace(nothing, findings=(*findings, problem))
     sign = np.sign(found).astype(np.int64)
     standing, turned = _standing(registration, pitch(x, y))
     findings += standing + _sign_findings(sign, active) + _place_findings(place)
@@ -140,10 +140,6 @@ def check_pokes(
     weak = alone & ~unlike & _weak(size, height[place], rings(x, y)[place], alone)
     findings += _named(weak, f"answer{{}} weakly, below {WEAK_SHARE:.0%} of the others of the ring")
     return PokeCheck(registration, place, sign, np.abs(found), turned, tuple(findings))
-
-
-def _with(check: PokeCheck, findings: list[str]) -> PokeCheck:
-    return PokeCheck(check.registration, check.place, check.sign, check.likeness, False, tuple(findings))
 
 
 def _standing(found: Registration, step: float) -> tuple[list[str], bool]:
