@@ -32,8 +32,9 @@ def record(
     """
     from dm_tools.recording.recorder import Recorder
 
-    # SIGTERM must finish the file as Ctrl-C does.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # SIGTERM must finish the file as Ctrl-C does, which a shell lets commands in the background ignore.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     folder = out if out is not None else Path("runs") / time.strftime("recording-%Y%m%dT%H%M%S")
     names = [name.strip() for name in topics.split(",") if name.strip()]
     started = time.monotonic()
