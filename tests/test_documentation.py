@@ -315,13 +315,9 @@ def test_it_runs(scene: Scene, command: str) -> None:
 
 
 def test_the_first_hour_is_run_as_written() -> None:
-    """The commands of the newcomer's page, in their order, are those that run here.
-
-    But for the camera's example: the bench of these tests has no camera, and test_autofocus_node.py runs it.
-    """
+    """The commands of the newcomer's page, in their order, are those that run here."""
     page = [command for where, command in SHELL if where.startswith("first-run.md") and command.startswith("./dm ")]
     hour = page[page.index("./dm up") + 1 : page.index("./dm degauss") + 1]
-    hour.remove("./dm exec python examples/camera_focus.py")
     assert [command for command in told.RUN if command in hour] == hour
     assert page[page.index("./dm up")] in told.WATCHED
 
