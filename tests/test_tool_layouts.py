@@ -14,10 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from dm_msgs.msg import FocusState
 
-from dm_tools.console.console_node import TOPICS
+from dm_common.ros import qos
+from dm_tools.console import console_node
 
 CONFIG = Path(__file__).resolve().parents[1] / "src" / "dm_bringup" / "config"
+#: What layouts may show: the console's topics, and the focus, of which it shows what `actuator_state` says.
+TOPICS = console_node.TOPICS | {"focus_state": (FocusState, qos.STATE)}
 #: Topics that every ROS 2 system has.
 STANDARD = {"diagnostics", "rosout"}
 #: Panel types of Foxglove and Lichtblick that the layout uses, and the settings each of them reads.

@@ -8,14 +8,12 @@ nodes, so they are forked off a server that has imported them all once. Nothing 
 from __future__ import annotations
 
 import atexit
-import ctypes
 import importlib
 import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import traceback
 from collections.abc import Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -103,13 +101,8 @@ def _run(module: str, arguments: list[str], log: str, environment: dict[str, str
         for number in (1, 2):
             os.dup2(output.fileno(), number)
     sys.argv = arguments
-    status = 1
     try:
         status = importlib.import_module(module).main()
-    except Exception:
-        traceback.print_exc()
-    atexit._run_exitfuncs()
-    sys.stdout.flush()
-    # The end of a child of multiprocessing leaves out the destructors of libraries: each node would leave its segment
-    # of shared memory behind.
-    ctypes.CDLL(None).exit(status)
+    finally:
+        atexit._run_exitfuncs()
+    sys.exit(status)
