@@ -58,3 +58,13 @@ def test_a_lease_that_lapses_on_a_busy_machine_is_no_new_start(watched: Watched)
     assert watched.lost
     watched.change(1, -1)
     assert not watched.lost and gone() == ""
+
+
+def test_a_node_whose_coming_was_not_heard_of_has_died_all_the_same(watched: Watched) -> None:
+    """It may come before the executor listens."""
+    watched.alive = 1
+    watched.change(-1, 1)
+    assert watched.lost and watched.text.startswith("the node pdm_driver has died")
+    gone = watched.since_now()
+    watched.change(1, 0)
+    assert gone() == "the node pdm_driver was restarted meanwhile: ask again"

@@ -120,8 +120,9 @@ class Liveliness:
 
     def _on_change(self, info: Any) -> None:
         lost = info.alive_count == 0
-        # A publisher that comes back after its lease lapsed only leaves the other count.
-        if info.alive_count_change + info.not_alive_count_change > 0:
-            self.starts += 1
+        # A publisher that comes back after its lease lapsed only leaves the other count. That the first one has come is
+        # not always heard, when it came before the executor did; whatever changes afterwards, there was one.
+        started = info.alive_count_change + info.not_alive_count_change > 0
+        self.starts = max(self.starts + started, 1)
         if lost != self.lost:
             self.lost, self._lost_at = lost, time.monotonic()
