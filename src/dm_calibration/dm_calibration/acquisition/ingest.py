@@ -88,17 +88,16 @@ class Ingest:
         with self._turn:
             source = read_map(path, xyz_unit=settings.xyz_unit or None)
             try:
-                return self.measure(source, settings)
+                return self._measure(source, settings)
             except (InsufficientDataError, MapRejectedError, PhaseStepError) as error:
                 raise type(error)(f"{path}: {error}") from error
 
-    def measure_once(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
-        """As :meth:`measure`, for any number of threads."""
-        with self._turn:
-            return self.measure(source, settings)
-
     def measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
-        """Orient and fit a map that was read; not for two threads at a time. Raises as :meth:`read`."""
+        """Orient and fit a map that was read. Raises as :meth:`read`."""
+        with self._turn:
+            return self._measure(source, settings)
+
+    def _measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
         difference = abs(source.wavelength - settings.wavelength)
         if settings.wavelength and difference > settings.wavelength_tolerance:
             raise MapRejectedError(
@@ -129,7 +128,7 @@ class Ingest:
         if not source.phase_steps and np.fmax.reduce(left) > STEP_SHARE * source.wavelength > 0.0:
             mended, regions = mend_phase_steps(source.sag, 0.5 * source.wavelength)
             if regions:
-                return self.measure(replace(source, sag=mended, phase_steps=regions), settings)
+                return self._measure(replace(source, sag=mended, phase_steps=regions), settings)
         measured = Measurement(
             points=self.points,
             sag=samples,

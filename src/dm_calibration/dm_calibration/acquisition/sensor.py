@@ -48,7 +48,7 @@ def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[S
     surface, residual_rms = seen
     if not settings.aperture_radius and surface.pitch:
         settings = replace(settings, aperture_radius=0.5 * PIXELS * surface.pitch, aperture_centre=(0.0, 0.0))
-    surface, measured = ingest.measure_once(surface, settings)
+    surface, measured = ingest.measure(surface, settings)
     sag = basis(measured.points.x, measured.points.y) @ measured.coefficients  # exactly, also between pixels
     return surface, replace(measured, residual_rms=residual_rms, sag=sag)
 
