@@ -26,6 +26,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import rclpy
@@ -151,32 +152,22 @@ def destroy(node: Node) -> None:
     node.destroy_node()
 
 
-def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> int:
-    """Remove Fast DDS segments whose process is gone; how many.
+def remove_orphaned_segments(least_age_s: float = LEAST_AGE_S) -> None:
+    """Remove Fast DDS segments whose process is gone.
 
     Fast DDS removes its segment (17 MB a node, see config/fastdds.xml of dm_bringup) when a node ends, never after it
     was killed, and memory runs out after some hundred kills. The owner of the segment `fastrtps_ID` holds a lock on
     the file `fastrtps_ID_el` as long as it lives. Ports, by number, are taken over by Fast DDS itself.
     """
-    removed = 0
     for lock in SHARED_MEMORY.glob("fastrtps_*_el"):
-        segment = lock.with_name(lock.name.removesuffix("_el"))
-        if segment.name.startswith("fastrtps_port"):
+        if lock.name.startswith("fastrtps_port"):
             continue
-        try:
-            if time.time() - lock.stat().st_mtime < least_age_s:
-                continue
-            descriptor = os.open(lock, os.O_RDWR)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                segment.unlink(missing_ok=True)
+        # Locked, somebody else's, or removed by another node at this moment: left alone.
+        with suppress(OSError), lock.open("r+b") as handle:
+            if time.time() - lock.stat().st_mtime >= least_age_s:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock.with_name(lock.name.removesuffix("_el")).unlink(missing_ok=True)
                 lock.unlink()
-                removed += 1
-            finally:
-                os.close(descriptor)
-        except OSError:  # locked, somebody else's, or removed by another node at this moment
-            continue
-    return removed
 
 
 def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> int:
