@@ -12,7 +12,7 @@ state says nothing of where the shape stands.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -78,14 +78,19 @@ class CreepHold:
         if shape.sent.confirmed or now - shape.sent.time > CONFIRM_S:
             self.end("another command came")
 
-    def command(self, report: DriverReport | None, estimate: ActuatorEstimate, now: Moment) -> SendCommand | None:
-        """What is due for the shape by the driver's last report and the actuators `now`; None = nothing yet."""
+    def command(
+        self, report: DriverReport | None, estimate: Callable[[float], ActuatorEstimate], now: Moment
+    ) -> SendCommand | None:
+        """What is due for the shape by the driver's last report; None = nothing yet.
+
+        `estimate` gives the actuators at a time, s.
+        """
         shape = self.shape
         if shape is None or not shape.held or report is None or report.applied.moving:
             return None
         if report.holder not in ("", shape.sent.command.holder):
             return None  # goes on afterwards, if they leave the shape as it is
-        signals = self.correction(estimate, now.time)
+        signals = self.correction(estimate(now.time), now.time)
         return None if signals is None else shape.send_on(signals, now, report.applied.turns)
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:

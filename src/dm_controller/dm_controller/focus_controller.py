@@ -275,7 +275,7 @@ class FocusController:
             self.hold.end("the driver did not take the command")
             # A correction, or the end of a move, answers no order.
             effects += self._refuse(order, refusal, now) if order is not None else [Log("warning", str(refusal))]
-        correction = self.hold.command(self.monitor.latest, self.observer.estimate(now.time), now)
+        correction = self.hold.command(self.monitor.latest, self.observer.estimate, now)
         return [*effects, *self._news(now), *([] if correction is None else [correction])]
 
     def quick_ticks(self, now: Moment) -> bool:
