@@ -6,15 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import (
-    JsonOption,
-    NamespaceOption,
-    TakeOverOption,
-    console,
-    nanometres,
-    next_step,
-    write_json,
-)
+from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, nanometres, next_step, write_json
 from dm_tools.running_suite import hear_health, kept, naming_holder, running_suite, settled_shape, verdict
 
 
