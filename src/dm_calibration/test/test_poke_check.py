@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dm_calibration.influence.poke_check import PokeCheck, check_pokes, cycles
@@ -119,6 +119,7 @@ def test_the_sentence_gives_turn_image_shift_and_their_errors() -> None:
     st.integers(0, 10**6),
     st.lists(st.sampled_from(["dead", "weak", "inverted", "doubled", "crossed"]), max_size=5),
 )
+@example(0.0, False, (0.0, 0.0), 1.0, 124, ["dead", "dead", "dead", "weak"])  # the centre, alone in its ring
 def test_any_mounting_with_any_faults(
     turn: float, mirrored: bool, shift: tuple[float, float], scale: float, seed: int, faults: list[str]
 ) -> None:
@@ -127,6 +128,7 @@ def test_any_mounting_with_any_faults(
     measured = response(*stand(turn, mirrored, shift_m, scale), seed=seed)
     left, place = list(random.permutation(37)), np.arange(37)
     expected: list[str] = []
+    weak: list[int] = []
     silent = np.zeros(37, dtype=bool)
     for fault in faults:
         one, other = (int(left.pop()) for _ in range(2))
@@ -136,7 +138,7 @@ def test_any_mounting_with_any_faults(
             measured[:, one] = NOISE * random.standard_normal(len(measured))
         elif fault == "weak":
             measured[:, one] *= 0.2
-            expected.append("weak")
+            weak.append(one + 1)
         elif fault == "inverted":
             measured[:, one] *= -1.0
             expected.append("opposite")
@@ -149,15 +151,16 @@ def test_any_mounting_with_any_faults(
             place[[one, other]] = other, one
             expected.append(f"actuators {numbers[0]} and {numbers[1]} are exchanged")
     result = check(measured, silent=silent)
-    assert result.registration is not None
-    assert result.registration.mirrored == mirrored
-    assert np.angle(np.exp(1j * (result.registration.turn - turn))) == pytest.approx(0.0, abs=0.01)
-    assert abs(complex(*result.registration.shift) - shift_m) < 1e-4
-    assert result.registration.scale == pytest.approx(scale, abs=0.01)
+    stands = result.registration
+    assert stands is not None and stands.mirrored == mirrored
+    turned, moved = np.angle(np.exp(1j * (stands.turn - turn))), abs(complex(*stands.shift) - shift_m)
+    assert abs(turned) < 0.01 and moved < 1e-4 and abs(stands.scale - scale) < 0.01, result.standing
     assert result.place.tolist() == place.tolist()
     text = "; ".join(result.findings)
     assert all(words in text for words in expected), text
     assert ("no response" in text) == bool(silent.any())
+    named = re.findall(r"actuators? ([\d, ]+) answers? weakly", text)
+    assert [int(number) for number in ", ".join(named).split(",") if number] == sorted(weak)
     # And nothing that is not so.
     assert text.count("exchanged") == faults.count("crossed") and text.count("together") == faults.count("doubled")
     assert "permuted" not in text and "does not look like" not in text

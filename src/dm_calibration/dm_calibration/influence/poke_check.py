@@ -33,8 +33,10 @@ FIT_MIN = 0.75
 DOUBLED = 0.5
 #: ... and the smaller of them is at least this share of the larger.
 SECOND_MIN = 0.4
-#: An actuator is weak below this share of the median response of its ring.
+#: An actuator is weak below this share of the median response of its ring, ...
 WEAK_SHARE = 0.4
+#: ... and of the rings beside it where fewer than this answer: half of them may be weak, and the centre is alone.
+COMPARED_MIN = 11
 #: Fewest actuators that must answer, and share of them below which the pokes are too small.
 ANSWERS_MIN = 3
 ANSWERS_SHARE = 0.5
@@ -115,12 +117,17 @@ def check_pokes(
             "small, or the drive is off; wiring and orientation cannot be checked (poke_amplitude)"
         )
         return replace(nothing, findings=(problem, *findings))
-    registration = register(unit[active], active, points, x, y, radius)
-    expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points)
-    height = np.maximum(height, np.finfo(float).tiny)
-    table = np.zeros((count, count))
-    table[active] = (unit[active] * points.weight) @ expected.T
-    double = _doubled(table, (expected * points.weight) @ expected.T, height)
+    single, double = active, {}
+    for _ in range(2):  # again without those that move two places, which would bend it
+        registration = register(unit[single], single, points, x, y, radius)
+        expected, height = bumps(registration.seen(x, y) / radius, registration.width / radius, points)
+        height = np.maximum(height, np.finfo(float).tiny)
+        table = np.zeros((count, count))
+        table[active] = (unit[active] * points.weight) @ expected.T
+        double = _doubled(table, (expected * points.weight) @ expected.T, height)
+        if not double:
+            break
+        single = np.setdiff1d(active, list(double))
     place = _places(np.abs(table), active, double)
     found = table[np.arange(count), place]
     if np.median(np.abs(found[active])) < FIT_MIN:
@@ -211,10 +218,12 @@ def _doubled(table: Floats, overlap: Floats, height: Floats) -> dict[int, tuple[
 def _weak(size: Floats, height: Floats, ring: Indices, counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Actuators below WEAK_SHARE of their ring, both as they are and for how far from the aperture they stand."""
     weak = counted.copy()
-    for response in (size, size / height):
-        for number in np.unique(ring[counted]):
-            same = counted & (ring == number)
-            weak[same] &= response[same] < WEAK_SHARE * np.median(response[same])
+    for number in np.unique(ring[counted]):
+        steps = np.abs(ring - number)
+        enough = (reach for reach in range(steps.max() + 1) if (counted & (steps <= reach)).sum() >= COMPARED_MIN)
+        beside = counted & (steps <= next(enough, steps.max()))
+        for response in (size, size / height):
+            weak[ring == number] &= response[ring == number] < WEAK_SHARE * np.median(response[beside])
     return weak
 
 

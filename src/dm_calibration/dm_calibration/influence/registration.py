@@ -34,6 +34,8 @@ REACH = 1.45
 GRID = 0.25
 #: Starts of the search, all around, for each image and scale.
 STARTS = 36
+#: Places in the middle over which the innermost bump may lie: one and its neighbours.
+ANCHORS = 7
 #: Those that lie best are followed: a hexagonal arrangement looks the same in twelve positions.
 TRIED = 36
 ROUNDS = 20
@@ -147,10 +149,11 @@ def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: floa
     """The similarity and numbering that take the configured `places` to those `seen`."""
     spread = float(np.std(seen) / np.std(places))
     starts = [
-        _over_each_other(seen, places, size * np.exp(1j * angle), mirrored)
+        start
         for mirrored in (False, True)
         for size in {1.0, round(spread, 2)}
         for angle in np.arange(STARTS) * 2 * np.pi / STARTS
+        for start in _over_each_other(seen, places, size * np.exp(1j * angle), mirrored)
     ]
     nearest = [np.abs(_seen(start, places)[:, None] - seen).min(axis=0) / step for start in starts]
     order = np.argsort([np.mean(np.minimum(distance, TOLERANCE) ** 2) for distance in nearest], kind="stable")
@@ -163,10 +166,15 @@ def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: floa
     return min(near, key=lambda match: (match.similarity.mirrored, round(abs(np.angle(match.similarity.factor)), 3)))
 
 
-def _over_each_other(seen: Places, places: Places, factor: complex, mirrored: bool) -> _Similarity:
-    """The similarity of this `factor` that puts the centroids over each other."""
-    centroid = _seen(_Similarity(factor, 0j, mirrored), places).mean()
-    return _Similarity(factor, complex(seen.mean() - centroid), mirrored)
+def _over_each_other(seen: Places, places: Places, factor: complex, mirrored: bool) -> list[_Similarity]:
+    """The similarities of this `factor` that put the centroids over each other, and, where actuators are missing so
+    that these are not the same, the innermost bump over the places in the middle."""
+    images = _seen(_Similarity(factor, 0j, mirrored), places)
+    shifts = [seen.mean() - images.mean()]
+    if len(seen) < len(places):
+        innermost = seen[np.abs(seen - seen.mean()).argmin()]
+        shifts += list(innermost - images[np.argsort(np.abs(places - places.mean()), kind="stable")[:ANCHORS]])
+    return [_Similarity(factor, complex(shift), mirrored) for shift in shifts]
 
 
 def _closest(seen: Places, places: Places, start: _Similarity, step: float) -> _Match:
