@@ -14,6 +14,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -91,8 +92,17 @@ class ForkedSuite(Suite):
         return ForkedNode(MODULES[name], arguments, self.log(name), self._environment)
 
 
+def _end_with_the_tests() -> None:
+    """End this process when the one that asked for it has gone: killed, it could not end its daemons."""
+    tests = multiprocessing.parent_process()
+    assert tests is not None
+    tests.join()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def _run(module: str, arguments: list[str], log: str, environment: dict[str, str], folder: str) -> None:
     """What the forked process does."""
+    threading.Thread(target=_end_with_the_tests, daemon=True).start()
     os.setsid()
     os.chdir(folder)
     os.environ.clear()

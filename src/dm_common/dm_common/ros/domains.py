@@ -6,14 +6,31 @@ import contextlib
 import fcntl
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
+
+#: Where DDS puts the ports of a domain: this many of them for each, from the base on.
+PORT_BASE, PORTS = 7400, 250
+#: Where the kernel lists the UDP ports that are in use.
+UDP_PORTS = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
+
+
+def inhabited_domains(tables: Iterable[Path] = UDP_PORTS) -> set[int]:
+    """ROS domains in which a process of this machine listens, whoever started it."""
+    ports = set()
+    for table in tables:
+        with contextlib.suppress(OSError):
+            ports |= {int(line.split()[1].rpartition(":")[2], 16) for line in table.read_text().splitlines()[1:]}
+    return {(port - PORT_BASE) // PORTS for port in ports if port >= PORT_BASE}
 
 
 @contextlib.contextmanager
 def own_domain() -> Iterator[int]:
-    """Lend a ROS domain that no other demo or test on this machine uses at the same time."""
+    """Lend a ROS domain that no other demo or test on this machine uses at the same time.
+
+    Nor one in which nodes are left over: those of a run that was killed go on, while its lock ended with it.
+    """
     folder = Path(tempfile.gettempdir()) / f"dm-domains-{os.getuid()}"
     folder.mkdir(exist_ok=True)
     for domain in range(1, 100):
@@ -21,6 +38,9 @@ def own_domain() -> Iterator[int]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
+            handle.close()
+            continue
+        if domain in inhabited_domains():
             handle.close()
             continue
         try:

@@ -1,0 +1,28 @@
+"""Which ROS domains are lent."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from dm_common.ros.domains import PORT_BASE, PORTS, inhabited_domains, own_domain
+
+
+def test_ports_that_are_in_use_tell_the_domains(tmp_path: Path) -> None:
+    table = tmp_path / "udp"
+    table.write_text(
+        "  sl  local_address rem_address   st\n"
+        "   1: 0100007F:1CE8 00000000:0000 07\n"  # 7400
+        "   2: 00000000:1EEC 00000000:0000 07\n"  # 7916
+        "   3: 00000000:0044 00000000:0000 07\n"  # 68
+    )
+    assert inhabited_domains((table, tmp_path / "none")) == {0, 2}
+
+
+def test_a_domain_in_which_somebody_was_left_is_not_lent() -> None:
+    with own_domain() as domain:
+        pass
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as left_over:
+        left_over.bind(("127.0.0.1", PORT_BASE + PORTS * domain + PORTS - 1))
+        with own_domain() as other:
+            assert other != domain
