@@ -262,6 +262,13 @@ def test_the_loop_opens_as_the_law_says() -> None:
     assert "hysteresis loop of actuator 4" in loop_chart(loop).description
 
 
+def test_the_loop_is_that_of_the_actuator_that_was_chosen() -> None:
+    own = replace(LAW, play_weight=np.arange(1.0, COUNT + 1.0)[:, None, None] * LAW.play_weight)
+    for actuator in (1, 4):
+        shared = modelled_loop(LAW, actuator, -1.0, 1.0)
+        assert modelled_loop(own, actuator, -1.0, 1.0).rising == pytest.approx(actuator * np.array(shared.rising))
+
+
 def test_a_measured_way_comes_back_and_stays_inside() -> None:
     signals = way(0.8, 0.5, -1.0, 1.0)
     assert max(signals) == 1.0 and signals[-1] == pytest.approx(0.8)

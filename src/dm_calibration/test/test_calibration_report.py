@@ -182,6 +182,15 @@ def test_a_play_operator_opens_the_loop_by_its_width() -> None:
     assert loop_opening(HysteresisModel.linear()) == pytest.approx(0.0, abs=1e-12)
 
 
+def test_actuators_with_laws_of_their_own_have_loops_of_their_own(calibration: Calibration) -> None:
+    share = np.linspace(0.5, 1.5, 37)
+    own = replace(PLAY, play_weight=np.array([1.0, 0.0])[:, None] + share[:, None, None] * [[0.0], [1.0]])
+    np.testing.assert_allclose(loop_opening(own), 0.4 * share / (2.0 + 1.6 * share))
+    hysteresis = HysteresisFit("Preisach, each actuator its own", own, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
+    text = one_html("", [content_hysteresis.hysteresis(replace(calibration, hysteresis=hysteresis))])
+    assert "7.1% to 13.6% over the actuators" in text and "the mean over actuators" in text
+
+
 def test_creep_grows_by_its_rate_in_a_decade() -> None:
     # The sum over elements two to a decade follows the straight line within its ripple.
     growth = np.diff(step_response(PLAY, np.array([1.0, 10.0, 100.0, 1000.0])))

@@ -25,11 +25,14 @@ def hysteresis(calibration: Calibration) -> Section:
             ],
         )
     law, wavelength = hysteresis.law, calibration.wavelength
+    opening = hysteresis_figures.loop_opening(law)
+    spread = f", {opening.min():.1%} to {opening.max():.1%} over the actuators" if law.actuators else ""
+    shared = "the mean over actuators, whose laws are their own" if law.actuators else "all actuators share it"
     hour, day = 100 * (hysteresis_figures.step_response(law, np.array([3600.0, 86400.0])) - 1.0)
     rows = [
         ("class of law", hysteresis.name),
         ("maps it was identified from", str(hysteresis.maps)),
-        ("opening of the full loop", f"{hysteresis_figures.loop_opening(law):.1%} of the span"),
+        ("opening of the full loop", f"{opening.mean():.1%} of the span{spread}"),
         ("creep", f"{law.creep_rate:.2%} of a step per decade of time"),
         ("growth of a step from 1 s to 1 h", f"{hour:.2f} %"),
         ("growth of a step from 1 s to 1 day", f"{day:.2f} %"),
@@ -42,7 +45,7 @@ def hysteresis(calibration: Calibration) -> Section:
     pictures = [
         Picture(
             "loops",
-            "Loops of the identified law: all actuators share it, their gains are in the influence function.",
+            f"Loops of the identified law: {shared}; gains are in the influence function.",
             hysteresis_figures.loops_figure(law),
         )
     ]

@@ -7,14 +7,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dm_calibration.report.document import BLUE, GREEN, GREY, ORANGE, VERMILION
-from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.hysteresis.loops import branch, closed_cycle, opening, rested
+from dm_common.hysteresis.model import HysteresisModel
 from dm_common.recipes import RecipeBook
 
 Floats = NDArray[np.float64]
 
 NM = 1e9
-#: Steps of a way from one turning point to the next.
-STEPS = 81
 #: Minor loops: from the falling branch, down to each of these and back.
 MINOR_TURNS = (0.6, 0.2, -0.2, -0.6)
 MINOR_DEPTH = 0.5
@@ -24,61 +23,47 @@ CREEP_TIMES = np.geomspace(0.1, 1e5, 61)
 CREEP_FROM = 1.0
 
 
-def branch(law: HysteresisModel, state: HysteresisState, end: float) -> tuple[Floats, Floats, HysteresisState]:
-    """Signals, static effective signals and the last state on a straight way of the first actuator to `end`."""
-    signals = np.linspace(float(state.signals[0]), end, STEPS)
-    positions = np.empty(STEPS)
-    for k, signal in enumerate(signals):
-        state = law.move(state, np.array([signal]), state.time)
-        positions[k] = state.position[0]
-    return signals, positions, state
-
-
-def major_loop(law: HysteresisModel) -> tuple[Floats, Floats, Floats]:
-    """Signals from -1 to +1 and the static effective signals there, rising and falling, in a cycle that closes."""
-    state = law.demagnetised(1, 0.0)
-    for turn in (1.0, -1.0):
-        state = branch(law, state, turn)[2]
-    signals, rising, state = branch(law, state, 1.0)
-    falling = branch(law, state, -1.0)[1]
-    return signals, rising, falling[::-1]
-
-
-def loop_opening(law: HysteresisModel) -> float:
-    """Largest distance of the two branches of the full cycle, as a share of its span."""
-    _, rising, falling = major_loop(law)
-    return float(np.abs(falling - rising).max() / (rising[-1] - rising[0]))
+def loop_opening(law: HysteresisModel) -> Floats:
+    """(N,) largest distance of the branches of the full cycle, as a share of its span, of each law that there is."""
+    return opening(*closed_cycle(law)[1:])
 
 
 def step_response(law: HysteresisModel, time: Floats) -> Floats:
-    """Effective signal `time` (T,) s after a step from 0 to +1 on a rested mirror, relative to that after 1 s."""
-    state = law.move(law.demagnetised(1, 0.0), np.ones(1), 0.0)
-    grown = np.array([law.effective(law.advance(state, float(when)))[0] for when in time])
-    return np.asarray(grown / law.effective(law.advance(state, CREEP_FROM))[0])
+    """Effective signal `time` (T,) s after a step from 0 to +1 on a rested mirror, relative to that after 1 s.
+
+    The mean over actuators whose laws are their own.
+    """
+    state = rested(law)
+    state = law.move(state, np.ones_like(state.signals), 0.0)
+    grown = np.array([law.effective(law.advance(state, float(when))).mean() for when in time])
+    return np.asarray(grown / law.effective(law.advance(state, CREEP_FROM)).mean())
 
 
 def loops_figure(law: HysteresisModel) -> Figure:
-    """The major loop with minor loops in it; beside it what remains without the straight line."""
+    """The major loop with minor loops in it; beside it what remains without the straight line.
+
+    The mean over actuators whose laws are their own.
+    """
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
-    signals, rising, falling = major_loop(law)
-    slope = (rising[-1] - rising[0]) / 2.0
-    middle = 0.5 * (rising[-1] + rising[0])
+    signals, rising, falling = closed_cycle(law)
+    slope = (rising[-1] - rising[0]).mean() / 2.0
+    middle = 0.5 * (rising[-1] + rising[0]).mean()
     ways: list[tuple[Floats, Floats, str, str]] = [
         (signals, rising, VERMILION, "rising"),
         (signals, falling, BLUE, "falling"),
     ]
     for turn in MINOR_TURNS:
-        state = law.demagnetised(1, 0.0)
+        state = rested(law)
         for end in (1.0, -1.0, 1.0, turn):
             state = branch(law, state, end)[2]
         for end in (turn + MINOR_DEPTH, turn):
             there, values, state = branch(law, state, min(end, 1.0))
             ways.append((there, values, GREY, "minor loops" if turn == MINOR_TURNS[0] and end != turn else ""))
-    start = law.demagnetised(1, 0.0)
-    there, values, _ = branch(law, start, 1.0)
+    there, values, _ = branch(law, rested(law), 1.0)
     ways.append((there, values, GREEN, "first rise after a degauss"))
-    for there, values, colour, label in ways:
+    for there, own, colour, label in ways:
+        values = own.mean(axis=1)
         left.plot(there, values, color=colour, linewidth=1.2, label=label or None)
         right.plot(there, 100 * (values - middle - slope * there) / (2.0 * slope), color=colour, linewidth=1.2)
     left.set(xlabel="applied signal", ylabel="effective signal")

@@ -94,7 +94,7 @@ def figures_of(calibration: Calibration) -> dict[str, Any]:
         result["hysteresis"] = {
             "law": hysteresis.name,
             "held_out_max_zernike_nm": hysteresis.held_out_max_zernike * 1e9,
-            "loop_opening": loop_opening(hysteresis.law),
+            "loop_opening": float(loop_opening(hysteresis.law).mean()),
             "creep_per_decade": hysteresis.law.creep_rate,
         }
     return result

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.hysteresis.loops import closed_cycle, opening
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
 Floats = NDArray[np.float64]
 
+#: Points of each branch of a loop.
+STEPS = 41
 #: A measured way in shares of the amplitude: up, back through the start, down, and back.
 WAY = (0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0)
 
@@ -37,31 +40,17 @@ class Loop:
     measured: tuple[float, ...] = ()
 
     @property
-    def opening(self) -> float:
-        """Largest distance of the branches as a share of the span."""
-        gap = max(abs(b - a) for a, b in zip(self.rising, self.falling, strict=True))
-        return gap / (self.rising[-1] - self.rising[0])
-
-    @property
     def text(self) -> str:
         """The loop in a sentence."""
-        return f"the branches are up to {self.opening:.1%} of the span apart"
+        apart = opening(np.array(self.rising)[:, None], np.array(self.falling)[:, None])[0]
+        return f"the branches are up to {apart:.1%} of the span apart"
 
 
-def modelled_loop(law: HysteresisModel, actuator: int, low: float, high: float, steps: int = 41) -> Loop:
-    """The closed cycle of `law` between `low` and `high`, without creep."""
-    signals = np.linspace(low, high, steps)
-    state = law.demagnetised(1, 0.0, 0.5 * (low + high))
-    for turn in (high, low):
-        state = law.move(state, np.array([turn]), 0.0)
-    branches = []
-    for way in (signals, signals[::-1]):
-        values = []
-        for signal in way:
-            state = law.move(state, np.array([signal]), 0.0)
-            values.append(float(state.position[0]))
-        branches.append(values)
-    return Loop(actuator, tuple(signals.tolist()), tuple(branches[0]), tuple(branches[1][::-1]))
+def modelled_loop(law: HysteresisModel, actuator: int, low: float, high: float) -> Loop:
+    """The closed cycle of one actuator (1-based) between `low` and `high` under `law`, without creep."""
+    own = actuator - 1 if law.actuators else 0
+    signals, rising, falling = closed_cycle(law, low, high, STEPS)
+    return Loop(actuator, *(tuple(values.tolist()) for values in (signals, rising[:, own], falling[:, own])))
 
 
 def way(start: float, amplitude: float, low: float, high: float) -> list[float]:
