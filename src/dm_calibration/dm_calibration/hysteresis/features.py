@@ -186,6 +186,10 @@ def weights_of(features: Floats, left: Floats, gains: Floats, prior: Floats, bet
     `between` (N, N) over actuators times `prior` (F, F) over features."""
     count, actuators = features.shape[1:]
     flat = features.transpose(0, 2, 1).reshape(len(features), -1)
-    normal = flat.T @ flat * np.kron(gains @ gains.T, np.ones((count, count))) + np.kron(between, prior)
+    normal = (flat.T @ flat).reshape(actuators, count, actuators, count)
+    normal *= (gains @ gains.T)[:, None, :, None]
+    normal += between[:, None, :, None] * prior[:, None, :]
     right = np.einsum("mfn,mn->nf", features, left @ gains.T)
-    return np.asarray(cho_solve(cho_factor(normal), right.ravel()).reshape(actuators, count).T)
+    # In the order in which LAPACK can overwrite it: its transpose, since it is symmetric.
+    factor = cho_factor(normal.reshape(len(flat.T), -1).T, overwrite_a=True, check_finite=False)
+    return np.asarray(cho_solve(factor, right.ravel()).reshape(actuators, count).T)
