@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from support import NodeProcess
 
 
@@ -18,6 +21,19 @@ def _own_ros_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     os.environ["ROS_HOME"] = str(tmp_path_factory.mktemp("ros_home"))
     yield
     del os.environ["ROS_HOME"]
+
+
+@pytest.fixture(scope="module")
+def common_laws() -> Iterator[None]:
+    """Calibrations in this process try no laws of each actuator by itself, which take half the time.
+
+    For simulations whose actuators are alike; tests of laws try them all.
+    """
+    common = partial(fit_hysteresis, candidates=[candidate for candidate in CANDIDATES if not candidate.own])
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("calibrator", "procedure.forecast"):
+            patch.setattr(f"dm_calibration.{module}.fit_hysteresis", common)
+        yield
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from studies.comparison.true_surface import TrueSurface
 from studies.verbs.compare import compare as command
 from studies.verbs.compare_hysteresis import rows_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
 WAVELENGTH = 632.8e-9
 SMALL = SimulationConfig(pixels=120, degauss_steps=50)

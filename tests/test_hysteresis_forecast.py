@@ -14,7 +14,7 @@ from dm_calibration.procedure.procedure import Procedure
 from linear_mirror import make_mirror
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
 SIMULATION = SimulationConfig(law="bouc_wen", seed=8, pixels=120, degauss_steps=50)
 

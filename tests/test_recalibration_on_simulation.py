@@ -16,7 +16,7 @@ from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS, basis
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
 NIGHTS = 100
 ASTIGMATISM = 4

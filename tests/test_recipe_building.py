@@ -31,7 +31,7 @@ from perfect_calibration import perfect_model
 from studies.comparison.compare import true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
 LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().limits.pairs, dtype=np.intp), 2.0)
 WAVELENGTH = 632.8e-9
