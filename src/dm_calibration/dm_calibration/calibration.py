@@ -40,6 +40,8 @@ _ATTRIBUTES: dict[str, type] = {
     "limitations": tuple,
     "note": str,
     "reference_surface": str,
+    "instrument_error": float,
+    "scale_error": float,
 }
 #: Names of attributes that differ from their fields'.
 _STORED_AS = {"limitations": "known_limitations"}
@@ -73,6 +75,8 @@ class Calibration:
         recipes: built on this calibration.
         reference_surface: the map that was subtracted from all others as the instrument's error, and its SHA-256; "" =
             none.
+        instrument_error: 95 % bound on what is left of the instrument's error in a coefficient, m; 0 = not known.
+        scale_error: 95 % bound on the relative error of lengths on the mirror; 0 = not known.
         region_weights: (10,) Eq. (8), for commands weighted by region; empty where no sample surfaces were measured.
     """
 
@@ -94,6 +98,8 @@ class Calibration:
     hysteresis: HysteresisFit | None = None
     recipes: RecipeBook = NO_RECIPES
     reference_surface: str = ""
+    instrument_error: float = 0.0
+    scale_error: float = 0.0
     region_weights: Floats = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -169,7 +175,8 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         columns = {"maps/moved_ns": unknown, "maps/segment": unknown, **columns}
         raw: dict[str, Any] = {f.name: columns[f"maps/{f.name}"] for f in fields(MapSet) if f.name != "points"}
         maps = MapSet(points=points, **raw)
-        attributes = {"reference_surface": "", **attributes}  # there was none before it was kept
+        # Nothing was known of the instrument before it was kept.
+        attributes = {"reference_surface": "", "instrument_error": 0.0, "scale_error": 0.0, **attributes}
         result: dict[str, Any] = {"points": points}
         for figure in fields(InfluenceFit):
             if figure.name == "points":

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 # Fields of the message that are named as those of a calibration and of its fit.
 _NAMES = (
     *("id", "mirror_name", "mirror_serial", "software_version", "wavelength", "aperture_radius", "maps_dropped"),
-    "reference_surface",
+    *("reference_surface", "instrument_error", "scale_error"),
 )
 _RANGE = ("method", "actuators", "signal_min", "signal_max")
 _FIGURES = ("in_sample_rms", "held_out_rms", "held_out_max_zernike", "condition_number")

@@ -25,6 +25,9 @@ from dm_common.mirror import Mirror
 
 Floats = NDArray[np.float64]
 
+#: What a calibration keeps of the setup of its run.
+_INSTRUMENT = ("reference_surface", "instrument_error", "scale_error")
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -158,7 +161,7 @@ def _evaluated(
         note=provenance.note,
         software_version=software_version(),
         hysteresis=hysteresis,
-        reference_surface=outcome.setup.reference_surface if outcome.setup else "",
+        **{name: getattr(outcome.setup, name) for name in _INSTRUMENT if outcome.setup},
         region_weights=_region_weights(maps, fit, options),
     )
 

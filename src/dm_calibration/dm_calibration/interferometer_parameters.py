@@ -84,7 +84,8 @@ PARAMETERS = (
     Parameter(
         "pitch",
         real(0.0, 0.0, 0.1, "m"),
-        "Lateral resolution per pixel for files that do not tell it; 0 = unknown.",
+        "Lateral resolution per pixel, as `./dm measure --reference-sphere` finds it; files that tell one that differs "
+        "by more than 5 % are refused. 0 = as the files tell.",
         live=True,
     ),
     Parameter(
@@ -92,6 +93,19 @@ PARAMETERS = (
         text(""),
         "Map file of the instrument's own error, as it shows it (before orientation.*), which is subtracted from every "
         "map; empty = nothing is.",
+    ),
+    Parameter(
+        "instrument_error",
+        real(0.0, 0.0, 1e-6, "m"),
+        "95 % bound on what is left of the instrument's error in any coefficient; results say what they are absolute "
+        "to by it. 0 = not known.",
+        live=True,
+    ),
+    Parameter(
+        "scale_error",
+        real(0.0, 0.0, 0.1),
+        "95 % bound on the relative error of the lateral scale, for the same; 0 = not known.",
+        live=True,
     ),
     Parameter(
         "xyz_unit",
@@ -147,6 +161,8 @@ def ingest_settings(
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
         minimum_valid_fraction=values["aperture.minimum_valid_fraction"],
         reference=reference,
+        instrument_error=values["instrument_error"],
+        scale_error=values["scale_error"],
         remove_piston_tilt=values["remove_piston_tilt"],
     )
 

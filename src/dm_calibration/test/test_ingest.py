@@ -17,7 +17,9 @@ from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import NoValidPixelsError, read_map
 from dm_calibration.optics.aperture import InsufficientDataError
 from dm_calibration.optics.orientation import Orientation
-from dm_common.optics.zernike import basis
+from dm_common.measurement import Measurement
+from dm_common.optics.conic import conic_sag, pitch_of_sphere
+from dm_common.optics.zernike import basis, curvature_of
 from map_fixtures import NO_DATA, WAVELENGTH, dat_bytes, disc_counts, write_datx
 
 SIZE, PITCH = 120, 2e-4
@@ -112,6 +114,29 @@ def test_a_reference_is_a_map_of_the_instruments_wavelength(surface: Path, tmp_p
         load_reference(str(surface), "", 532e-9, 1e-9)
     with pytest.raises(ValueError, match=r"reference_surface: .*missing.dat: No such file"):
         load_reference(str(tmp_path / "missing.dat"), "", 0.0, 1e-9)
+
+
+def test_a_sphere_of_known_radius_gives_the_lateral_scale(surface: Path) -> None:
+    """A file that is 0.3 % wrong about its pixels makes 9 nm of defocus at 0.05 1/m: none with the pitch found."""
+    told, true = read_map(surface), 1.003 * PITCH
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    away = true * np.hypot(columns - 62, 57 - rows)
+
+    def seen(curvature: float, settings: IngestSettings) -> Measurement:
+        sag = np.where(told.valid, conic_sag(away, np.zeros_like(away), curvature), np.nan)
+        return Ingest().measure(dataclasses.replace(told, sag=sag), settings)[1]
+
+    sphere = seen(-1 / 1.5, IngestSettings())
+    pitch, share = pitch_of_sphere(sphere.coefficients, sphere.radius_px, sphere.pitch, -1.5)
+    assert pitch == pytest.approx(true, rel=2e-5) and share < 3e-5
+    wrong, right = (seen(0.05, IngestSettings(pitch=each)) for each in (0.0, pitch))
+    assert curvature_of(wrong.coefficients, wrong.radius) == pytest.approx(0.05 * 1.003**2, rel=1e-4)
+    assert curvature_of(right.coefficients, right.radius) == pytest.approx(0.05, rel=1e-4)
+    for radius, text in ((1.5, "a sphere of 1.5 m, and the map shows -"), (-3.0, "not a sphere of -3 m")):
+        with pytest.raises(ValueError, match=text):
+            pitch_of_sphere(sphere.coefficients, sphere.radius_px, sphere.pitch, radius)
+    with pytest.raises(MapRejectedError, match=r"pitch 200.000 um, the parameter says 220.000 um: another zoom"):
+        Ingest().read(surface, IngestSettings(pitch=1.1 * PITCH))
 
 
 def test_orientation_turns_the_coefficients(surface: Path) -> None:

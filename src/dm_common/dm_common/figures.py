@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 
 def rounded(value: float) -> str:
     """Two significant digits, more only where they stand before the point: 1.3, 97, 153."""
@@ -18,3 +21,34 @@ def in_wavelengths(length: float, wavelength: float) -> str:
     if length > wavelength:
         return f"{rounded(length / wavelength)} λ"
     return f"λ/{wavelength / length:.0f}" if length > 0 else "0"
+
+
+def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
+    """What a bound on open-loop moves comes to: how well they repeat, and how well they are right, by what limits it.
+
+    Args:
+        repeatable: 95 % bound on the largest coefficient error against the maps of the calibration, m; 0 = not known.
+        calibration: its `wavelength`, `aperture_radius` (m), `instrument_error` (m) and `scale_error`.
+        curvature: for which this holds, 1/m; for a range its farther end. An error of the lateral scale counts twice
+            in the curvature.
+    """
+
+    def length(metres: float) -> str:
+        share = f" ({in_wavelengths(metres, calibration.wavelength)})" if calibration.wavelength > 0.0 else ""
+        return f"{in_nanometres(metres)}{share}"
+
+    if not (math.isfinite(repeatable) and repeatable > 0.0):
+        return "repeatable to what is not known"
+    text = f"repeatable to {length(repeatable)}"
+    parameters = {"instrument_error": calibration.instrument_error, "scale_error": calibration.scale_error}
+    unknown = [name for name, value in parameters.items() if not value > 0.0]
+    if unknown:
+        return f"{text}; absolute not known ({' and '.join(unknown)} of the interferometer not given)"
+    defocus = abs(curvature) * calibration.aperture_radius**2 / 4.0
+    parts = {
+        "the calibration": repeatable,
+        "the instrument's own error": calibration.instrument_error,
+        "the lateral scale": 2.0 * calibration.scale_error * defocus,
+    }
+    limit = max(parts, key=lambda part: parts[part])
+    return f"{text}, absolute to {length(math.hypot(*parts.values()))}, limited by {limit}"

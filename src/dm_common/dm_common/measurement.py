@@ -28,6 +28,8 @@ class Measurement:
         wavelength: m; 0 = unknown.
         system_error_subtracted: 1 yes, 0 no, -1 not known.
         reference_surface: the map that was subtracted as the instrument's error, and its SHA-256; "" = none.
+        instrument_error: 95 % bound on what is left of the instrument's error in a coefficient, m; 0 = not known.
+        scale_error: 95 % bound on the relative error of pitch and radius; 0 = not known.
         file, sha256: the map file it came from; "" = none.
         moved_ns: when the mirror took the shape, ns; 0 = not known.
         instrument: what took the map, with its serial number; "" = not known.
@@ -56,6 +58,8 @@ class Measurement:
     wavelength: float = 0.0
     system_error_subtracted: int = -1
     reference_surface: str = ""
+    instrument_error: float = 0.0
+    scale_error: float = 0.0
     file: str = ""
     sha256: str = ""
     moved_ns: int = 0

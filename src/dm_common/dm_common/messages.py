@@ -106,6 +106,8 @@ def measurement_from(response: Any) -> Measurement:
         wavelength=zernike.wavelength,
         system_error_subtracted=response.info.system_error_subtracted,
         reference_surface=response.info.reference_surface,
+        instrument_error=response.info.instrument_error,
+        scale_error=response.info.scale_error,
         file=response.info.file,
         sha256=response.info.sha256,
         instrument=response.info.instrument,

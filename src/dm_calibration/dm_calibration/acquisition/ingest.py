@@ -23,6 +23,8 @@ from dm_common.optics.zernike import basis
 #: Maps are searched for phase steps where the terms leave more than this at a sampling point, in wavelengths; a step of
 #: a fringe leaves more wherever it ends.
 STEP_SHARE = 0.125
+#: A file whose pitch differs by more than this from the one that is known better is of another zoom.
+ZOOM_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class IngestSettings:
 
     Attributes:
         xyz_unit: unit of `.xyz` values; "" = refuse them.
-        pitch: m per pixel for files that do not tell it; 0 = unknown.
+        pitch: m per pixel, better known than to the files; 0 = as they tell.
         wavelength: expected, m; 0 = any.
         wavelength_tolerance: m.
         orientation: from the instrument's picture to the mirror frame.
@@ -40,6 +42,7 @@ class IngestSettings:
         aperture_centre: (x, y) in m from the oriented map's centre, used with aperture_radius.
         minimum_valid_fraction: valid pixels / pixels inside the aperture.
         reference: the instrument's own error, subtracted from every map before it is turned; None = not known.
+        instrument_error, scale_error: as of :class:`~dm_common.measurement.Measurement`.
         remove_piston_tilt: subtract the map's plane from the map that is handed on; the fit keeps piston and tilt.
     """
 
@@ -53,6 +56,8 @@ class IngestSettings:
     aperture_centre: tuple[float, float] = (0.0, 0.0)
     minimum_valid_fraction: float = 0.7
     reference: SurfaceMap | None = None
+    instrument_error: float = 0.0
+    scale_error: float = 0.0
     remove_piston_tilt: bool = False
 
 
@@ -104,7 +109,11 @@ class Ingest:
                 f"wavelength = {source.wavelength * 1e9:.3f} nm: must be {settings.wavelength * 1e9:.3f} nm within "
                 f"{settings.wavelength_tolerance * 1e9:g} nm (parameters wavelength.expected, wavelength.tolerance)"
             )
-        pitch = source.pitch or settings.pitch or None
+        if source.pitch and settings.pitch and abs(source.pitch - settings.pitch) > ZOOM_SHARE * settings.pitch:
+            raise MapRejectedError(
+                f"pitch {source.pitch * 1e6:.3f} um, the parameter says {settings.pitch * 1e6:.3f} um: another zoom?"
+            )
+        pitch = settings.pitch or source.pitch
         sag, subtracted = source.sag, source.system_error_subtracted
         if settings.reference is not None:
             sag = absolute_sag(source, settings.reference, settings.pitch, settings.wavelength_tolerance)
@@ -141,6 +150,8 @@ class Ingest:
             wavelength=source.wavelength,
             system_error_subtracted=-1 if subtracted is None else int(subtracted),
             reference_surface=reference_name(settings.reference),
+            instrument_error=settings.instrument_error,
+            scale_error=settings.scale_error,
             file=source.file,
             instrument=f"{source.instrument}, serial {source.serial}" if source.serial else source.instrument,
             pitch=pitch or 0.0,

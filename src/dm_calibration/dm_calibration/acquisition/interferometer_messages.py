@@ -61,6 +61,8 @@ def info_message(surface: SurfaceMap, measured: Measurement, header: Header) -> 
         piston_tilt_removed=surface.piston_tilt_removed,
         system_error_subtracted=measured.system_error_subtracted,
         reference_surface=measured.reference_surface,
+        instrument_error=measured.instrument_error,
+        scale_error=measured.scale_error,
         flip_x=measured.orientation[0],
         flip_y=measured.orientation[1],
         rotate_deg=measured.orientation[2],

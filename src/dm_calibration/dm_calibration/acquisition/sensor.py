@@ -46,6 +46,7 @@ def read_sensor(seen: Seen, ingest: Ingest, settings: IngestSettings) -> tuple[S
         MapRejectedError, InsufficientDataError: see :class:`Ingest`.
     """
     surface, residual_rms = seen
+    settings = replace(settings, pitch=0.0)  # which is that of a camera
     if not settings.aperture_radius and surface.pitch:
         settings = replace(settings, aperture_radius=0.5 * PIXELS * surface.pitch, aperture_centre=(0.0, 0.0))
     surface, measured = ingest.measure(surface, settings)

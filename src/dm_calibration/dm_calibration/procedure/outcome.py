@@ -35,6 +35,8 @@ class Setup:
     camera: tuple[int, int] = (0, 0)
     orientation: tuple[bool, bool, float] = (False, False, 0.0)
     reference_surface: str = ""
+    instrument_error: float = 0.0
+    scale_error: float = 0.0
 
     @classmethod
     def of(cls, measured: Measurement) -> Setup:

@@ -16,6 +16,7 @@ from dm_calibration.report import figures
 from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
+from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
@@ -106,15 +107,14 @@ def certificate(calibration: Calibration, names: Mapping[str, str]) -> Section:
     until = calibration.created_ns + round(1e9 * DEFAULTS["updates.stale_after"])
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
-    absolute = f"less the instrument's error in {calibration.reference_surface}"
-    if not calibration.reference_surface:
-        absolute = "only as far as the instrument is right: no reference surface was subtracted (reference_surface)"
+    farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
     rows = [
         ("verdict", verdict),
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach if np.isfinite(low) else "flat is out of reach"),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move"),
-        ("absolute", absolute),
+        ("repeatable, absolute", two_fold(promise(calibration), calibration, farthest)),
+        ("reference surface", calibration.reference_surface or "none was subtracted"),
         ("measured", utc(calibration.stamp_ns)),
         ("valid until", f"{utc(until)}, longer when ./dm check agrees"),
         ("operator", names.get("operator") or "not given (./dm report --operator)"),

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dm_common.optics.zernike import TERM_RMS, basis
+from dm_common.optics.zernike import DEFOCUS, TERM_RMS, basis
 
 _RADIAL_NODES = 24
 _ANGLES = 48
@@ -81,3 +81,37 @@ def _quadrature() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.
     x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
     area = np.repeat(weights / (2 * _ANGLES), _ANGLES)
     return x, y, area[:, np.newaxis] * basis(x, y) / TERM_RMS**2
+
+
+def pitch_of_sphere(
+    coefficients: ArrayLike, radius_px: float, pitch: float, radius_of_curvature: float
+) -> tuple[float, float]:
+    """The lateral resolution (m per pixel) at which a map shows a sphere of known radius.
+
+    The defocus of a sphere goes with the square of the aperture, so heights give lengths.
+
+    Args:
+        coefficients: (21,) m, of a map of the sphere.
+        radius_px: of the aperture, pixels.
+        pitch: in use, m per pixel; 0 = not known.
+        radius_of_curvature: m; positive = concave.
+
+    Returns:
+        The resolution, and its relative error for each nm of error in the defocus.
+
+    Raises:
+        ValueError: no sphere, or the map shows nothing like it: further off than ten per cent from the pitch in use.
+    """
+    seen = float(np.asarray(coefficients)[DEFOCUS])
+    if radius_of_curvature == 0.0 or not seen * radius_of_curvature > 0.0:
+        raise ValueError(f"a sphere of {radius_of_curvature:g} m, and the map shows {seen * 1e9:+.1f} nm of defocus")
+    found = 2.0 * np.sqrt(seen * radius_of_curvature) / radius_px
+    for _ in range(3):  # a sphere is a little steeper than the paraboloid of its curvature
+        expected = conic_coefficients(1.0 / radius_of_curvature, 0.0, found * radius_px)[DEFOCUS]
+        found *= np.sqrt(seen / expected)
+    if pitch > 0.0 and not abs(found / pitch - 1.0) < 0.1:
+        raise ValueError(
+            f"the map would have {found * 1e6:.3f} um per pixel, in use are {pitch * 1e6:.3f}: not a sphere of "
+            f"{radius_of_curvature:g} m"
+        )
+    return float(found), 0.5e-9 / abs(seen)

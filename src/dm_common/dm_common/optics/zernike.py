@@ -91,7 +91,7 @@ NAMES: tuple[str, ...] = tuple(term.name for term in TERMS)
 
 #: What opticians call each term.
 SPOKEN: tuple[str, ...] = tuple(term.spoken for term in TERMS)
-_DEFOCUS = TERMS.index(Term(2, 0, ""))
+DEFOCUS = TERMS.index(Term(2, 0, ""))
 
 #: Root mean square of each term over the unit disc.
 TERM_RMS: NDArray[np.float64] = np.array([term.rms for term in TERMS])
@@ -129,7 +129,7 @@ def curvature_of(coefficients: ArrayLike, radius: float) -> float:
     Args:
         radius: of the aperture, m.
     """
-    return curvature_of_defocus(float(_checked(coefficients)[_DEFOCUS]), radius)
+    return curvature_of_defocus(float(_checked(coefficients)[DEFOCUS]), radius)
 
 
 def curvature_of_defocus(coefficient: float, radius: float) -> float:

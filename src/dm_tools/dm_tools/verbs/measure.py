@@ -6,12 +6,21 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_common.figures import two_fold
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, nanometres, next_step, write_json
 from dm_tools.running_suite import hear_health, kept, naming_holder, running_suite, settled_shape, verdict
 
 
 def measure(
     label: Annotated[str, typer.Option(help="Goes into the log.")] = "",
+    reference_sphere: Annotated[
+        float | None,
+        typer.Option(
+            metavar="METRES",
+            help="In place of the mirror stands a sphere of this radius of curvature (negative = convex): find the "
+            "lateral scale from it.",
+        ),
+    ] = None,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
@@ -42,8 +51,31 @@ def measure(
     if figures["curvature"] is not None:
         console.print(f"defocus: as of a surface of {figures['curvature']:+.4f} 1/m")
     console.print(f"file: {info.file}", soft_wrap=True)
+    if reference_sphere is not None:
+        figures["pitch"] = _scale(info, coefficients, reference_sphere)
+        write_json(json, {"measure": figures})
+        next_step("put pitch and scale_error into the parameter file; then take the sphere out")
+        return
     write_json(json, {"measure": figures})
     next_step("./dm check compares a map with the calibration in use")
+
+
+def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> float:
+    """Say what lateral resolution (m per pixel) a map of a known sphere shows, as parameters, and what limits it."""
+    from dm_common.optics.conic import pitch_of_sphere
+
+    try:
+        pitch, share = pitch_of_sphere(coefficients, info.aperture_radius_px, info.pitch, radius_of_curvature)
+    except ValueError as error:
+        raise typer.BadParameter(f"--reference-sphere: {error}") from error
+    differs = f", {pitch / info.pitch - 1.0:+.3%} against what is in use" if info.pitch > 0.0 else ""
+    console.print(
+        f"pitch: {pitch * 1e6:.5f} um{differs}; each nm of the instrument's own error in defocus is {share:.3%} of it, "
+        "and the sphere's radius counts by half",
+        soft_wrap=True,
+    )
+    console.print(f"/**/interferometer:\n  ros__parameters:\n    pitch: {pitch:.12f}\n    scale_error: {share:.6f}")
+    return pitch
 
 
 def check(
@@ -82,6 +114,7 @@ def check(
         console.print(response.message)
     else:
         console.print(f"largest coefficient: {verdict(promised, response.max_zernike)}")
+        console.print(two_fold(promised, calibration, shape.curvature if shape else 0.0), soft_wrap=True)
         if not response.accepted:
             console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)
         elif without:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from dm_common.figures import two_fold
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
 from dm_tools.running_suite import (
     BUSY_S,
@@ -43,6 +44,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "now": _now(by, shape, state),
         "calibration": _calibration(calibration),
         "promise": _promise(capabilities) if calibration is not None else "none without a calibration",
+        "absolute": _absolute(capabilities, calibration),
         "health": "; ".join(f"{name}: {each.message}" for name, each in health.items() if each.level != b"\0") or "ok",
         "next": _next(lacking, by, state, calibration, shape, capabilities),
     }
@@ -95,6 +97,13 @@ def _promise(capabilities: Any) -> str:
         f"largest coefficient within {promise(capabilities.error_bound)} and what creep adds, from "
         f"{capabilities.curvature_min:+.4f} to {capabilities.curvature_max:+.4f} 1/m; each move says its own"
     )
+
+
+def _absolute(capabilities: Any, calibration: Any) -> str:
+    if capabilities is None or calibration is None or capabilities.error_code:
+        return "not known"
+    farthest = max(capabilities.curvature_min, capabilities.curvature_max, key=abs)
+    return f"{two_fold(capabilities.error_bound, calibration, farthest)}, at {farthest:+.4f} 1/m"
 
 
 def _next(lacking: list[str], by: Any, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
