@@ -45,6 +45,7 @@ from dm_controller.focus_controller_node import FocusControllerNode
 
 rclpy.init()
 node = FocusControllerNode()
+node.trigger_configure(), node.trigger_activate()
 callbacks = {each.topic_name.rsplit("/", 1)[-1]: each.callback for each in node.subscriptions}
 rest = [0.0] * 37
 callbacks["mirror_info"](focus_bench.mirror_info())

@@ -152,6 +152,7 @@ ELSEWHERE = {
     "rosdep install --from-paths src --ignore-src -y": "needs apt and root",
     "sudo apt-get install python3-statsmodels": "needs apt and root",
     "colcon build": "needs ROS 2 from apt; ./dm builds with colcon",
+    "colcon build --packages-up-to dm_example_cpp": "needs ROS 2 from apt; `test_cpp_example` compiles it",
     "docker build -t deformable-mirror .": "needs a Docker daemon; the hosted checks build it",
     "docker run --rm -it deformable-mirror dm demo": "the same",
     "docker run --rm -it --network host --ipc host deformable-mirror": "the same",

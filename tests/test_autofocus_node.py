@@ -332,10 +332,11 @@ def test_without_controller_and_camera_the_reason_is_told(start: Start, observer
     assert "focus_controller" in answer.message
 
 
-def test_a_senseless_region_ends_with_the_reason(start: Start) -> None:
+def test_a_senseless_region_keeps_the_node_from_its_work_with_the_reason(start: Start, observer: Observer) -> None:
     process = start("dm_autofocus", "autofocus", {"region": [0.5, 0.0, 0.9, 1.0]})
-    assert process.process.wait(30) == 1
-    assert "region = [0.5, 0.0, 0.9, 1.0]" in process.output
+    answer = observer.call(GetFocusRange, "get_focus_range")
+    assert answer.error_code == ErrorCode.NODE_INACTIVE
+    assert "region = [0.5, 0.0, 0.9, 1.0]" in answer.message and "region = [0.5, 0.0, 0.9, 1.0]" in process.output
 
 
 def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) -> None:

@@ -16,6 +16,8 @@ from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, MirrorInfo
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 
 from calibration_stand_in import StandIn, doubles
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -168,14 +170,24 @@ def test_calibrate_store_publish_and_serve(node: NodeProcess, bench: StandIn, ob
     assert newest.id == fitted.id
 
 
-def test_cancel_brings_the_mirror_back(node: NodeProcess, bench: StandIn, observer: Observer, folder: Path) -> None:
+@pytest.mark.parametrize("deactivated", [False, True])
+def test_cancel_brings_the_mirror_back(
+    node: NodeProcess, bench: StandIn, observer: Observer, folder: Path, deactivated: bool
+) -> None:
     received = ready(observer, node)
     handle, future = observer.send_goal(Calibrate, "calibrate", pokes(settle_time=0.2))
     wait_until(lambda: len(bench.measured) >= 3, 60, node.output)
-    handle.cancel_goal_async()
+    if deactivated:
+        rest = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+        assert observer.call(ChangeState, "calibration/change_state", rest).success
+    else:
+        handle.cancel_goal_async()
     wait_until(future.done, 60, node.output)
     result = future.result().result
-    assert future.result().status == GoalStatus.STATUS_CANCELED
+    assert future.result().status == (GoalStatus.STATUS_ABORTED if deactivated else GoalStatus.STATUS_CANCELED)
+    if deactivated:
+        assert "calibration was deactivated" in result.message
+        assert observer.call(ListCalibrations, "list_calibrations").error_code == ErrorCode.NODE_INACTIVE
     assert result.error_code == ErrorCode.CANCELED
     assert "the mirror is back at mid range" in result.message
     assert (bench.signals == 0.0).all()

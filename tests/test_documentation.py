@@ -207,6 +207,10 @@ def test_commands_of_ros_name_what_exists(command: str) -> None:
             assert argument.split(":=")[0] in {name for name, _default, _text in LAUNCH_ARGUMENTS}
         assert file.is_file()
         return
+    if words[1] == "run":
+        build = (ROOT / "examples" / "cpp" / "CMakeLists.txt").read_text()
+        assert f"project({words[2]})" in build and f"add_executable({words[3]} " in build
+        return
     if words[1:3] == ["param", "set"]:
         table = {parameter.name: parameter for parameter in TABLES[words[3].lstrip("/")]}
         assert table[words[4]].live, f"{words[4]} cannot be set while the node runs"

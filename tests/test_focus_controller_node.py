@@ -18,6 +18,8 @@ from dm_msgs.msg import (
     FocusRequest,
 )
 from dm_msgs.srv import Flatten, SetFocus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.time import Time
 
 from focus_bench import MIRROR, Bench, calibration, mirror_info
@@ -178,6 +180,35 @@ def test_cancel_holds_the_shape_reached_and_the_newest_goal_preempts(bench: Benc
     assert first.result().result.error_code == ErrorCode.PREEMPTED
     wait_until(second.done)
     assert second.result().result.error_code == ErrorCode.OK
+
+
+def test_deactivated_in_a_move_it_holds_the_shape_reached_and_refuses_until_it_is_active_again(bench: Bench) -> None:
+    def change(transition: int) -> None:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert bench.observer.call(ChangeState, "focus_controller/change_state", request).success
+
+    bench.follow = False
+    bench.ready()
+    _, result = bench.observer.send_goal(MoveFocus, "move_focus", MoveFocus.Goal(request=FocusRequest(curvature=0.01)))
+    wait_until(lambda: len(bench.commands) == 1)
+    half_way = [0.1] * 37
+    bench.publish_state(half_way)
+    threading.Event().wait(0.1)
+    change(Transition.TRANSITION_DEACTIVATE)
+    wait_until(result.done)
+    assert result.result().result.error_code == ErrorCode.CANCELED
+    wait_until(lambda: len(bench.commands) == 2)
+    assert list(bench.commands[-1].signals) == half_way
+    wait_until(lambda: bench.capabilities[-1].error_code == ErrorCode.NODE_INACTIVE)
+    refused = bench.set_focus(curvature=0.01)
+    assert refused.error_code == ErrorCode.NODE_INACTIVE and math.isnan(refused.state.curvature_max)
+    wait_until(lambda: bench.request.get_subscription_count() > 0)
+    bench.request.publish(FocusRequest(curvature=0.01))
+    wait_until(lambda: bench.focus_states and bench.focus_states[-1].error_code == ErrorCode.NODE_INACTIVE)
+    assert len(bench.commands) == 2
+    change(Transition.TRANSITION_ACTIVATE)
+    bench.follow = True
+    wait_until(lambda: bench.set_focus(curvature=0.01).error_code == ErrorCode.OK)
 
 
 def test_move_is_aborted_when_the_driver_loses_its_electronics(bench: Bench) -> None:

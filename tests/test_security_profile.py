@@ -73,6 +73,15 @@ def test_the_policy_is_what_the_node_uses_and_nothing_more(bench: DeformableMirr
         raise AssertionError(f"{name}: {found}") from None
 
 
+def test_only_the_interferometer_hears_a_sensor_and_only_where_there_is_one() -> None:
+    profile = Profile("left", sensor="wavefront/zernike")
+    hear = [
+        name for name in profile.enclaves() if "rt/left/wavefront/zernike" in dds_topics(profile, name)["subscribe"]
+    ]
+    assert hear == ["interferometer"]
+    assert "rt/left/wavefront/zernike" not in dds_topics(Profile("left"), "interferometer")["subscribe"]
+
+
 def test_nobody_but_the_simulation_may_set_the_time() -> None:
     for profile in (Profile(), PROFILE):
         may = [enclave for enclave in profile.enclaves() if "rt/clock" in dds_topics(profile, enclave)["publish"]]

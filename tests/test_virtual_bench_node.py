@@ -11,11 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -115,10 +116,14 @@ def test_fast_clock(start: Start, observer: Observer) -> None:
 
 def test_images_of_the_camera(start: Start, observer: Observer) -> None:
     images: list[Image] = observer.record(Image, "image_raw", qos_profile_sensor_data)
+    infos: list[CameraInfo] = observer.record(CameraInfo, "camera_info", qos_profile_sensor_data)
     process = start("dm_simulation", "virtual_bench", {**SMALL, "camera.rate": 30.0, "camera.width": 160})
     wait_until(lambda: len(images) > 10, 60, "images")
     first, last = images[0], images[-1]
     assert (last.width, last.height, last.encoding, len(last.data)) == (160, 240, "mono8", 160 * 240)
+    wait_until(lambda: infos, 60, "camera_info")
+    assert np.array_equal(infos[-1].p.reshape(3, 4)[:, :3], infos[-1].k.reshape(3, 3)) and infos[-1].k[0] > 0.0
+    assert np.array_equal(infos[-1].r.reshape(3, 3), np.eye(3)) and infos[-1].distortion_model == "plumb_bob"
     stamps = [Time.from_msg(image.header.stamp).nanoseconds for image in images]
     assert stamps == sorted(set(stamps))
     assert (stamps[-1] - stamps[0]) * 1e-9 > 0.9 * (len(stamps) - 1) / 30, "no faster than asked for"

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 from dm_msgs.action import Autofocus
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_autofocus.autofocus_parameters import focus_lens, search_config
@@ -25,6 +24,7 @@ from dm_autofocus.sharpness import Region, check_region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.optics.zernike import curvature_of_defocus
+from dm_common.ros.worker import WorkerGoal
 from dm_common.values import Fields, real, reals
 
 #: Uncertainty of the mirror's curvature with which it stands where it is sent, in depths of focus.
@@ -51,7 +51,7 @@ class AutofocusAction(ProbeAction):
         except ValueError as error:
             raise Refusal(ErrorCode.OUT_OF_RANGE, str(error)) from error
 
-    def _carry_out(self, goal_handle: ServerGoalHandle, plan: tuple[SearchConfig, Region], result: Any) -> None:
+    def _carry_out(self, goal_handle: WorkerGoal, plan: tuple[SearchConfig, Region], result: Any) -> None:
         peak, config, swept = self._search(goal_handle, *plan)
         self._fill(result, peak)
         if goal_handle.request.track:
@@ -62,9 +62,7 @@ class AutofocusAction(ProbeAction):
         if peak.at_limit:
             result.message += "; at the end of the range: the object may lie beyond it"
 
-    def _search(
-        self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region
-    ) -> tuple[Peak, SearchConfig, str]:
+    def _search(self, goal_handle: WorkerGoal, config: SearchConfig, region: Region) -> tuple[Peak, SearchConfig, str]:
         """Search from beginning to end and stand on the peak; without one, where the mirror stood before.
 
         Returns:
@@ -137,9 +135,7 @@ class AutofocusAction(ProbeAction):
         except ValueError as reason:
             raise Refusal(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
 
-    def _track(
-        self, goal_handle: ServerGoalHandle, config: SearchConfig, region: Region, peak: Peak, result: Any
-    ) -> None:
+    def _track(self, goal_handle: WorkerGoal, config: SearchConfig, region: Region, peak: Peak, result: Any) -> None:
         """Stay on the peak until cancelled or pre-empted: ends by Refusal only."""
         tracker = self._tracker(peak, config, region)
         position = peak.curvature
@@ -175,7 +171,7 @@ class AutofocusAction(ProbeAction):
 
     def _report(
         self,
-        goal_handle: ServerGoalHandle,
+        goal_handle: WorkerGoal,
         phase: Phase,
         sample: SharpnessSample,
         curvature: float,

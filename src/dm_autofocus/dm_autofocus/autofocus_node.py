@@ -9,22 +9,21 @@ from typing import Any
 from dm_msgs.msg import AutofocusState, Capabilities, FocusRequest
 from dm_msgs.srv import GetFocusRange, SetFocus, SetFocusDistance
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 
 from dm_autofocus.autofocus_action import AutofocusAction
 from dm_autofocus.autofocus_parameters import PARAMETERS, focus_optics, tolerance_of
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
 from dm_autofocus.focus_stack_action import FocusStackAction
 from dm_autofocus.images import exposure_fault
-from dm_autofocus.optics import dioptre_of, distance_of
+from dm_autofocus.optics import FocusOptics, dioptre_of, distance_of
 from dm_autofocus.probe_action import ready_capabilities
 from dm_autofocus.search.peak_search import Phase
 from dm_autofocus.sharpness import check_region
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros import diagnostics, qos
+from dm_common.ros import qos
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.executor import run_node
-from dm_common.ros.parameters import declare
+from dm_common.ros.lifecycle import OK, WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerService, never_silent
 from dm_common.values import Fields, real, without_figures
 
@@ -33,27 +32,31 @@ SET_FOCUS_DISTANCE = Fields(
 )
 
 
-class AutofocusNode(Node):
+class AutofocusNode(ManagedNode):
     """See docs/camera.md for the interfaces; optics, sharpness and search are in `dm_autofocus`."""
 
     def __init__(self, **keywords: Any) -> None:
-        super().__init__("autofocus", **keywords)
-        self._values = declare(self, PARAMETERS)
-        self._optics = focus_optics(self._values)
+        super().__init__("autofocus", PARAMETERS, **keywords)
+        self._optics: FocusOptics
         self._probe = FocusProbe(self, self._values)
         self._state = self.create_publisher(AutofocusState, "autofocus_state", qos.with_lease(qos.STATE))
         self._set_focus = self.create_client(SetFocus, "set_focus")
         for action in (AutofocusAction, FocusStackAction):
-            action(self, self._probe, self._values, self._optics, self._publish)
+            action(self, self._probe, self._values, lambda: self._optics, self._publish)
         WorkerService(self, SetFocusDistance, "set_focus_distance", self._on_set_focus_distance, SET_FOCUS_DISTANCE)
         answer = never_silent(self, "get_focus_range", self._on_get_focus_range)
         self.create_service(GetFocusRange, "get_focus_range", answer)
         self._watched: Any = None
         self._image_problem = ""
-        if self._values["monitor_rate"] > 0:
-            period = 1 / self._values["monitor_rate"]
-            self.create_timer(period, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        diagnostics.Diagnostics(self, "", self._health)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(1.0, self._watch, clock=steady, autostart=False)
+
+    def configure(self) -> None:
+        self._optics = focus_optics(self._values)
+        self._timer.cancel()
+        if rate := self._values["monitor_rate"]:
+            self._timer.timer_period_ns = round(1e9 / rate)
+            self._timer.reset()
 
     # --- focus by distance ---
 
@@ -121,7 +124,7 @@ class AutofocusNode(Node):
     def _watch(self) -> None:
         """While idle, a figure of the newest image now and then."""
         image = self._probe.newest
-        if self._probe.user or image is None or image is self._watched:
+        if not self.active or self._probe.user or image is None or image is self._watched:
             return
         self._watched = image
         try:
@@ -132,7 +135,7 @@ class AutofocusNode(Node):
             self._image_problem = str(error)
             self.get_logger().warning(self._image_problem, throttle_duration_sec=5.0)
 
-    def _health(self) -> diagnostics.Health:
+    def health(self) -> Health:
         values = {"images_counted": self._probe.counted, "images_dropped": self._probe.dropped}
         try:
             ready_capabilities(self._probe)
@@ -141,8 +144,8 @@ class AutofocusNode(Node):
             if self._image_problem:
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, self._image_problem)
         except Refusal as error:
-            return diagnostics.Health(diagnostics.WARN, str(error), values)
-        return diagnostics.Health(diagnostics.OK, self._probe.user or "ready", values)
+            return Health(WARN, str(error), values)
+        return Health(OK, self._probe.user or "ready", values)
 
 
 def main() -> int:

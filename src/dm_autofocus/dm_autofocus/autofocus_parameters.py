@@ -10,9 +10,10 @@ from dm_autofocus.optics import FocusOptics, depth_of_focus
 from dm_autofocus.search.defocus_model import FocusLens
 from dm_autofocus.search.peak_search import NOISE_POINTS, SearchConfig
 from dm_autofocus.sharpness import METRICS, check_region
-from dm_common.ros.parameters import Parameter, real, reals, switch, text, whole
+from dm_common.ros.parameters import AUTOSTART, Parameter, real, reals, switch, text, whole
 
 PARAMETERS: Final = (
+    AUTOSTART,
     Parameter(
         "optics.rest_distance",
         real(0.0, 0.0, 1e6, "m"),

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from dm_msgs.action import FocusStack
 from numpy.typing import NDArray
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
@@ -23,6 +22,7 @@ from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
 from dm_autofocus.sharpness import WHOLE
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
+from dm_common.ros.worker import WorkerGoal
 from dm_common.values import Fields, real, whole
 
 #: Most images of a stack.
@@ -50,7 +50,7 @@ class FocusStackAction(ProbeAction):
         step = self._values["stack.step"] * tolerance_of(self._values, capabilities.aperture_radius)
         return np.linspace(low, high, goal.images or min(max(NOISE_POINTS, 1 + math.ceil((high - low) / step)), MOST))
 
-    def _carry_out(self, goal_handle: ServerGoalHandle, plan: NDArray[np.float64], result: Any) -> None:
+    def _carry_out(self, goal_handle: WorkerGoal, plan: NDArray[np.float64], result: Any) -> None:
         before = self._probe.curvature
         stack, image = self._sweep(goal_handle, plan)
         if math.isfinite(before):
@@ -71,7 +71,7 @@ class FocusStackAction(ProbeAction):
         result.distance_near, result.distance_far, result.stamp = float(near), float(far), image.header.stamp
         result.message = f"{len(stack.positions)} images, {100 * result.share:.0f} % of the pixels have a distance"
 
-    def _sweep(self, goal_handle: ServerGoalHandle, plan: NDArray[np.float64]) -> tuple[ImageStack, Image]:
+    def _sweep(self, goal_handle: WorkerGoal, plan: NDArray[np.float64]) -> tuple[ImageStack, Image]:
         """The stack and its last image. What the mirror refuses at the ends of the range is left out."""
         stack = ImageStack(self._values["stack.cell"])
         image = Image()

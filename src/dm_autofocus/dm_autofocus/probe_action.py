@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dm_msgs.msg import Capabilities
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_autofocus.focus_probe import FocusProbe, SharpnessSample
@@ -16,7 +15,7 @@ from dm_autofocus.optics import FocusOptics
 from dm_autofocus.search.peak_search import Phase
 from dm_autofocus.sharpness import Region
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.worker import WorkerActionServer
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal
 from dm_common.values import Fields
 
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
@@ -61,7 +60,7 @@ class ProbeAction(ABC):
         action_type, name, fields: of the action.
         probe: moves and measures.
         values: parameters of the node.
-        optics: from curvatures to distances.
+        optics: from curvatures to distances, now.
         publish: (phase, sample): publishes an image that counted.
     """
 
@@ -73,7 +72,7 @@ class ProbeAction(ABC):
         fields: Fields,
         probe: FocusProbe,
         values: Mapping[str, Any],
-        optics: FocusOptics,
+        optics: Callable[[], FocusOptics],
         publish: Callable[[Phase, SharpnessSample], None],
     ) -> None:
         self._log = node.get_logger()
@@ -81,19 +80,23 @@ class ProbeAction(ABC):
         self._name = name
         self._probe = probe
         self._values = values
-        self._optics = optics
+        self._optics_now = optics
         self._publish = publish
         self._server = WorkerActionServer(node, action_type, name, self._run, exclusive="preempt", fields=fields)
+
+    @property
+    def _optics(self) -> FocusOptics:
+        return self._optics_now()
 
     @abstractmethod
     def _plan(self, goal: Any) -> Any:
         """What is to be done. Raises Refusal."""
 
     @abstractmethod
-    def _carry_out(self, goal_handle: ServerGoalHandle, plan: Any, result: Any) -> None:
+    def _carry_out(self, goal_handle: WorkerGoal, plan: Any, result: Any) -> None:
         """Do it and fill the result, its message too. Raises Refusal."""
 
-    def _run(self, goal_handle: ServerGoalHandle) -> tuple[str, Any]:
+    def _run(self, goal_handle: WorkerGoal) -> tuple[str, Any]:
         started = time.monotonic()
         result = self._type.Result()
         outcome = "succeed"
@@ -110,20 +113,20 @@ class ProbeAction(ABC):
         result.duration = time.monotonic() - started
         return outcome, result
 
-    def _go(self, goal_handle: ServerGoalHandle, curvature: float) -> None:
+    def _go(self, goal_handle: WorkerGoal, curvature: float) -> None:
         self._probe.move(curvature, lambda: self._stopping(goal_handle))
         self._check_stop(goal_handle)
 
-    def _measure(self, goal_handle: ServerGoalHandle, region: Region) -> SharpnessSample:
+    def _measure(self, goal_handle: WorkerGoal, region: Region) -> SharpnessSample:
         sample = self._probe.measure(region, lambda: self._stopping(goal_handle))
         self._check_stop(goal_handle)
         assert sample is not None  # only a stop leaves without one
         return sample
 
-    def _stopping(self, goal_handle: ServerGoalHandle) -> bool:
+    def _stopping(self, goal_handle: WorkerGoal) -> bool:
         return goal_handle.is_cancel_requested or self._server.preempted(goal_handle)
 
-    def _check_stop(self, goal_handle: ServerGoalHandle) -> None:
+    def _check_stop(self, goal_handle: WorkerGoal) -> None:
         if goal_handle.is_cancel_requested:
             raise Refusal(ErrorCode.CANCELED, "canceled; the mirror holds the shape it has")
         if self._server.preempted(goal_handle):

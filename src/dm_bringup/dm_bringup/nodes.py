@@ -23,7 +23,7 @@ class SuiteNode:
         parameter_module: of the package; its `PARAMETERS` is the table of the node's parameters.
         configuring: "module.function" of the package that the node makes its parts with from the values of all its
             parameters, or checks them by, raising ValueError; "" = any values that the table allows will do.
-        lifecycle: whether it is a lifecycle node (it configures and activates itself).
+        lifecycle: whether it is a lifecycle node.
         optional: whether it runs only where a configuration has a section for it.
     """
 
@@ -32,7 +32,7 @@ class SuiteNode:
     class_name: str
     parameter_module: str
     configuring: str = ""
-    lifecycle: bool = False
+    lifecycle: bool = True
     optional: bool = False
 
     @property
@@ -62,7 +62,13 @@ class SuiteNode:
 #: In the order of their start. They stop together, the bench after the others: it outlives the driver's last ramp.
 NODES = (
     SuiteNode(
-        "virtual_bench", "dm_simulation", "VirtualBenchNode", "parameters", "parameters.check_bench", optional=True
+        "virtual_bench",
+        "dm_simulation",
+        "VirtualBenchNode",
+        "parameters",
+        "parameters.check_bench",
+        lifecycle=False,
+        optional=True,
     ),
     SuiteNode(
         "pdm_driver",
@@ -70,7 +76,6 @@ NODES = (
         "PdmDriverNode",
         "driver_parameters",
         "driver_configuration.build_configuration",
-        True,
     ),
     SuiteNode(
         "interferometer",
@@ -78,7 +83,6 @@ NODES = (
         "InterferometerNode",
         "interferometer_parameters",
         "interferometer_parameters.configure",
-        True,
     ),
     SuiteNode("calibration", "dm_calibration", "CalibrationNode", "calibration_parameters"),
     SuiteNode("focus_controller", "dm_controller", "FocusControllerNode", "focus_parameters"),
@@ -114,6 +118,8 @@ def node_environment(config_folder: Path) -> dict[str, str]:
     }
 
 
+#: Value of the launch argument `autostart`: nodes are configured and activated from outside.
+BY_EVENTS = "events"
 #: Arguments of the launch files: name, default (None = `config` must be given) and description.
 LAUNCH_ARGUMENTS = (
     ("config", None, "parameter file of all nodes, see config/hardware.yaml"),
@@ -123,7 +129,12 @@ LAUNCH_ARGUMENTS = (
     ("log_level", "info", "of every node: debug, info, warn, error, fatal"),
     ("remap", "", "remappings of every node, separated by blanks: image_raw:=/camera/image_raw"),
     ("use_sim_time", "", "true or false; empty = as the parameter file says"),
-    ("autostart", "", "true: driver and interferometer configure and activate themselves; empty = as in the file"),
+    (
+        "autostart",
+        "",
+        "true: each node configures and activates itself, also when it was started again; false: a lifecycle manager "
+        "does; events: this launch does, by lifecycle events; empty = as in the file",
+    ),
 )
 
 
@@ -137,11 +148,12 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
         ValueError: a value that cannot be; the message names the argument, the value and what is allowed.
     """
     parameters: list[Any] = [values["config"]]
-    switches = {
-        name: flag(name, values[name])
-        for name in ("use_sim_time", "autostart")
-        if values[name] and (name == "use_sim_time" or node.lifecycle)
-    }
+    given = {name: values[name] for name in ("use_sim_time", "autostart") if values[name]}
+    if not node.lifecycle:
+        given.pop("autostart", None)
+    if given.get("autostart") == BY_EVENTS:
+        given["autostart"] = "false"
+    switches = {name: flag(name, text) for name, text in given.items()}
     if switches:
         parameters.append(switches)
     return {

@@ -3,11 +3,23 @@
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument, GroupAction, OpaqueFunction, SetEnvironmentVariable
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    GroupAction,
+    OpaqueFunction,
+    RegisterEventHandler,
+    SetEnvironmentVariable,
+)
+from launch.event_handlers import OnProcessStart
+from launch.events import matches_action
 from launch.substitutions import EnvironmentVariable, LaunchConfiguration
-from launch_ros.actions import Node
+from launch_ros.actions import LifecycleNode, Node
+from launch_ros.event_handlers import OnStateTransition
+from launch_ros.events.lifecycle import ChangeState
+from lifecycle_msgs.msg import Transition
 
-from dm_bringup.nodes import LAUNCH_ARGUMENTS, arguments_of, node_environment, nodes_of
+from dm_bringup.nodes import BY_EVENTS, LAUNCH_ARGUMENTS, arguments_of, node_environment, nodes_of
 from dm_bringup.suite import load_config
 from launch import LaunchDescription
 
@@ -15,10 +27,31 @@ from launch import LaunchDescription
 def start_nodes(context):
     """One action a node; the virtual bench and the autofocus only where the file has a section for them."""
     values = {name: LaunchConfiguration(name).perform(context) for name, _default, _text in LAUNCH_ARGUMENTS}
-    nodes = nodes_of(load_config(Path(values["config"])))
+    actions = []
+    for node in nodes_of(load_config(Path(values["config"]))):
+        action = (LifecycleNode if node.lifecycle else Node)(
+            package=node.package, executable=node.name, name=node.name, output="screen", **arguments_of(node, values)
+        )
+        if node.lifecycle and values["autostart"] == BY_EVENTS:
+            actions += brought_up(action)
+        actions.append(action)
+    return actions
+
+
+def brought_up(action):
+    """Configure a node when its process has started, and activate it when it is inactive."""
+
+    def change(transition):
+        return [EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(action), transition_id=transition))]
+
+    configured = {"start_state": "configuring", "goal_state": "inactive"}
     return [
-        Node(package=node.package, executable=node.name, output="screen", **arguments_of(node, values))
-        for node in nodes
+        RegisterEventHandler(OnProcessStart(target_action=action, on_start=change(Transition.TRANSITION_CONFIGURE))),
+        RegisterEventHandler(
+            OnStateTransition(
+                target_lifecycle_node=action, entities=change(Transition.TRANSITION_ACTIVATE), **configured
+            )
+        ),
     ]
 
 

@@ -30,6 +30,10 @@ class _Recorded:
         return context[self.arguments[0]]
 
 
+class _Managed(_Recorded):
+    """A lifecycle node."""
+
+
 @pytest.mark.parametrize(
     ("config", "nodes"),
     [("bench.yaml", NAMES[:5]), ("hardware.yaml", NAMES[1:5]), ("camera.yaml", NAMES[1:])],
@@ -38,10 +42,11 @@ def test_launch_files_start_what_up_starts(
     config: str, nodes: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stand_ins = dict.fromkeys(("LaunchConfiguration", "OpaqueFunction", "GroupAction"), _Recorded)
-    for name in ("launch", "launch.actions", "launch.substitutions", "launch.launch_description_sources"):
+    parts = ("actions", "event_handlers", "events", "substitutions", "launch_description_sources")
+    for name in ("launch", *(f"launch.{part}" for part in parts)):
         monkeypatch.setitem(sys.modules, name, MagicMock(**stand_ins))
-    for name in ("launch_ros", "launch_ros.actions"):
-        monkeypatch.setitem(sys.modules, name, MagicMock(Node=_Recorded))
+    for name in ("", ".actions", ".event_handlers", ".events", ".events.lifecycle"):
+        monkeypatch.setitem(sys.modules, f"launch_ros{name}", MagicMock(Node=_Recorded, LifecycleNode=_Managed))
     monkeypatch.setattr(sys.modules["launch"], "LaunchDescription", _Recorded)
     folder = SHARE / "config"
     path = folder / config
@@ -58,6 +63,12 @@ def test_launch_files_start_what_up_starts(
     assert tuple(action.keywords["executable"] for action in actions) == nodes
     assert tuple(node.name for node in nodes_of(load_config(path))) == nodes
     assert {action.keywords["parameters"][0] for action in actions} == {str(path)}
+    managed = [action.keywords["executable"] for action in actions if isinstance(action, _Managed)]
+    assert managed == [name for name in nodes if name != "virtual_bench"]
+    # By events: a handler of its start and one of its configuration before each of them.
+    driven = start_nodes(DEFAULTS | {"config": str(path), "autostart": "events"})
+    assert [isinstance(action, _Managed) for action in driven[-3:]] == [False, False, True]
+    assert driven[-1].keywords["parameters"][1] == {"autostart": False} and len(driven) == len(nodes) + 2 * len(managed)
     with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
         start_nodes(DEFAULTS | {"config": str(tmp_path / "none.yaml")})
 

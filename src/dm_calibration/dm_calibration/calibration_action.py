@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dm_msgs.action import Calibrate
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -26,7 +25,7 @@ from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.mirror import Mirror
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.worker import wait_for_clock
+from dm_common.ros.worker import WorkerGoal, wait_for_clock
 
 #: Least time between two feedback messages, s.
 FEEDBACK_PERIOD_S = 0.1
@@ -58,7 +57,7 @@ class CalibrateAction:
         self._node, self._values, self._services, self._manager = node, values, services, manager
         self._driver_facts, self._enough = driver_facts, GoodEnough(0.0)
 
-    def run(self, handle: ServerGoalHandle) -> tuple[str, Calibrate.Result]:
+    def run(self, handle: WorkerGoal) -> tuple[str, Calibrate.Result]:
         goal, result = handle.request, Calibrate.Result()
         clock = self._node.get_clock()
         started = clock.now()
@@ -88,7 +87,7 @@ class CalibrateAction:
 
     def _run_kept(
         self,
-        handle: ServerGoalHandle,
+        handle: WorkerGoal,
         plan: Plan,
         options: PlanOptions,
         mirror: Mirror,
@@ -171,7 +170,7 @@ class CalibrateAction:
             result.message = f"{maps} maps in about {expected.duration:.0f} s{guess}{accuracy}; nothing was moved"
 
     def _procedure(
-        self, handle: ServerGoalHandle, plan: Plan, mirror: Mirror, run: OpenRun
+        self, handle: WorkerGoal, plan: Plan, mirror: Mirror, run: OpenRun
     ) -> tuple[Procedure, Callable[[int, str, int], None]]:
         """The run of `plan`, and a function that reports phase, label and step."""
         feedback = Calibrate.Feedback(steps=len(plan.steps))

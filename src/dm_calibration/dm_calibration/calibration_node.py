@@ -20,7 +20,6 @@ from dm_msgs.srv import (
     StoreRecipes,
 )
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 
 from dm_calibration import requests
 from dm_calibration.calibration import Calibration
@@ -35,21 +34,23 @@ from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.messages import mirror_from, recipe_book_from, time_message
-from dm_common.ros import diagnostics, qos
+from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.executor import run_node
-from dm_common.ros.parameters import declare
+from dm_common.ros.lifecycle import WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerActionServer, WorkerService
 
 
-class CalibrationNode(Node):
-    """Topics, services and the action of the calibration; what they do is in CalibrationManager and CalibrateAction."""
+class CalibrationNode(ManagedNode):
+    """Topics, services and the action of the calibration; what they do is in CalibrationManager and CalibrateAction.
+
+    While it is inactive it takes no maps, and the calibration in use stays; a cleanup withdraws that.
+    """
 
     def __init__(self) -> None:
-        super().__init__("calibration")
-        self._values = declare(self, PARAMETERS)
+        super().__init__("calibration", PARAMETERS, hardware_id="calibration")
         self._frame_id = ""
-        self._start_pending = bool(self._values["load_on_start"])
+        self._start_pending = False
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.with_lease(qos.LATCHED))
         self._reports = ReportWriter(self._log_report)
@@ -65,7 +66,9 @@ class CalibrationNode(Node):
         self._server = WorkerActionServer(
             self, Calibrate, "calibrate", action.run, exclusive="refuse", fields=requests.CALIBRATE
         )
-        self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
+        self._listener = MapListener(
+            self, self._values, self._manager, self._bench_services, lambda: self._server.busy or not self.active
+        )
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load, requests.LOAD_CALIBRATION)
         fields = requests.FIT_INFLUENCE_FUNCTION
@@ -74,12 +77,24 @@ class CalibrationNode(Node):
         prediction = ErrorPrediction(self._manager, self._values)
         WorkerService(self, FitRegression, "fit_regression", prediction.fit, requests.FIT_REGRESSION)
         WorkerService(self, PredictError, "predict_error", prediction.predict)
-        self._diagnostics = diagnostics.Diagnostics(self, "calibration", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._ticker = self.create_timer(PUBLISH_PERIOD_S, self._listener.tick, clock=steady)
+        self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
+
+    def configure(self) -> None:
+        self._manager.store.folder = Path(self._values["calibration_folder"]).expanduser()
+
+    def activate(self) -> None:
+        if self._manager.in_use is not None:
+            return
+        self._start_pending = bool(self._values["load_on_start"])
         if not self._start_pending:  # else nobody shall take for uncalibrated what is about to be loaded
             self._publish(None, None)
-        self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
+        self._load_pending()
+
+    def clean_up(self) -> None:
+        if self._manager.in_use is not None:
+            self._manager.use(None)
 
     def make_safe(self) -> None:
         """Bring the mirror back to mid range when the process ends in the middle of a calibration."""
@@ -117,7 +132,10 @@ class CalibrationNode(Node):
         if withdrawn := self._manager.set_mirror(mirror):
             self.get_logger().warning(withdrawn)
         self._diagnostics.hardware_id = f"{mirror.name} {mirror.serial}"
-        if self._start_pending:
+        self._load_pending()
+
+    def _load_pending(self) -> None:
+        if self._start_pending and self.active and self._manager.mirror is not None:
             self._start_pending = False
             # Reading the folder takes longer than a callback may.
             threading.Thread(target=self._load_on_start, daemon=True).start()
@@ -185,17 +203,17 @@ class CalibrationNode(Node):
         )
         return response
 
-    def _health(self) -> diagnostics.Health:
+    def health(self) -> Health:
         calibration, mirror = self._manager.in_use, self._manager.mirror
         values: dict[str, object] = {"calibrating": self._server.busy, "folder": str(self._manager.store.folder)}
         if mirror is None:
-            return diagnostics.Health(diagnostics.WARN, "no mirror_info: is pdm_driver running?", values)
+            return Health(WARN, "no mirror_info: is pdm_driver running?", values)
         if calibration is None:
-            return diagnostics.Health(diagnostics.WARN, "no calibration is in use", values)
+            return Health(WARN, "no calibration is in use", values)
         values["held_out_rms_nm"] = round(calibration.fit.held_out_rms * 1e9, 3)
         values["maps_used"] = int(calibration.fit.used.sum())
         level, warnings, figures = self._listener.health()
-        return diagnostics.Health(level, "; ".join((f"calibration {calibration.id}", *warnings)), values | figures)
+        return Health(level, "; ".join((f"calibration {calibration.id}", *warnings)), values | figures)
 
 
 def main(args: Sequence[str] | None = None) -> int:

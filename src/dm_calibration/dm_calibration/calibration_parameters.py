@@ -11,9 +11,10 @@ from dm_calibration.procedure.bump_check import BumpOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift_filter import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
-from dm_common.ros.parameters import APERTURE_PARAMETER, Parameter, real, switch, text, whole
+from dm_common.ros.parameters import APERTURE_PARAMETER, AUTOSTART, Parameter, real, switch, text, whole
 
 PARAMETERS = (
+    AUTOSTART,
     Parameter("calibration_folder", text("~/.ros/dm_calibrations"), "Folder of the calibration files."),
     Parameter(
         "load_on_start",

@@ -17,8 +17,6 @@ from typing import Any
 
 from dm_msgs.msg import MirrorInfo, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import IngestFile, Measure
-from rclpy.clock import Clock, ClockType
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 from rclpy.time import Time
@@ -36,25 +34,25 @@ from dm_calibration.requests import INGEST_FILE, MEASURE
 from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.measurement import Measurement
 from dm_common.messages import stamp_ns
-from dm_common.ros import diagnostics, parameters, qos
+from dm_common.ros import parameters, qos
 from dm_common.ros.executor import run_node
+from dm_common.ros.lifecycle import ERROR, OK, WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerService
 
 
-class InterferometerNode(LifecycleNode):
+class InterferometerNode(ManagedNode):
     """Translates between map files and messages; reading and fitting are in `ingest` and `acquisition`."""
 
+    rests = False
+
     def __init__(self) -> None:
-        super().__init__("interferometer")
-        self._configured = self._active = False
         self._mirror_radius = 0.0  # m; 0 = not known
-        self._values = parameters.declare(
-            self, PARAMETERS, unlocked=lambda: not self._configured, check=self._fits_mirror
-        )
+        super().__init__("interferometer", PARAMETERS, check=self._fits_mirror, hardware_id="interferometer")
         self._ingest = Ingest()
         self._reference: SurfaceMap | None = None
         self._acquisition: Acquisition | SensorAcquisition | None = None
         self._sensor: Subscription | None = None
+        self._publishers_made = False
         self._publishing = threading.Lock()  # the four messages of one map stay together
         self._taken = self._bad = 0
         self._last_file = self._last_refusal = ""
@@ -64,15 +62,11 @@ class InterferometerNode(LifecycleNode):
         self._info_publisher = self.create_lifecycle_publisher(
             SurfaceMapInfo, "surface_map_info", qos.with_lease(qos.STATE)
         )
-        self._diagnostics = diagnostics.Diagnostics(self, "interferometer", self._health)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self._worker_services = [
             WorkerService(self, IngestFile, "ingest_file", self._on_ingest_file, INGEST_FILE),
             WorkerService(self, Measure, "measure", self._on_measure, MEASURE),
         ]
-        if self._values["autostart"]:
-            steady = Clock(clock_type=ClockType.STEADY_TIME)
-            self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
 
     def _on_mirror_info(self, message: MirrorInfo) -> None:
         self._mirror_radius = 0.5 * message.full_aperture_diameter
@@ -82,26 +76,15 @@ class InterferometerNode(LifecycleNode):
         if wrong := too_large(changes.get("aperture.radius", 0.0), self._mirror_radius):
             raise parameters.ParameterError(wrong)
 
-    def _autostart(self) -> None:
-        self._autostart_timer.cancel()
-        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
-            self.trigger_activate()
-
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        try:
-            self._values.check()
-            settings, self._reference = configure(self._values)
-            self._acquisition = Acquisition(settings, self._read, self._now_ns, self._on_new_file, self._warn_of_file)
-            if topic := self._values["zernike_topic"]:
-                self._listen_to(topic)
-        except ValueError as error:
-            self.get_logger().error(f"cannot configure: {error}")
-            return TransitionCallbackReturn.FAILURE
+    def configure(self) -> None:
+        settings, self._reference = configure(self._values)
+        self._acquisition = Acquisition(settings, self._read, self._now_ns, self._on_new_file, self._warn_of_file)
+        if topic := self._values["zernike_topic"]:
+            self._listen_to(topic)
         self._map_publisher = self.create_lifecycle_publisher(Image, "surface_map", qos.MAP)
         self._zernike_publisher = self.create_lifecycle_publisher(ZernikeCoefficients, "zernike", qos.STATE)
         self._samples_publisher = self.create_lifecycle_publisher(SurfaceSamples, "surface_samples", qos.STATE)
-        self._configured = True
-        return TransitionCallbackReturn.SUCCESS
+        self._publishers_made = True
 
     def _listen_to(self, topic: str) -> None:
         """Take measurements from a sensor in place of map files."""
@@ -115,38 +98,25 @@ class InterferometerNode(LifecycleNode):
 
         self._sensor = self.create_subscription(ZernikeCoefficients, topic, heard, qos_profile_sensor_data)
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def activate(self) -> None:
         assert self._acquisition is not None
-        result = super().on_activate(state)
-        self._active = True
         self._acquisition.start()
         less = f", less {reference_name(self._reference)}" if self._reference is not None else ""
         self.get_logger().info(f"active; maps from {self._acquisition.source}{less}")
-        return result
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def deactivate(self) -> None:
         self.make_safe()
-        return super().on_deactivate(state)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.make_safe()
-        self._release()
-        return TransitionCallbackReturn.SUCCESS
 
     def make_safe(self) -> None:
         """End the watching thread and a running trigger command."""
-        self._active = False
+        self.active = False
         if self._acquisition is not None:
             self._acquisition.stop()
 
-    def _release(self) -> None:
-        if self._configured:
-            self._configured = False
+    def clean_up(self) -> None:
+        if self._publishers_made:
             with self._publishing:
+                self._publishers_made = False
                 for publisher in (self._map_publisher, self._zernike_publisher, self._samples_publisher):
                     self.destroy_lifecycle_publisher(publisher)
         if self._sensor is not None:
@@ -154,7 +124,7 @@ class InterferometerNode(LifecycleNode):
         self._acquisition = self._sensor = None
 
     def _on_ingest_file(self, request: IngestFile.Request, response: IngestFile.Response) -> IngestFile.Response:
-        if not self._configured:
+        if not self.configured:
             raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not configured")
         with self._counting_refusals():
             surface, measured = self._read(self._expanded(request.path))
@@ -170,7 +140,7 @@ class InterferometerNode(LifecycleNode):
 
     def _on_measure(self, request: Measure.Request, response: Measure.Response) -> Measure.Response:
         acquisition = self._acquisition
-        if not self._active or acquisition is None:
+        if not self.active or acquisition is None:
             raise Refusal(ErrorCode.INTERFEROMETER_INACTIVE, "the interferometer is not active: activate it first")
         timeout_s = request.timeout or self._values["measure_timeout"]
         with self._counting_refusals():
@@ -193,7 +163,7 @@ class InterferometerNode(LifecycleNode):
         # The digest takes longer than the fit: coefficients wait for it only where it may say that nothing is new.
         before = self._published.pop(str(path), None)
         known = before is not None and before == surface.sha256
-        if self._active and not known:
+        if self.active and not known:
             self._publish(surface, measured, self._header(self._file_time(surface, believe_header=False)))
             self._log_taken(surface, measured, "new file")
         self._published[str(path)] = surface.sha256
@@ -207,7 +177,7 @@ class InterferometerNode(LifecycleNode):
         return ingest_settings(self._values, self._mirror_radius, self._reference)
 
     def _accept(self, response: Any, surface: SurfaceMap, measured: Measurement, header: Header, what: str) -> Any:
-        if self._active:
+        if self.active:
             self._publish(surface, measured, header)
         self._log_taken(surface, measured, what)
         response.error_code = ErrorCode.OK
@@ -221,7 +191,7 @@ class InterferometerNode(LifecycleNode):
 
     def _publish(self, surface: SurfaceMap, measured: Measurement, header: Header) -> None:
         with self._publishing:
-            if not self._configured:
+            if not self._publishers_made:
                 return
             # What is waited for most comes first; map and digest take longer than all before.
             self._zernike_publisher.publish(messages.zernike_message(measured, header))
@@ -266,11 +236,11 @@ class InterferometerNode(LifecycleNode):
         now = self._now_ns()
         return now if self.get_clock().ros_time_is_active else measured_ns(surface, now, believe_header)
 
-    def _health(self) -> diagnostics.Health:
+    def health(self) -> Health:
         acquisition = self._acquisition
-        trouble = acquisition.folder_trouble if acquisition is not None and self._active else ""
+        trouble = acquisition.folder_trouble if acquisition is not None and self.active else ""
         values = {
-            "active": self._active,
+            "active": self.active,
             "watch_folder": self._values["watch_folder"],
             "maps_taken": self._taken,
             "files_refused": self._bad,
@@ -279,10 +249,10 @@ class InterferometerNode(LifecycleNode):
         }
         trouble = trouble or too_large(self._values["aperture.radius"], self._mirror_radius)
         if trouble:
-            return diagnostics.Health(diagnostics.ERROR, trouble, values)
+            return Health(ERROR, trouble, values)
         if self._last_refusal:
-            return diagnostics.Health(diagnostics.WARN, f"refused: {self._last_refusal}", values)
-        return diagnostics.Health(diagnostics.OK, "active" if self._active else "inactive", values)
+            return Health(WARN, f"refused: {self._last_refusal}", values)
+        return Health(OK, "active" if self.active else "inactive", values)
 
 
 def _mended(surface: SurfaceMap) -> str:

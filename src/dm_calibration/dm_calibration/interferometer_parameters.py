@@ -14,10 +14,10 @@ from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap
 from dm_calibration.optics.orientation import Orientation
-from dm_common.ros.parameters import Parameter, real, switch, text, texts
+from dm_common.ros.parameters import AUTOSTART, Parameter, real, switch, text, texts
 
 PARAMETERS = (
-    Parameter("autostart", switch(True), "Configure and activate by itself after the start."),
+    AUTOSTART,
     Parameter(
         "frame_id",
         text(""),

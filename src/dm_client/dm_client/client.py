@@ -111,15 +111,17 @@ class DeformableMirrorClient(Connection):
         return self.messages[topic]
 
     def wait_until_active(self, timeout_s: float = 20.0) -> None:
-        """Wait until the driver accepts commands. Raises DeformableMirrorError with the driver's own reason."""
+        """Wait until driver and controller, if there is one, take requests. Raises DeformableMirrorError."""
 
-        def active() -> bool:
-            state = self.messages.get("actuator_state")
-            return state is not None and state.driver_state == ActuatorState.STATE_ACTIVE
+        def refusal() -> tuple[int, str]:
+            state, able = self.messages.get("actuator_state"), self.messages.get("capabilities")
+            if state is None or state.driver_state != ActuatorState.STATE_ACTIVE:
+                reason = (state.message or "it is not active") if state else "it is not heard: are the nodes running?"
+                return ErrorCode.DRIVER_INACTIVE, f"pdm_driver does not accept commands: {reason}"
+            return (able.error_code, able.message) if able and able.error_code == ErrorCode.NODE_INACTIVE else (0, "")
 
-        if not self.wait(active, timeout_s):
-            reason = self.latest("actuator_state", 0.1).message or "it is not in the lifecycle state `active`"
-            raise DeformableMirrorError(ErrorCode.DRIVER_INACTIVE, f"pdm_driver does not accept commands: {reason}")
+        if not self.wait(lambda: not refusal()[0], timeout_s):
+            raise DeformableMirrorError(*refusal())
 
     @property
     def capabilities(self) -> Capabilities:
@@ -291,8 +293,7 @@ class DeformableMirrorClient(Connection):
         timeout_s: float = 7200.0,
     ) -> Calibrate.Result:
         """Measure and store a calibration; by default the full plan, used at once."""
-        goal = goal if goal is not None else Calibrate.Goal(activate=True)
-        return self.run_action("calibrate", goal, on_feedback, timeout_s)
+        return self.run_action("calibrate", goal or Calibrate.Goal(activate=True), on_feedback, timeout_s)
 
 
 def _request(curvature: float, conic_constant: float, claim: Claim) -> FocusRequest:

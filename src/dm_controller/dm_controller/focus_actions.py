@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 from dm_msgs.action import Degauss, MoveFocus
 from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import Flatten, SetFocus
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.clients import ThreadedActionClient, answers_arrive
-from dm_common.ros.worker import WorkerActionServer, WorkerService, sleep
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_parameters import MOVE_FOCUS
@@ -69,22 +68,22 @@ class MoveFocusAction:
 
     Args:
         node: hosts the action and carries the requests out.
-        settle_time: s, for goals that name none.
+        settle_time: s, now, for goals that name none.
     """
 
-    def __init__(self, node: FocusControllerNode, settle_time: float) -> None:
+    def __init__(self, node: FocusControllerNode, settle_time: Callable[[], float]) -> None:
         self._node, self._settle_time = node, settle_time
         self._server = WorkerActionServer(
             node, MoveFocus, "move_focus", self._run, exclusive="preempt", fields=MOVE_FOCUS
         )
 
-    def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+    def _run(self, handle: WorkerGoal) -> tuple[str, Any]:
         started, result = time.monotonic(), MoveFocus.Result()
         outcome, result.error_code, result.message = self._carry_out(handle, result)
         result.duration = time.monotonic() - started
         return outcome, result
 
-    def _carry_out(self, handle: ServerGoalHandle, result: MoveFocus.Result) -> tuple[str, int, str]:
+    def _carry_out(self, handle: WorkerGoal, result: MoveFocus.Result) -> tuple[str, int, str]:
         """Outcome, ErrorCode and message of a goal; fills the state of `result`."""
         goal, node = handle.request, self._node
         # Goals that wait for their turn may get it in another order than they came in.
@@ -107,7 +106,7 @@ class MoveFocusAction:
         if ended is not None:
             return ended
         handle.publish_feedback(MoveFocus.Feedback(phase=MoveFocus.Feedback.PHASE_SETTLE, progress=1.0))
-        if not sleep(node.get_clock(), goal.settle_time or self._settle_time, lambda: self._to_stop(handle)):
+        if not sleep(node.get_clock(), goal.settle_time or self._settle_time(), lambda: self._to_stop(handle)):
             return self._stopped(handle, order)
         with node.controller() as (controller, _now):
             keeps = controller.monitor.keeps(order)
@@ -115,7 +114,7 @@ class MoveFocusAction:
             return "abort", ErrorCode.PREEMPTED, "another command took over"
         return "succeed", ErrorCode.OK, f"the shape stands; {result.state.predicted_rms * 1e9:.1f} nm rms predicted"
 
-    def _follow(self, handle: ServerGoalHandle, order: Order) -> tuple[str, int, str] | None:
+    def _follow(self, handle: WorkerGoal, order: Order) -> tuple[str, int, str] | None:
         """Wait until the shape of `order` stands; None when it does."""
         next_feedback = 0.0
         while True:
@@ -135,10 +134,10 @@ class MoveFocusAction:
                 )
             time.sleep(POLL_S)
 
-    def _to_stop(self, handle: ServerGoalHandle) -> bool:
+    def _to_stop(self, handle: WorkerGoal) -> bool:
         return handle.is_cancel_requested or self._server.preempted(handle)
 
-    def _stopped(self, handle: ServerGoalHandle, order: Order | None) -> tuple[str, int, str]:
+    def _stopped(self, handle: WorkerGoal, order: Order | None) -> tuple[str, int, str]:
         """End a goal early, None = before it asked for anything.
 
         On cancel the mirror holds the shape it has, unless it is under way to one that was asked for since; a newer

@@ -96,6 +96,12 @@ class FocusController:
                 effects.append(Log("error", str(refusal)))
         return [*effects, PublishCapabilities()]
 
+    def rest(self, refusal: Refusal, now: Moment) -> list[Effect]:
+        """Use no calibration until `use` is called again: requests are refused, and the mirror stays as it is."""
+        self.hold.end("the node was deactivated")
+        self.active, self.not_calibrated = None, refusal
+        return [*self._degauss_ended(now, refusal), PublishCapabilities()]
+
     def driver_report(self, report: DriverReport, now: Moment) -> list[Effect]:
         """Take the driver's next report."""
         latency_learnt = self.monitor.observe(report, now.steady)
@@ -269,8 +275,7 @@ class FocusController:
         failure = self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady)
         if failure is not None:
             effects += self._degauss_ended(now, failure)
-        untaken = self.monitor.untaken(now.steady)
-        if untaken is not None:
+        if (untaken := self.monitor.untaken(now.steady)) is not None:
             order, refusal = untaken
             self.hold.end("the driver did not take the command")
             # A correction, or the end of a move, answers no order.

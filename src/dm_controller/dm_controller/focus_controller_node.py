@@ -14,14 +14,14 @@ from typing import Any
 
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 
-from dm_common.errors import Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, time_message
-from dm_common.ros import diagnostics, qos
+from dm_common.ros import qos
 from dm_common.ros.executor import run_node
-from dm_common.ros.parameters import declare, frame_id
+from dm_common.ros.lifecycle import Health, ManagedNode
+from dm_common.ros.parameters import frame_id
 from dm_common.ros.qos import GONE, LEASE_S, Liveliness
 from dm_controller.focus_actions import DegaussClient, FocusServices, MoveFocusAction
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
@@ -47,12 +47,15 @@ STEADY_PERIOD_S = 0.5
 RECORD_PERIOD_S = 30.0
 
 
-class FocusControllerNode(Node):
-    """Subscriptions and timers run in the executor, services and actions in threads of their own. See README."""
+class FocusControllerNode(ManagedNode):
+    """Subscriptions and timers run in the executor, services and actions in threads of their own. See README.
+
+    While it is not active it goes on following the actuators, has no calibration in use, and sends no command.
+    """
 
     def __init__(self, **keywords: Any) -> None:
-        super().__init__("focus_controller", **keywords)
-        self._values = values = declare(self, PARAMETERS, on_change=lambda _changes: self._publish_capabilities())
+        super().__init__("focus_controller", PARAMETERS, lambda _changes: self._publish_capabilities(), **keywords)
+        values = self._values
         self._lock, self._controller = threading.Lock(), FocusController(values)
         self._mirror: MirrorInfo | None = None
         self._calibration: Calibration | None = None
@@ -67,15 +70,31 @@ class FocusControllerNode(Node):
         self._quick = self.create_timer(values["hold.period"], self._tick)
         self.create_timer(SLOW_PERIOD_S, self._tick)
         self.create_timer(STEADY_PERIOD_S, self._tick, clock=steady)
-        self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         FocusServices(self, lambda: values["driver_timeout"])
-        self._actions = MoveFocusAction(self, values["settle_time"]), *serve_loops(self, values, LoopHost(self))
+        self._actions = MoveFocusAction(self, lambda: values["settle_time"]), *serve_loops(self, values, LoopHost(self))
         self._driver = Liveliness(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         self.create_subscription(FocusRequest, "focus_request", self.order, qos.COMMAND)
-        self._publish_capabilities()
+        if not values["autostart"]:
+            self.deactivate()
+
+    # --- lifecycle ---
+
+    def configure(self) -> None:
+        self._quick.timer_period_ns = round(self._values["hold.period"] * 1e9)
+        self._recorder.folder = self._values["state_folder"]
+
+    def activate(self) -> None:
+        self._use()
+
+    def deactivate(self) -> None:
+        with self.controller() as (controller, now):
+            self._do(controller.rest(Refusal(ErrorCode.NODE_INACTIVE, self.inactive()), now), now)
+
+    def refused(self, reason: str) -> None:
+        self.deactivate()
 
     @property
     def _frame_id(self) -> str:
@@ -113,6 +132,8 @@ class FocusControllerNode(Node):
         self._use()
 
     def _use(self) -> None:
+        if not self.active:
+            return
         with self.controller() as (controller, now):
             self._do(controller.use(self._calibration, self._mirror), now)
             self._forecast.use(controller.active, self._values["reachable_tolerance"])
@@ -173,7 +194,7 @@ class FocusControllerNode(Node):
         message.header.frame_id = self._frame_id
         self._capabilities.publish(message)
 
-    def _health(self) -> diagnostics.Health:
+    def health(self) -> Health:
         with self.controller() as (controller, now):
             return health(controller, self._values, now)
 

@@ -10,7 +10,7 @@ import numpy as np
 from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
 
 from dm_common.messages import applied_from, doubles, stamp_ns, time_message
-from dm_common.ros import diagnostics
+from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import without_figures
 from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_controller import FocusController
@@ -101,7 +101,7 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
     return remarks(controller.active, controller.observer.unknown, values, now.ns)
 
 
-def health(controller: FocusController, values: Mapping[str, Any], now: Moment) -> diagnostics.Health:
+def health(controller: FocusController, values: Mapping[str, Any], now: Moment) -> Health:
     """The health of the node whose parameters are `values`.
 
     While the shape stands that was asked for: its curvature (1/m), since when (s), the 95 % bound on its error (m).
@@ -121,7 +121,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment) 
             "bound": shape.move.plan.max_zernike_upper,
         }
     text = trouble(controller, values, now)
-    return diagnostics.Health(diagnostics.WARN if text else diagnostics.OK, text or "ready", figures)
+    return Health(WARN if text else OK, text or "ready", figures)
 
 
 def capabilities_message(

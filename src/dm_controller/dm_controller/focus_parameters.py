@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from dm_common.ros.parameters import APERTURE_PARAMETER, Parameter, real, switch, text, whole
+from dm_common.ros.parameters import APERTURE_PARAMETER, AUTOSTART, Parameter, real, switch, text, whole
 from dm_common.values import Fields, reals
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S
@@ -42,6 +42,7 @@ LOOP_PARAMETERS = (
 )
 
 PARAMETERS: Final = (
+    AUTOSTART,
     Parameter(
         "reachable_tolerance",
         real(2e-8, 1e-10, 1e-5, "m"),

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 from dm_msgs.action import BuildRecipes, Converge
 from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import StoreRecipes
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.worker import WorkerActionServer
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal
 from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
@@ -53,6 +52,12 @@ class LoopHost:
             return controller.observer.estimate(now.time).state
 
 
+def loop_times(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What `BenchServices` goes by, from the parameters of the node; these may change while it rests."""
+    own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
+    return own | {"degauss_timeout": values["recipes.degauss_timeout"]}
+
+
 class LoopBench(BenchServices):
     """Driver and interferometer, for one goal of either action at a time.
 
@@ -65,13 +70,12 @@ class LoopBench(BenchServices):
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any], host: LoopHost) -> None:
-        own = {name: values[f"converge.{name}"] for name in ("settle_time", "driver_timeout", "measure_timeout")}
-        super().__init__(node, own | {"degauss_timeout": values["recipes.degauss_timeout"]})
+        super().__init__(node, loop_times(values))
         self.host, self._parameters = host, values
         self._goal = threading.Lock()
 
     @contextmanager
-    def reserved(self, handle: ServerGoalHandle, feedback: Any, asked: Any, text: str) -> Iterator[None]:
+    def reserved(self, handle: WorkerGoal, feedback: Any, asked: Any, text: str) -> Iterator[None]:
         """Keep the bench for one goal: its cancellation ends waits, and its feedback says what is waited for.
 
         Args:
@@ -84,6 +88,8 @@ class LoopBench(BenchServices):
         if not self._goal.acquire(blocking=False):
             raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
         try:
+            self._values = loop_times(self._parameters)
+            self.settle_time = self._values["settle_time"]
             self.cancelled = lambda: bool(handle.is_cancel_requested)
             self.publish_waits(handle, feedback)
             with self.held(asked, f"{text}; cancel it to end it"):
@@ -118,12 +124,12 @@ def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[
     bench = LoopBench(node, values, host)
     store = node.create_client(StoreRecipes, "store_recipes")
 
-    def converge(handle: ServerGoalHandle) -> tuple[str, Any]:
+    def converge(handle: WorkerGoal) -> tuple[str, Any]:
         from dm_controller.converge.converge_run import ConvergeRun
 
         return ConvergeRun(node, values, bench).run(handle)
 
-    def build_recipes(handle: ServerGoalHandle) -> tuple[str, Any]:
+    def build_recipes(handle: WorkerGoal) -> tuple[str, Any]:
         from dm_controller.converge.recipe_run import RecipeRun
 
         return RecipeRun(node, values, bench, store).run(handle)

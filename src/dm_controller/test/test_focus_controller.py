@@ -462,6 +462,25 @@ def test_a_withdrawn_order_leaves_the_mirror_degaussed(bench: Bench) -> None:
     assert bench.commands == [] and bench.controller.conditioning.run is None
 
 
+def test_at_rest_the_mirror_stays_and_requests_are_refused_until_the_calibration_is_used_again(bench: Bench) -> None:
+    bench.ask(0.01)
+    bench.history_known = False
+    bench.report()
+    order, commands = bench.ask(0.02, time_budget=60.0), len(bench.commands)
+    assert order.pending
+    bench.do(bench.controller.rest(Refusal(ErrorCode.NODE_INACTIVE, "it rests"), bench.now))
+    assert bench.refusal().error_code == ErrorCode.NODE_INACTIVE and not order.pending
+    bench.degauss()
+    bench.do(bench.controller.degauss_answered(bench.degauss_runs[0].number, bench.now, 0.2))
+    bench.wait(5.0)
+    assert bench.controller.unavailable(bench.now) is not None
+    bench.ask(0.02)
+    assert bench.refusal().error_code == ErrorCode.NODE_INACTIVE and len(bench.commands) == commands
+    bench.do(bench.controller.use(calibration(), MIRROR))
+    bench.ask(0.02)
+    assert bench.outcomes[-1].applied and bench.outcomes[-1].unknown == ""  # it was followed all the while
+
+
 def stopped(bench: Bench) -> None:
     bench.state = ActuatorState.STATE_INACTIVE
     bench.report(message="deactivated")

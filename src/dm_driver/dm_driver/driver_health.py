@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.diagnostics import ERROR, OK, WARN, Health
+from dm_common.ros.lifecycle import ERROR, OK, WARN, Health
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.moves import WriterState
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from dm_common.ros.parameters import REQUIRED, Parameter, real, reals, switch, text, whole, wholes
+from dm_common.ros.parameters import AUTOSTART, REQUIRED, Parameter, real, reals, switch, text, whole, wholes
 from dm_driver.degauss import STEPS_MAX
 from dm_driver.electronics import BACK_ENDS
 from dm_driver.electronics.check_sums import CHECK_SUMS
@@ -15,7 +15,7 @@ from dm_driver.output.volts import LAWS, LINEAR
 _FRAME: Final = FrameFormat()
 
 PARAMETERS: Final = (
-    Parameter("autostart", switch(True), "Configure and activate by itself after the start."),
+    AUTOSTART,
     Parameter(
         "frame_id",
         text(""),

@@ -16,12 +16,12 @@ from typing import Any
 from dm_msgs.msg import ActuatorCommand, ActuatorState, MirrorInfo
 from dm_msgs.srv import HoldMirror, SetSignals
 from rclpy.clock import Clock, ClockType
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.time import Time
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros import diagnostics, parameters, qos
+from dm_common.ros import parameters, qos
 from dm_common.ros.executor import run_node
+from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.worker import WorkerService, never_silent
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.commands.command_gate import CODE_OF_OUTCOME, MARGIN_S, CommandGate
@@ -38,14 +38,15 @@ from dm_driver.moves import Move, Outcome, WriterState
 STATE_INTERVAL_S = 0.02
 
 
-class PdmDriverNode(LifecycleNode):
+class PdmDriverNode(ManagedNode):
     """The node; see the head of this module."""
 
+    rests = False
+
     def __init__(self) -> None:
-        super().__init__("pdm_driver")
+        super().__init__("pdm_driver", PARAMETERS)
         self._hold = MirrorHold(time.monotonic)
         self._gate = CommandGate(self._hold, self._on_gate)
-        self._values = parameters.declare(self, PARAMETERS, unlocked=lambda: self._gate.writer is None)
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         # Guards publishing: state leaves the executor's, the writer's and the services' threads.
         self._state_lock = threading.Lock()
@@ -59,30 +60,17 @@ class PdmDriverNode(LifecycleNode):
         DegaussAction(self, self._gate, self._values)
         answer = never_silent(self, "hold_mirror", self._on_hold_mirror)
         self.create_service(HoldMirror, "hold_mirror", answer, qos_profile=qos.SERVICE)
-        self._diagnostics = diagnostics.Diagnostics(self, "", self._health)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(self._values["state_period"], self._periodic, clock=steady)
-        if self._values["autostart"]:
-            self._autostart_timer = self.create_timer(0.0, self._autostart, clock=steady)
 
     # Lifecycle
 
-    def _autostart(self) -> None:
-        self._autostart_timer.cancel()
-        if self._state_machine.current_state[1] != "unconfigured":
-            return  # somebody was quicker
-        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
-            self.trigger_activate()
+    def refused(self, reason: str) -> None:
+        self._gate.refusal = Refusal(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {reason}")
+        self._publish_state()
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        try:
-            self._values.check()
-            configuration = build_configuration(self._values)
-        except ValueError as error:
-            self.get_logger().error(f"configuration refused: {error}")
-            self._gate.refusal = Refusal(ErrorCode.INVALID_ARGUMENT, f"configuration refused: {error}")
-            self._publish_state()
-            return TransitionCallbackReturn.FAILURE
+    def configure(self) -> None:
+        configuration = build_configuration(self._values)
         self._frame_id = parameters.frame_id(self, self._values["frame_id"])
         self._diagnostics.hardware_id = f"{self._values['mirror.name']} {self._values['mirror.serial']}"
         self._timer.timer_period_ns = round(self._values["state_period"] * 1e9)
@@ -105,7 +93,6 @@ class PdmDriverNode(LifecycleNode):
             mirror_info_message(self._values, configuration, self._frame_id, self.get_clock().now().to_msg())
         )
         self._publish_state()
-        return TransitionCallbackReturn.SUCCESS
 
     def _last_shape(self, configuration: DriverConfiguration) -> LastShape:
         """The record of what was last sent to this unit; an empty one where none can be kept."""
@@ -118,7 +105,7 @@ class PdmDriverNode(LifecycleNode):
             self.get_logger().warning(f"state_folder = {self._values['state_folder']!r} cannot be used: {error}")
             return LastShape(None, actuators)
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def activate(self) -> None:
         writer = self._gate.writer
         assert writer is not None
         self._gate.refusal = None
@@ -127,28 +114,17 @@ class PdmDriverNode(LifecycleNode):
         else:
             self.get_logger().info("active; the safe shape is written as soon as the drive electronics answer")
         self._publish_state()
-        return TransitionCallbackReturn.SUCCESS
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def deactivate(self) -> None:
         self._to_safe_shape("deactivate")
         self._publish_state()
-        return TransitionCallbackReturn.SUCCESS
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._release("cleanup")
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._release("shutdown")
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._release("error")
-        return TransitionCallbackReturn.SUCCESS
+    def clean_up(self) -> None:
+        self._close("cleanup")
 
     def make_safe(self) -> None:
         """Ramp to the safe shape and close the electronics; runs when the process ends (SIGINT, SIGTERM)."""
-        self._release("end of the process")
+        self._close("end of the process")
 
     def _to_safe_shape(self, occasion: str) -> None:
         writer, configuration = self._gate.writer, self._gate.configuration
@@ -166,7 +142,7 @@ class PdmDriverNode(LifecycleNode):
                 " values"
             )
 
-    def _release(self, occasion: str) -> None:
+    def _close(self, occasion: str) -> None:
         self._to_safe_shape(occasion)
         writer, self._gate.writer, self._gate.configuration = self._gate.writer, None, None
         if writer is not None and not writer.stop():
@@ -266,7 +242,7 @@ class PdmDriverNode(LifecycleNode):
             self._state_publisher.publish(message)
             self._published_at = time.monotonic()
 
-    def _health(self) -> diagnostics.Health:
+    def health(self) -> Health:
         return driver_health(self._gate.writer, self._gate.refusal, self._gate.refused)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from dm_common.ros.diagnostics import ERROR, OK, WARN
+from dm_common.ros.lifecycle import ERROR, OK, WARN
 from dm_driver.driver_health import driver_health
 
 

@@ -14,6 +14,7 @@ import threading
 import time
 from typing import Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -23,8 +24,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from dm_common.ros import qos
-from dm_common.ros.diagnostics import ERROR, OK, WARN, Diagnostics, Health
 from dm_common.ros.executor import run_node
+from dm_common.ros.lifecycle import ERROR, OK, WARN, Diagnostics, Health
 from dm_common.ros.parameters import declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
@@ -76,7 +77,9 @@ class VirtualBenchNode(Node):
             # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
             self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
             self._info_publisher = self.create_publisher(CameraInfo, "camera_info", qos.MAP)
-            self._camera_matrix = camera_matrix(self.bench.config.camera)
+            k = camera_matrix(self.bench.config.camera)
+            self._camera_info = CameraInfo(distortion_model="plumb_bob", d=[0.0] * 5, r=np.eye(3).ravel(), k=k)
+            self._camera_info.p = np.pad(np.reshape(k, (3, 3)), [(0, 0), (0, 1)]).ravel()
             self._camera_thread = threading.Thread(target=self._film, args=(1 / values["camera.rate"],), daemon=True)
             self._camera_thread.start()
         places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
@@ -109,7 +112,8 @@ class VirtualBenchNode(Node):
             message.header.frame_id = "camera"
             message.data = array.array("B", picture.tobytes())
             self._image_publisher.publish(message)
-            info = CameraInfo(header=message.header, height=height, width=width, k=self._camera_matrix)
+            info = self._camera_info
+            info.header, info.height, info.width = message.header, height, width
             self._info_publisher.publish(info)
 
     def _on_event(self, severe: bool, text: str) -> None:

@@ -25,8 +25,9 @@ from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
 from dm_common.messages import applied_from, measurement_from, stamp_ns
-from dm_common.ros import diagnostics, qos
+from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
+from dm_common.ros.lifecycle import OK, WARN
 from dm_common.ros.worker import WorkerService
 from dm_common.values import wholes
 
@@ -55,10 +56,8 @@ class MapListener:
         services: BenchServices,
         busy: Callable[[], bool],
     ) -> None:
-        self._node = node
-        self._values = values
-        self._manager = manager
-        self._services = services
+        self._node, self._values = node, values
+        self._manager, self._services = manager, services
         self._busy = busy
         self._updates = RecalibrationManager(manager.store.folder, lambda: update_options(values))
         self._history = AppliedHistory()
@@ -88,6 +87,7 @@ class MapListener:
         """Keep `calibration` true from now on."""
         if calibration is self._updates.calibration:
             return
+        self._updates.folder = self._manager.store.folder
         try:
             remark = self._updates.begin(calibration)
         except (ValueError, np.linalg.LinAlgError) as error:  # use it all the same, as it was made
@@ -280,7 +280,7 @@ class MapListener:
         """Level, warnings and figures for the node's diagnostics."""
         updates = self._updates.updates
         if updates is None:
-            return diagnostics.OK, [], {}
+            return OK, [], {}
         warnings = [doubt.rstrip(".") for doubt in self._doubts()]
         gain, actuator = updates.largest_gain
         if abs(gain) > self._values["updates.gain_drift_max"]:
@@ -297,4 +297,4 @@ class MapListener:
             "maps_refused": self._refused,
             "last_refusal": self._last_refusal,
         }
-        return diagnostics.WARN if warnings else diagnostics.OK, warnings, figures
+        return WARN if warnings else OK, warnings, figures

@@ -79,7 +79,7 @@ class RecalibrationManager:
     """
 
     def __init__(self, folder: Path, options: Callable[[], UpdateOptions]) -> None:
-        self._folder, self._options = folder, options
+        self.folder, self._options = folder, options
         self._lock = threading.RLock()
         self._calibration: Calibration | None = None
         self._filter: DriftFilter | None = None
@@ -204,7 +204,7 @@ class RecalibrationManager:
                 return Verdict(accepted, reason, comparison)
             before = self._updates or updates
             changed = comparison.updated if accepted else replace(before, surprising=before.surprising + 1)
-            with storing(f"the update of {calibration.id} was not stored in {self._folder}"):
+            with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
                 write_updates(self._file(calibration.id), calibration.id, self._basis, changed)
             self._updates = changed
             self._disagreement = 0.0 if accepted else max(self._disagreement, comparison.max_zernike)
@@ -237,7 +237,7 @@ class RecalibrationManager:
         return self._repeat if same else 0
 
     def _file(self, identifier: str) -> Path:
-        return self._folder / f"{identifier}{SUFFIX}"
+        return self.folder / f"{identifier}{SUFFIX}"
 
 
 def check_map(measured: Measurement, calibration: Calibration, options: UpdateOptions) -> None:

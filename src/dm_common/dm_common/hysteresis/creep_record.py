@@ -100,10 +100,13 @@ class CreepRecorder:
         folder: of the records; empty = nothing is kept.
         observer: of the mirror.
         warn: told, from any thread, what could not be done.
+
+    Attributes:
+        folder: as above; may change.
     """
 
     def __init__(self, folder: str, observer: HysteresisObserver, warn: Callable[[str], None]) -> None:
-        self._folder, self._observer, self._warn = folder, observer, warn
+        self.folder, self._observer, self._warn = folder, observer, warn
         self._serial: str | None = None
         self._disk = ThreadPoolExecutor(max_workers=1)  # until a disk has a record for sure may take long
 
@@ -112,7 +115,7 @@ class CreepRecorder:
         if serial == self._serial:
             return
         another, self._serial = self._serial is not None, serial
-        file, record = record_file(self._folder, serial), None
+        file, record = record_file(self.folder, serial), None
         try:
             record = read_record(file, now) if file is not None else None
         except ValueError as error:
@@ -121,7 +124,7 @@ class CreepRecorder:
 
     def keep(self, now: float) -> None:
         """Have what the actuators have crept to by `now` (s) put on disk, if there is anything to keep."""
-        file = record_file(self._folder, self._serial) if self._serial is not None else None
+        file = record_file(self.folder, self._serial) if self._serial is not None else None
         record = record_of(self._observer.law, self._observer.state, now)
         if file is not None and record is not None:
             self._disk.submit(self._write, file, record)

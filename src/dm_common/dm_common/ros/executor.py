@@ -55,9 +55,12 @@ def make_executor(*nodes: Node) -> Executor:
 def spin(executor: Executor, until: Callable[[], bool] | None = None) -> None:
     """Dispatch events until the ROS context is shut down or `until()` is true.
 
-    A callback that raises is logged with its traceback and the loop goes on.
+    A callback that raises is logged with its traceback and the loop goes on. Lifecycle nodes start by themselves
+    before the first request is served.
     """
     context = executor.context
+    for node in executor.get_nodes():
+        getattr(node, "autostart", lambda: None)()
     while context.ok() and not (until is not None and until()):
         try:
             executor.spin_once(timeout_sec=WAKE_PERIOD_S)

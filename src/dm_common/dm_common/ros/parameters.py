@@ -138,6 +138,8 @@ class Parameter:
         return descriptor
 
 
+#: Of every lifecycle node.
+AUTOSTART = Parameter("autostart", switch(True), "Configure and activate by itself after the start.")
 #: Of every node that holds calibrations against the mirror.
 APERTURE_PARAMETER = Parameter(
     "aperture_tolerance",
@@ -176,6 +178,7 @@ def declare(
     table: Sequence[Parameter],
     on_change: Callable[[Mapping[str, Any]], None] | None = None,
     unlocked: Callable[[], bool] | None = None,
+    unlock: str = "cleanup",
     check: Callable[[Mapping[str, Any]], None] = lambda changes: None,
 ) -> Values:
     """Declare every parameter of `table` on `node` and return their values by name.
@@ -185,6 +188,7 @@ def declare(
     Args:
         unlocked: of a lifecycle node: whether parameters that are not live may change now. With it nothing is raised
             here: the node calls `Values.check` when it is configured, and may be put right before.
+        unlock: transition after which they may.
         check: raises ParameterError for changes that what the node has learnt since denies.
 
     Raises:
@@ -211,10 +215,9 @@ def declare(
                 if (parameter := by_name.get(change.name)) is None:
                     continue
                 if not (parameter.live or unlocked is None or unlocked()):
-                    raise ParameterError(
-                        f"{change.name} changes only while the node is not configured: `ros2 lifecycle set "
-                        f"{node.get_fully_qualified_name()} cleanup` first"
-                    )
+                    state = "configured" if unlock == "cleanup" else "active"
+                    command = f"ros2 lifecycle set {node.get_fully_qualified_name()} {unlock}"
+                    raise ParameterError(f"{change.name} changes only while the node is not {state}: `{command}` first")
                 check({change.name: parameter.check(change.value)})
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))

@@ -34,6 +34,12 @@ CLOCK_S = 10.0
 NO_FIELDS = Fields({})
 
 
+def _check_active(node: Node) -> None:
+    """Raise Refusal when a lifecycle node rests, see `dm_common.ros.lifecycle.ManagedNode`."""
+    if (check := getattr(node, "check_active", None)) is not None:
+        check()
+
+
 def _answer_error(node: Node, what: str, error: Exception, answer: Any) -> None:
     """Log an exception of the body of `what`; answer it as ErrorCode.INTERNAL where the answer has a place for that."""
     if node.context.ok():  # else the process is ending: what a worker still used is gone, and so is who asked
@@ -59,6 +65,7 @@ def never_silent(
         before, refused = refused, ""
         try:
             try:
+                _check_active(node)
                 fields.check(request)
             except Refusal:
                 without_figures(response)
@@ -111,11 +118,34 @@ class WorkerService:
         self._node.destroy_service(self._service)
 
 
+class WorkerGoal:
+    """A goal as its body sees it: cancelled by its client, or by the deactivation of the node that serves it.
+
+    Attributes:
+        handle: of rclpy.
+        request, publish_feedback: of the handle.
+    """
+
+    def __init__(self, handle: ServerGoalHandle, node: Node) -> None:
+        self.handle, self._node = handle, node
+        self.request, self.publish_feedback = handle.request, handle.publish_feedback
+        self._begun = self._session
+
+    @property
+    def _session(self) -> int:
+        return getattr(self._node, "session", 0)
+
+    @property
+    def is_cancel_requested(self) -> bool:
+        """Whether it is to end."""
+        return bool(self.handle.is_cancel_requested) or self._session != self._begun
+
+
 class WorkerActionServer(ActionServer):
     """An action server whose body runs in a worker thread.
 
-    `body(goal_handle) -> (outcome, result)` may block; `outcome` is "succeed", "abort" or "canceled". It should return
-    soon after `goal_handle.is_cancel_requested` or after `preempted(goal_handle)` becomes true.
+    `body(goal) -> (outcome, result)` may block; `outcome` is "succeed", "abort" or "canceled". It should return soon
+    after `goal.is_cancel_requested` or after `preempted(goal)` becomes true.
 
     Args:
         exclusive: "refuse" refuses a goal while another runs; "preempt" asks the running goal to stop and starts the
@@ -128,7 +158,7 @@ class WorkerActionServer(ActionServer):
         node: Node,
         action_type: Any,
         name: str,
-        body: Callable[[ServerGoalHandle], tuple[str, Any]],
+        body: Callable[[WorkerGoal], tuple[str, Any]],
         *,
         exclusive: str = "refuse",
         fields: Fields = NO_FIELDS,
@@ -141,7 +171,7 @@ class WorkerActionServer(ActionServer):
         self._exclusive, self._fields, self._admit = exclusive, fields, admit
         self._turn = threading.Lock()  # held by the goal that runs
         self._bookkeeping = threading.Lock()
-        self._newest: ServerGoalHandle | None = None
+        self._newest: WorkerGoal | None = None
         self._running = 0
         super().__init__(
             node,
@@ -162,10 +192,10 @@ class WorkerActionServer(ActionServer):
         with self._bookkeeping:
             return self._running > 0
 
-    def preempted(self, goal_handle: ServerGoalHandle) -> bool:
+    def preempted(self, goal: WorkerGoal) -> bool:
         """Whether a newer goal waits for this one to stop."""
         with self._bookkeeping:
-            return self._newest is not goal_handle
+            return self._newest is not goal
 
     def _on_goal(self, goal: Any) -> GoalResponse:
         if self._exclusive == "refuse" and self.busy:
@@ -179,6 +209,7 @@ class WorkerActionServer(ActionServer):
         """Run the body in a thread; rclpy's own execution only publishes the outcome, when it is there."""
         try:
             try:
+                _check_active(self._worker_node)
                 self._fields.check(goal_handle.request)
             except Refusal as refusal:
                 self._worker_node.get_logger().warning(f"goal refused: {refusal}")
@@ -191,27 +222,30 @@ class WorkerActionServer(ActionServer):
             result.error_code, result.message = refusal.error_code, str(refusal)
             self._finish(goal_handle, "abort", result)
             return
+        goal = WorkerGoal(goal_handle, self._worker_node)
         with self._bookkeeping:
-            self._newest = goal_handle
-        threading.Thread(target=self._work, args=(goal_handle,), daemon=True).start()
+            self._newest = goal
+        threading.Thread(target=self._work, args=(goal,), daemon=True).start()
 
-    def _work(self, goal_handle: ServerGoalHandle) -> None:
+    def _work(self, goal: WorkerGoal) -> None:
         try:
             with self._turn:
-                outcome, result = self._body(goal_handle)
+                outcome, result = self._body(goal)
         except Exception as error:
             outcome, result = "abort", self._action_type.Result()
             _answer_error(self._worker_node, "action", error, result)
         finally:
             with self._bookkeeping:
                 self._running -= 1
-        self._finish(goal_handle, outcome, result)
+        if goal.is_cancel_requested and not goal.handle.is_cancel_requested:
+            result.message = f"{self._worker_node.get_name()} was deactivated: {result.message}"
+        self._finish(goal.handle, outcome, result)
 
     def _finish(self, goal_handle: ServerGoalHandle, outcome: str, result: Any) -> None:
         """Have the executor publish the outcome."""
 
         def finish(_goal_handle: ServerGoalHandle) -> Any:
-            # Only a goal whose cancellation was requested may end as cancelled.
+            # Only a goal whose client requested its cancellation may end as cancelled.
             if outcome == "canceled" and not goal_handle.is_cancel_requested:
                 goal_handle.abort()
             else:

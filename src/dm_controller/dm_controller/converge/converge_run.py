@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import Converge
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.messages import doubles
-from dm_common.ros.worker import wait_for_clock
+from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.goals import ending
 from dm_controller.loop_actions import LoopBench
@@ -40,7 +39,7 @@ class ConvergeRun:
     def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench) -> None:
         self._node, self._values, self._bench = node, values, bench
 
-    def run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+    def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
         steps: list[LoopStep] = []
         feedback = Converge.Feedback()

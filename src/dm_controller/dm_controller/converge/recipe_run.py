@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from dm_msgs.action import BuildRecipes
 from dm_msgs.srv import StoreRecipes
-from rclpy.action.server import ServerGoalHandle
 from rclpy.client import Client
 from rclpy.node import Node
 
@@ -21,7 +20,7 @@ from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
 from dm_common.ros.clients import ServiceCallError, call
-from dm_common.ros.worker import wait_for_clock
+from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_controller.converge.goals import ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench
@@ -48,7 +47,7 @@ class RecipeRun:
     def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench, store: Client) -> None:
         self._node, self._values, self._bench, self._store = node, values, bench, store
 
-    def run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+    def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
         feedback = BuildRecipes.Feedback()
 
@@ -67,9 +66,7 @@ class RecipeRun:
             self._node.get_logger().warning(f"build_recipes: {result.message}")
         return outcome, result
 
-    def _build_and_store(
-        self, handle: ServerGoalHandle, feedback: BuildRecipes.Feedback
-    ) -> tuple[str, BuildRecipes.Result]:
+    def _build_and_store(self, handle: WorkerGoal, feedback: BuildRecipes.Feedback) -> tuple[str, BuildRecipes.Result]:
         """Build and store.
 
         Raises:

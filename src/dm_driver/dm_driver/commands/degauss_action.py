@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.action import Degauss
-from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.worker import WorkerActionServer
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.commands.command_gate import CODE_OF_OUTCOME, MARGIN_S, CommandGate
 from dm_driver.degauss import degauss_move
@@ -62,13 +61,13 @@ class DegaussAction:
 
         return self._gate.attempt("degauss", goal, carry_out)
 
-    def _run(self, handle: ServerGoalHandle) -> tuple[str, Any]:
+    def _run(self, handle: WorkerGoal) -> tuple[str, Any]:
         began, result = time.monotonic(), Degauss.Result()
         outcome, result.error_code, result.message = self._carry_out(handle)
         result.duration = time.monotonic() - began
         return outcome, result
 
-    def _carry_out(self, handle: ServerGoalHandle) -> tuple[str, int, str]:
+    def _carry_out(self, handle: WorkerGoal) -> tuple[str, int, str]:
         """Outcome, ErrorCode and message of a goal."""
         if handle.is_cancel_requested:
             return "canceled", ErrorCode.CANCELED, "cancelled before anything moved"

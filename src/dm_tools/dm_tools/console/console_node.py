@@ -14,6 +14,9 @@ from typing import Any
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from dm_msgs.msg import SurfaceMapInfo, ZernikeCoefficients
+from rcl_interfaces.msg import Log
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import Image
 
@@ -23,7 +26,6 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
 from dm_common.ros.clients import answers_arrive
-from dm_common.ros.diagnostics import hear_log
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.long_actions import LONG, ExternalGoals
 
@@ -35,6 +37,8 @@ TOPICS = client.TOPICS | {
 #: What the console has no button for.
 NOT_OFFERED = ("ingest_file", "update_calibration")
 INTERFACES = {name: interface for name, interface in client.INTERFACES.items() if name not in NOT_OFFERED}
+#: Names of the levels of rcl_interfaces/Log.
+LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 #: Lines of the log that are kept.
 LOG_LINES = 200
 #: A node whose diagnostics were not heard for so long counts as missing, s. Nodes publish once a second.
@@ -236,3 +240,17 @@ async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[
             return False
         await asyncio.sleep(0.02)
     return True
+
+
+def hear_log(node: Node, keep: int, take: Callable[[float, str, str, str], None]) -> None:
+    """Call `take(time, level, logger, message)` for every line on `/rosout`, the last `keep` of before among them.
+
+    The time is ROS time, s.
+    """
+
+    def on_log(line: Log) -> None:
+        take(seconds(line.stamp), LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg)
+
+    # Nodes offer their latest lines to those who come late.
+    profile = QoSProfile(depth=keep, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(Log, "/rosout", on_log, profile)

@@ -143,9 +143,16 @@ _SIMULATION = NodeInterface(
 )
 
 
-def interfaces(simulation: bool = False) -> tuple[NodeInterface, ...]:
-    """The interfaces of all nodes, with what every node has; with `simulation`, the virtual bench and its clock too."""
-    nodes = (*_DECLARED, _SIMULATION) if simulation else _DECLARED
+def interfaces(simulation: bool = False, sensor: str = "") -> tuple[NodeInterface, ...]:
+    """The interfaces of all nodes, with what every node has.
+
+    Args:
+        simulation: with the virtual bench and its clock.
+        sensor: topic that the interferometer takes coefficients from (its parameter `zernike_topic`); "" = map files.
+    """
+    heard = {"interferometer": (sensor,)} if sensor else {}
+    nodes = [replace(node, subscribe=(*node.subscribe, *heard.get(node.name, ()))) for node in _DECLARED]
+    nodes += [_SIMULATION] if simulation else []
     return tuple(
         replace(
             node,

@@ -33,11 +33,13 @@ class Profile:
         namespace: of the mirror, "" for none.
         domain: ROS domain.
         simulation: with the virtual bench and its clock.
+        sensor: topic that the interferometer takes coefficients from, "" for none.
     """
 
     namespace: str = ""
     domain: int = 0
     simulation: bool = False
+    sensor: str = ""
 
     @property
     def ns(self) -> str:
@@ -51,7 +53,7 @@ class Profile:
     def enclaves(self) -> dict[str, list[NodeInterface]]:
         """The nodes of each enclave, by its last part."""
         found: dict[str, list[NodeInterface]] = {}
-        for node in interfaces(self.simulation):
+        for node in interfaces(self.simulation, self.sensor):
             found.setdefault(node.enclave, []).append(node)
         return found
 

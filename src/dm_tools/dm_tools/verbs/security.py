@@ -18,6 +18,9 @@ def security(
     simulation: Annotated[
         bool, typer.Option("--simulation", help="With the virtual bench, which publishes the clock.")
     ] = False,
+    sensor: Annotated[
+        str, typer.Option(help="Topic of a sensor in place of map files: zernike_topic of the interferometer.")
+    ] = "",
     json: JsonOption = None,
 ) -> None:
     """Generate or check least-privilege SROS 2 policies, one enclave per node; exit status 1 when the check fails."""
@@ -26,7 +29,7 @@ def security(
 
     if (out is None) == (check is None):
         raise typer.BadParameter("--out and --check: give one of them")
-    profile = Profile(namespace, domain, simulation)
+    profile = Profile(namespace, domain, simulation, sensor)
     if out is not None:
         files = write_profile(profile, out)
         console.print(f"{len(files)} files in {out}: one policy per enclave, governance, and environment.sh")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from dm_common.errors import ErrorCode
 from dm_common.figures import two_fold
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
 from dm_tools.running_suite import (
@@ -111,6 +112,8 @@ def _next(lacking: list[str], by: Any, state: Any, calibration: Any, shape: Any,
         return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
     if state is None or state.driver_state != state.STATE_ACTIVE:
         return "the driver must be active first: ./dm doctor --config FILE says what it lacks"
+    if capabilities is not None and capabilities.error_code == ErrorCode.NODE_INACTIVE:
+        return str(capabilities.message)
     if by is not None:
         return "wait for its end; ./dm console shows how far it is, and can cancel it"
     if calibration is None or not calibration.hysteresis.play_radius:

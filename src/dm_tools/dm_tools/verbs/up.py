@@ -114,6 +114,8 @@ def say_when_ready(namespace: str, stop: threading.Event) -> None:
             state = client.messages.get("actuator_state")
             if state is None or state.driver_state != state.STATE_ACTIVE:
                 return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
+            if client.messages.keys() >= {"capabilities"} and client.capabilities.error_code == ErrorCode.NODE_INACTIVE:
+                return str(client.capabilities.message)
             if {"mirror_info", "calibration", "capabilities"} - client.messages.keys():
                 return "calibration and focus_controller have not said yet what the mirror can do"
             if client.messages["calibration"].id and client.capabilities.error_code == ErrorCode.NOT_CALIBRATED:

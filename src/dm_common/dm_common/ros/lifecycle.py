@@ -1,0 +1,195 @@
+"""Lifecycle nodes, and the health of a node on `/diagnostics` (the Python diagnostic_updater is not on PyPI)."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+
+from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros.parameters import Parameter, declare
+
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+STALE = DiagnosticStatus.STALE
+#: How often health is published, s.
+PERIOD_S = 1.0
+
+
+@dataclass
+class Health:
+    """One status: a level (OK, WARN, ERROR, STALE), a line for a person, and figures."""
+
+    level: bytes = OK
+    message: str = "ok"
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+class Diagnostics:
+    """Publish `check()` on `/diagnostics` once a second of wall time, whatever ROS time does."""
+
+    def __init__(self, node: Node, hardware_id: str, check: Callable[[], Health]) -> None:
+        self._node = node
+        self._check = check
+        self.hardware_id = hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._timer = node.create_timer(PERIOD_S, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def publish(self) -> None:
+        """Publish now."""
+        health = self._check()
+        status = DiagnosticStatus(
+            level=health.level,
+            name=self._node.get_fully_qualified_name().lstrip("/"),
+            message=health.message,
+            hardware_id=self.hardware_id,
+            values=[KeyValue(key=str(key), value=str(value)) for key, value in health.values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node that configures and activates itself, unless its parameter `autostart` is false.
+
+    What a node does in its transitions is in `configure`, `activate`, `deactivate` and `clean_up`. The first two raise
+    ValueError where the parameters will not do: then the node stays as it was, says why, and takes others.
+
+    Args:
+        name, keywords: of the node.
+        table, on_change, check: of its parameters, see `parameters.declare`.
+        hardware_id: in its diagnostics.
+
+    Attributes:
+        configured, active: its state.
+        session: of a node that `rests`, changes with every activation and deactivation: goals of before are over.
+    """
+
+    #: Whether parameters that are not live change while it is inactive, and requests are refused then with
+    #: NODE_INACTIVE; else they change while it is not configured, and it judges requests by itself.
+    rests = True
+
+    def __init__(
+        self,
+        name: str,
+        table: Sequence[Parameter],
+        on_change: Callable[[Mapping[str, Any]], None] | None = None,
+        check: Callable[[Mapping[str, Any]], None] = lambda changes: None,
+        hardware_id: str = "",
+        **keywords: Any,
+    ) -> None:
+        super().__init__(name, **keywords)
+        self.configured = self.active = False
+        self.session = 0
+        self._trouble = ""
+        self._unlock = "deactivate" if self.rests else "cleanup"
+        self._values = declare(self, table, on_change, self._unlocked, self._unlock, check)
+        self._diagnostics = Diagnostics(self, hardware_id, self._health_in_any_state)
+
+    # --- what nodes do ---
+
+    def configure(self) -> None:
+        """Make what the parameters ask for; of a node that `rests` before every activation too."""
+
+    def activate(self) -> None:
+        """Begin."""
+
+    def deactivate(self) -> None:
+        """Rest. Goals end as when they are cancelled."""
+
+    def clean_up(self) -> None:
+        """Be as after the start."""
+
+    def refused(self, reason: str) -> None:
+        """The parameters will not do."""
+
+    def health(self) -> Health:
+        """Health; of a node that `rests` while it is active."""
+        return Health()
+
+    # --- what all have in common ---
+
+    def inactive(self) -> str:
+        """The reason why it serves no requests and what to do, as a sentence; "" = it does."""
+        if self.active:
+            return ""
+        name, trouble = self.get_fully_qualified_name(), f" ({self._trouble})" if self._trouble else ""
+        return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} configure`, then `activate`"
+
+    def check_active(self) -> None:
+        """Raise Refusal when it rests."""
+        if self.rests and (reason := self.inactive()):
+            raise Refusal(ErrorCode.NODE_INACTIVE, reason)
+
+    def _health_in_any_state(self) -> Health:
+        if self.rests and (reason := self.inactive()):
+            return Health(ERROR if self._trouble else WARN, reason)
+        return self.health()
+
+    def _unlocked(self) -> bool:
+        return not (self.active if self.rests else self.configured)
+
+    def autostart(self) -> None:
+        """Configure and activate it unless its parameter says that somebody else will; called when it is served."""
+        if self._values["autostart"] and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def _done(self, *steps: Callable[[], None]) -> TransitionCallbackReturn:
+        """Take the steps of a transition; what they raise is logged, which rclpy does not."""
+        try:
+            for step in steps:
+                step()
+        except ValueError as error:
+            self._trouble = str(error)
+            self.get_logger().error(f"configuration refused: {error}")
+            self.refused(self._trouble)
+            return TransitionCallbackReturn.FAILURE
+        except Exception:
+            self.get_logger().error(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
+        self._trouble = ""
+        return TransitionCallbackReturn.SUCCESS
+
+    def _rest(self) -> None:
+        if self.active:
+            self.active, self.session = False, self.session + self.rests
+            self.deactivate()
+
+    def _release(self) -> None:
+        self._rest()
+        self.configured = False
+        self.clean_up()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        done = self._done(self._values.check, self.configure)
+        self.configured = done == TransitionCallbackReturn.SUCCESS
+        return done
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        if self.rests and (done := self._done(self._values.check, self.configure)) != TransitionCallbackReturn.SUCCESS:
+            return done
+        super().on_activate(state)  # publishers, before anything is published
+        self.active, self.session = True, self.session + self.rests
+        return self._done(self.activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        done = self._done(self._rest)
+        super().on_deactivate(state)
+        return done
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._done(self._release)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._done(self._release)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._done(self._release)

@@ -1,0 +1,127 @@
+"""Lifecycle nodes: started by themselves, refusing while they rest, ending goals, and put right before they go on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from action_msgs.msg import GoalStatus
+from dm_msgs.action import MoveFocus
+from dm_msgs.srv import Flatten
+from rclpy.action import ActionClient
+from rclpy.parameter import Parameter as RosParameter
+
+from dm_common.errors import ErrorCode
+from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.lifecycle import ERROR, OK, WARN, ManagedNode
+from dm_common.ros.parameters import AUTOSTART, Parameter, real, whole
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
+from ros_fixtures import Observer
+from waiting import wait_until
+
+TABLE = (
+    AUTOSTART,
+    Parameter("gain", real(2.0, 0.0, 10.0), "gain", live=True),
+    Parameter("count", whole(3, 0, 10), "count; 7 will not do with anything"),
+)
+
+
+class Example(ManagedNode):
+    """Writes down what it does."""
+
+    def __init__(self, **keywords: Any) -> None:
+        super().__init__("example", TABLE, **keywords)
+        self.did: list[str] = []
+        WorkerService(self, Flatten, "flatten", lambda _request, response: response)
+        WorkerActionServer(self, MoveFocus, "move_focus", self.run)
+
+    def run(self, goal: WorkerGoal) -> tuple[str, Any]:
+        if sleep(self.get_clock(), 30.0, lambda: goal.is_cancel_requested):
+            return "succeed", MoveFocus.Result()
+        return "canceled", MoveFocus.Result(error_code=ErrorCode.CANCELED, message="canceled where it was")
+
+    def configure(self) -> None:
+        if self._values["count"] == 7:
+            raise ValueError("count = 7: will not do")
+        self.did.append(f"configure {self._values['count']}")
+
+    def activate(self) -> None:
+        self.did.append("activate")
+
+    def deactivate(self) -> None:
+        self.did.append("deactivate")
+
+    def clean_up(self) -> None:
+        self.did.append("clean up")
+
+    @property
+    def level(self) -> bytes:
+        return self._health_in_any_state().level
+
+    def put(self, name: str, value: Any) -> str:
+        """Set a parameter; the reason why not."""
+        return str(self.set_parameters([RosParameter(name, value=value)])[0].reason)
+
+
+@pytest.fixture
+def served(observer: Observer) -> Iterator[Example]:
+    node = Example(context=observer.node.context)
+    executor = BackgroundExecutor(node)
+    wait_until(lambda: node.active)
+    yield node
+    executor.destroy_node()
+
+
+def test_a_node_that_rests_refuses_and_ends_its_goals(served: Example, observer: Observer) -> None:
+    assert served.did == ["configure 3", "configure 3", "activate"] and served.level == OK
+    client = ActionClient(observer.node, MoveFocus, "move_focus")
+    wait_until(client.server_is_ready)
+    accepted = client.send_goal_async(MoveFocus.Goal())
+    wait_until(accepted.done)
+    ended = accepted.result().get_result_async()
+    assert observer.call(Flatten, "flatten").error_code == ErrorCode.OK
+    served.trigger_deactivate()
+    wait_until(ended.done)
+    assert ended.result().status == GoalStatus.STATUS_ABORTED
+    result = ended.result().result
+    assert (result.error_code, result.message) == (ErrorCode.CANCELED, "example was deactivated: canceled where it was")
+    answer = observer.call(Flatten, "flatten")
+    assert answer.error_code == ErrorCode.NODE_INACTIVE and "ros2 lifecycle set /example" in answer.message
+    accepted = client.send_goal_async(MoveFocus.Goal())
+    wait_until(accepted.done)
+    refused = accepted.result().get_result_async()
+    wait_until(refused.done)
+    assert refused.result().result.error_code == ErrorCode.NODE_INACTIVE
+    assert served.level == WARN
+    served.trigger_activate()
+    assert observer.call(Flatten, "flatten").error_code == ErrorCode.OK
+    client.destroy()
+
+
+def test_parameters_change_while_it_rests_and_wrong_ones_keep_it_resting(observer: Observer) -> None:
+    node = Example(context=observer.node.context, parameter_overrides=[RosParameter("count", value=11)])
+    node.autostart()
+    assert not node.configured and node.level == ERROR and "count = 11" in node.inactive()
+    assert node.put("count", 5) == ""
+    node.trigger_configure()
+    node.trigger_activate()
+    assert node.active and node.level == OK
+    assert "ros2 lifecycle set /example deactivate" in node.put("count", 4) and node.put("gain", 1.0) == ""
+    node.trigger_deactivate()
+    assert node.put("count", 7) == ""
+    node.trigger_activate()
+    assert not node.active and node.configured and "count = 7: will not do" in node.inactive()
+    assert node.put("count", 4) == ""
+    node.trigger_activate()
+    assert node.did[-2:] == ["configure 4", "activate"]
+    node.trigger_shutdown()
+    assert node.did[-2:] == ["deactivate", "clean up"] and not node.configured
+    node.destroy_node()
+
+
+def test_a_node_waits_for_its_manager_where_it_is_told_to(observer: Observer) -> None:
+    node = Example(context=observer.node.context, parameter_overrides=[RosParameter("autostart", value=False)])
+    node.autostart()
+    assert not node.configured and node.level == WARN
+    node.destroy_node()
