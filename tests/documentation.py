@@ -113,6 +113,7 @@ PARSED = {
     "./dm demo --camera": _LONG + "its parts run in test_autofocus_node.py",
     "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
+    "./dm calibrate --boresight": "needs a camera; test_boresight_command.py runs what it does, test_held_tilt.py how",
     "./dm up --camera": "test_many_mirrors.py checks what it adds; test_autofocus_node.py runs such nodes",
     "./dm exec python examples/camera_focus.py": "test_autofocus_node.py runs it",
     "./dm check --without 5": "that actuator is well; test_drift_updates.py checks such updates",

@@ -10,7 +10,8 @@ import typer
 
 from dm_bringup.suite import ConfigError, load_config
 from dm_calibration.procedure.forecast import GoodEnough
-from dm_tools.verbs.calibrate import REACHED, metres, source_of, write_parameters
+from dm_tools.parameter_changes import source_of, write_parameters
+from dm_tools.verbs.calibrate import REACHED, metres
 from dm_tools.verbs.up import shared_config
 
 FOUND = "/**/interferometer:\n  ros__parameters:\n    orientation.rotate_deg: -35.010000\n    orientation.flip_x: true"

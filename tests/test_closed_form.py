@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,14 +13,16 @@ from dm_controller.planning.fast_path import ClosedForm
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget
-from linear_mirror import LinearMirror, hexagon, make_mirror
+from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
 
 @pytest.fixture(scope="module")
 def mirror() -> CalibratedMirror:
     limits = Limits(-1.0, 1.0, np.array(make_mirror().limits.pairs), 2.0)
-    return CalibratedMirror(perfect_model(LinearMirror(*hexagon())), limits)
+    plant = LinearMirror(*hexagon())
+    model = replace(perfect_model(plant), actuator_x=RADIUS * plant.x, actuator_y=RADIUS * plant.y)
+    return CalibratedMirror(model, limits, axis=(1e-4, -2e-4))
 
 
 def solved(mirror: CalibratedMirror, target: FocusTarget) -> Plan:
@@ -26,7 +30,8 @@ def solved(mirror: CalibratedMirror, target: FocusTarget) -> Plan:
     model = mirror.model
     coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
     sag = target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
-    return mirror.predict(target, mirror.solve(mirror.rows(coefficients, sag)))
+    tilt = np.array(target.zernike[1:3] or (0.0, 0.0)) - target.curvature * model.aperture_radius * mirror.axis
+    return mirror.predict(target, mirror.solve(mirror.rows(coefficients, sag, tilt)))
 
 
 @pytest.mark.parametrize("curvature", [-0.05, 0.0, 0.02])

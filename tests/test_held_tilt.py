@@ -3,32 +3,50 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
 
-from dm_common.optics.zernike import basis
-from dm_controller.planning.mirror_model import CalibratedMirror
+from dm_autofocus.boresight import STEP, BoresightError, find_boresight
+from dm_autofocus.optics import depth_of_focus
+from dm_common.optics.zernike import TERMS, basis
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
+from dm_simulation.camera import CameraConfig, SceneCamera
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
 pytestmark = pytest.mark.slow
 
 #: Shift of the picture of the demonstration's camera: twice the angle, 0.2 m, 3.45 um.
 FOCAL_LENGTH_PX = 0.2 / 3.45e-6
+RANGE = 0.05
 
 
-def test_the_picture_stands_still_while_the_focus_changes() -> None:
+class Calibrated(NamedTuple):
     """A plate with unequal actuators and figure, calibrated by an interferometer whose own tilt is 300 nm a map."""
+
+    bench: SimulatedBench
+    model: InfluenceModel
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> Calibrated:
     bench = SimulatedBench(SimulationConfig(seed=4, law="preisach", pixels=118))
     calibration = bench.calibrate()
     model = influence_model(calibration.fit, calibration.aperture_radius)
-    model = replace(model, actuator_x=calibration.actuator_x, actuator_y=calibration.actuator_y)
+    return Calibrated(bench, replace(model, actuator_x=calibration.actuator_x, actuator_y=calibration.actuator_y))
+
+
+def test_the_picture_stands_still_while_the_focus_changes(calibrated: Calibrated) -> None:
+    bench, model = calibrated
     rows, columns = np.nonzero(np.isfinite(bench.true_map()))
     aperture = bench.aperture
     x, y = (columns - aperture.centre_x_px) / aperture.radius_px, (aperture.centre_y_px - rows) / aperture.radius_px
     tilt = (np.linalg.pinv(basis(x, y)) @ bench.true_influence()[0])[1:3] * bench.true_stroke
-    targets = [FocusTarget(float(curvature)) for curvature in np.linspace(-0.05, 0.05, 7)]
+    targets = [FocusTarget(float(curvature)) for curvature in np.linspace(-RANGE, RANGE, 7)]
 
     def moved(mirror: CalibratedMirror) -> float:
         """Largest shift, px, over the range, along either axis."""
@@ -46,3 +64,57 @@ def test_the_picture_stands_still_while_the_focus_changes() -> None:
     np.testing.assert_allclose(narrow[0], narrow[1], rtol=0.01)
     unknown = replace(model, actuator_x=None)
     assert CalibratedMirror(unknown, bench.limits).tilt is None, "without the actuators' places it is free"
+
+
+class Eccentric:
+    """A camera that looks at the mirror beside its middle, through a smaller pupil."""
+
+    DIAMETER, AXIS = 20e-3, np.array([0.5e-3, -0.3e-3])
+
+    def __init__(self, calibrated: Calibrated, axis: tuple[float, ...] = (0.0, 0.0), hold_tilt: bool = True) -> None:
+        self._bench, model = calibrated
+        self.mirror = CalibratedMirror(model, self._bench.limits, hold_tilt, axis)
+        self._radius = model.aperture_radius
+        seeds = (np.random.default_rng(seed) for seed in (3, 4))
+        self._camera = SceneCamera(CameraConfig(distances=(10.0,)), self.DIAMETER, *seeds)
+        self._nodes = np.cos(np.pi * (np.arange(60) + 0.5) / 60)
+
+    def surface(self, curvature: float, tilt: NDArray) -> NDArray:
+        """The true surface over the pupil."""
+        zernike = np.zeros(len(TERMS))
+        zernike[1:3] = tilt
+        signals = self.mirror.command(FocusTarget(curvature, 0.0, tuple(zernike)))[0]
+        whole = self._bench._interferometer.surface(self._bench.true_stroke * signals)
+        at = self._nodes * self.DIAMETER / 2 / self._radius
+        order = len(whole) - 1
+        x, y = (chebyshev.chebvander(at + off / self._radius, order) for off in self.AXIS)
+        back = np.linalg.pinv(chebyshev.chebvander(self._nodes, order))
+        return np.asarray(back @ (y @ whole @ x.T) @ back.T)
+
+    def see(self, curvature: float, tilt: NDArray) -> NDArray:
+        return self._camera.expose(self.surface(curvature, tilt))
+
+    def moved(self) -> float:
+        """Shift [px] over the range, along either axis: twice the mean slope."""
+        low, high = (self.surface(curvature, np.zeros(2)) for curvature in (-RANGE, RANGE))
+        grid = np.linspace(-1, 1, 81)
+        values = chebyshev.chebval2d(*np.meshgrid(grid, grid, indexing="ij"), high - low)
+        inside = np.add.outer(grid**2, grid**2) <= 1
+        slopes = [axis[inside].mean() for axis in np.gradient(values, grid, grid)]
+        return float(2 / (self.DIAMETER / 2) * FOCAL_LENGTH_PX * np.abs(slopes).max())
+
+
+def test_a_camera_that_looks_beside_the_middle_finds_its_axis(calibrated: Calibrated) -> None:
+    before = Eccentric(calibrated)
+    step = STEP * depth_of_focus(before.mirror.model.aperture_radius)
+    found = find_boresight(before.see, 0.0, step)
+    axis = found.offset(before.mirror.model.aperture_radius)
+    np.testing.assert_allclose(axis, Eccentric.AXIS, atol=0.1e-3)  # as the calibration's tilts count
+    after = Eccentric(calibrated, tuple(axis))
+    assert before.moved() > 5
+    assert after.moved() <= 0.5
+    again = find_boresight(after.see, 0.0, step)
+    assert np.abs(2 * RANGE * again.drift).max() <= 0.5, "by the camera's own images"
+    free = Eccentric(calibrated, hold_tilt=False)
+    with pytest.raises(BoresightError, match="does not follow the mirror's tilt"):
+        find_boresight(free.see, 0.0, step)

@@ -5,16 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
+import numpy as np
 from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import AutofocusState
 from dm_msgs.srv import GetFocusRange, SetFocusDistance
 from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
-from dm_autofocus.images import pixels_of
+from dm_autofocus.boresight import STEP, Boresight, BoresightError, find_boresight
+from dm_autofocus.focus_probe import IMAGES
+from dm_autofocus.images import grey, pixels_of
+from dm_autofocus.sharpness import check_region, cut
 from dm_client import Claim, DeformableMirrorClient, DeformableMirrorError
 from dm_common.errors import ErrorCode
+from dm_common.messages import seconds
+from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.ros import qos
+
+#: After a move, until images count [s].
+SETTLE_S = 0.05
 
 _OWN: dict[str, Any] = {
     "set_focus_distance": SetFocusDistance,
@@ -112,3 +121,44 @@ class CameraFocusClient(DeformableMirrorClient):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, "the images did not arrive on focus_stack/image and depth")
         image, depth = (pixels_of(self.messages[topic]) for topic in topics)
         return result, image, depth[..., 0]
+
+    def boresight(self, region: Sequence[float], *, pairs: int = 6, **claim: Unpack[Claim]) -> Boresight:
+        """Measure how the picture moves with the mirror's tilt and with the focus; ends at the focus of the region.
+
+        Args:
+            region: left, top, width, height as shares 0..1 of the image: an object that stands still.
+            pairs: images on either side of the focus, in turns.
+            claim: where somebody holds the mirror.
+
+        Raises:
+            DeformableMirrorError: a search or a move did not succeed, images do not come, or do not follow tilt.
+        """
+        part = check_region(region)
+        focus = self.autofocus(part, **claim).curvature
+        reach = self.focus_range()
+        step = STEP * reach.curvature_tolerance
+        focus = min(max(focus, reach.curvature_min + 2 * step), reach.curvature_max - 2 * step)
+        if "image_raw" not in self.messages:
+            self.messages["image_raw"] = None
+            self.hear("image_raw", Image, IMAGES)
+
+        def see(curvature: float, tilt: NDArray[np.float64]) -> NDArray:
+            zernike = np.zeros(len(TERMS))
+            zernike[1:PISTON_TILT] = tilt
+            state = self.focus(curvature, zernike=zernike.tolist(), **claim)
+            begin = seconds(state.header.stamp) + state.predicted_duration + SETTLE_S
+
+            def arrived() -> bool:
+                image = self.messages["image_raw"]
+                return image is not None and seconds(image.header.stamp) >= begin
+
+            if not self.wait(arrived):
+                raise DeformableMirrorError(ErrorCode.TIMEOUT, "no image on image_raw that was stamped after a move")
+            return cut(grey(self.messages["image_raw"]), part)
+
+        try:
+            found = find_boresight(see, focus, step, pairs)
+        except BoresightError as error:
+            raise DeformableMirrorError(ErrorCode.NOT_CONVERGED, str(error)) from error
+        self.focus(focus, **claim)
+        return found

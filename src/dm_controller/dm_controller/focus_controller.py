@@ -80,7 +80,9 @@ class FocusController:
         effects: list[Effect] = []
         before, values = self.active, self._values
         try:
-            active = active_calibration(calibration, mirror, values["aperture_tolerance"], values["hold_tilt"])
+            active = active_calibration(
+                calibration, mirror, values["aperture_tolerance"], values["hold_tilt"], values["optical_axis"]
+            )
             # A new revision leaves the shape that stands as it is: so it can be held on.
             if before is None or before.calibration.id != active.calibration.id:
                 self.hold.end("another calibration is used")

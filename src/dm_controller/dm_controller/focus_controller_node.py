@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -54,7 +54,7 @@ class FocusControllerNode(ManagedNode):
     """
 
     def __init__(self, **keywords: Any) -> None:
-        super().__init__("focus_controller", PARAMETERS, lambda _changes: self._publish_capabilities(), **keywords)
+        super().__init__("focus_controller", PARAMETERS, self._on_parameters, **keywords)
         values = self._values
         self._lock, self._controller = threading.Lock(), FocusController(values)
         self._mirror: MirrorInfo | None = None
@@ -130,6 +130,12 @@ class FocusControllerNode(ManagedNode):
     def _on_calibration(self, message: Calibration) -> None:
         self._calibration = message
         self._use()
+
+    def _on_parameters(self, changes: Mapping[str, Any]) -> None:
+        if {"hold_tilt", "optical_axis"} & set(changes):
+            self._use()
+        else:
+            self._publish_capabilities()
 
     def _use(self) -> None:
         if not self.active:

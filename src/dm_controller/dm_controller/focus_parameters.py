@@ -10,6 +10,8 @@ from dm_common.values import Fields, reals
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S
 
+#: How far from the middle of the mirror a camera may look at it, m.
+AXIS_MAX = 0.1
 #: Of the closed loops, for whatever node hosts them.
 LOOP_PARAMETERS = (
     Parameter(
@@ -109,6 +111,14 @@ PARAMETERS: Final = (
         switch(True),
         "keep the mirror's tilt while its curvature changes, so that the picture of a camera stands still; "
         "false = tilt is free",
+        live=True,
+    ),
+    Parameter(
+        "optical_axis",
+        reals([0.0, 0.0], -AXIS_MAX, AXIS_MAX, "m", sizes=(2,)),
+        "x and y of where the camera's axis meets the mirror, from the middle of the calibrated aperture: the picture "
+        "stands still where the vertex of the sphere stays on it; `./dm calibrate --boresight` finds it",
+        live=True,
     ),
     APERTURE_PARAMETER,
     *LOOP_PARAMETERS,

@@ -66,6 +66,7 @@ VALUES: dict[str, Any] = {
     "calibration_age_max": 0.0,
     "aperture_tolerance": 0.02,
     "hold_tilt": True,
+    "optical_axis": [0.0, 0.0],
 }
 
 

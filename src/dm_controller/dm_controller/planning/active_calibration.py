@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -91,9 +92,13 @@ class ActiveCalibration:
 
 
 def active_calibration(
-    calibration: Calibration | None, mirror: MirrorInfo | None, aperture_tolerance: float, hold_tilt: bool = True
+    calibration: Calibration | None,
+    mirror: MirrorInfo | None,
+    aperture_tolerance: float,
+    hold_tilt: bool = True,
+    axis: Sequence[float] = (0.0, 0.0),
 ) -> ActiveCalibration:
-    """What to plan moves of `mirror` with; `hold_tilt`: see `CalibratedMirror`.
+    """What to plan moves of `mirror` with; `hold_tilt` and `axis`: see `CalibratedMirror`.
 
     Raises:
         Refusal: there is no calibration, it is of another mirror, or its numbers make no sense, naming the field.
@@ -117,7 +122,7 @@ def active_calibration(
         slew_rate = mirror.slew_rate_max if mirror.slew_rate_max > 0.0 else math.inf
         limits = limits_from(mirror)
         model = model_of(calibration, np.asarray(mirror.actuator_x), np.asarray(mirror.actuator_y))
-        calibrated = CalibratedMirror(model, limits, hold_tilt)
+        calibrated = CalibratedMirror(model, limits, hold_tilt, axis)
         recipes = recipe_book_from(calibration.recipes)
         if any(len(recipe.effective) != calibration.actuators for recipe in recipes.recipes):
             raise ValueError(f"recipes: effective must have {calibration.actuators} values each")
@@ -135,6 +140,7 @@ def active_calibration(
                     neighbour_difference=min(share, 1.0) * limits.neighbour_difference,
                 ),
                 hold_tilt,
+                axis,
             )
     except (ValueError, np.linalg.LinAlgError) as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error

@@ -24,7 +24,7 @@ from dm_common.hysteresis.inverse import Pieces, horner, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 from dm_common.optics.conic import disc_coefficients
-from dm_common.optics.zernike import TERMS, basis
+from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
 
@@ -79,7 +79,10 @@ class ClosedForm:
         # Columns: the figure with the amplitude 1, the series, the added terms.
         coefficients = np.column_stack([-model.zernike_offset, series_coefficients(), np.eye(len(TERMS))])
         sag = np.column_stack([-model.sag_offset, series_sag(x, y), basis(x, y)])
-        signals = mirror.unlimited(coefficients, sag)
+        tilt = np.zeros((2, coefficients.shape[1]))
+        tilt[:, 1] = -2 / self._radius * mirror.axis  # by the slope of the sphere, whose amplitude is c r^2 / 2
+        tilt[:, 1 + ORDERS + 1 : 1 + ORDERS + PISTON_TILT] = np.eye(2)
+        signals = mirror.unlimited(coefficients, sag, tilt)
         self._signals = len(signals)
         self._all_terms = np.ascontiguousarray(np.vstack([signals, mirror.coefficient_errors(signals, coefficients)]))
         self._conic_only = np.ascontiguousarray(self._all_terms[:, : 1 + ORDERS])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -115,27 +116,33 @@ class CalibratedMirror:
 
     The command makes the coefficients beyond tilt equal to the wanted ones and the sag beyond the terms as small as
     possible, with piston free, inside the limits, and the tilt at what it is at zero signals, so that the picture of a
-    camera stands still while the focus changes (`hold_tilt`; else it is free too); where the limits forbid equality it
-    is the closest in the weighted least-squares sense. A mirror of few actuators moves fewer combinations of
-    coefficients than there are; the others count as the sag they are (measured with 19 actuators: 8 nm rms are left
-    instead of 97, and no signal saturates). A small ridge keeps actuators that the aperture hardly sees from running to
-    their limits for nothing.
+    camera stands still while the focus changes (`hold_tilt`; else it is free too); a target's own tilt comes on top. A
+    camera whose axis meets the mirror beside the middle sees the slope that a sphere has there: as much tilt puts the
+    vertex on the axis. Where the limits forbid equality the command is the closest in the weighted least-squares sense.
+    A mirror of few actuators moves fewer combinations of coefficients than there are; the others count as the sag they
+    are (measured with 19 actuators: 8 nm rms are left instead of 97, and no signal saturates). A small ridge keeps
+    actuators that the aperture hardly sees from running to their limits for nothing.
 
     Args:
         model: of the mirror.
         limits: of its signals.
         hold_tilt: hold it where the model says where the actuators are.
+        axis: (2,) m, x and y of where the camera's axis meets the mirror.
 
     Attributes:
+        axis: as given.
         matrix: (R, N), `rows` of the influence function.
         tilt: (2, N) m per unit signal, of the two tilts that are held; None = they are free.
         ridge: weight of the squared signals beside the squared rows.
         sag_root: (N, N), m: its product with signals is as long as their rms sag, piston and tilt removed.
     """
 
-    def __init__(self, model: InfluenceModel, limits: Limits, hold_tilt: bool = True) -> None:
+    def __init__(
+        self, model: InfluenceModel, limits: Limits, hold_tilt: bool = True, axis: Sequence[float] = (0.0, 0.0)
+    ) -> None:
         self.model = model
         self.limits = limits
+        self.axis = np.array(axis, dtype=float)
         self._weights = np.sqrt(model.sample_weight)
         self._terms = np.linalg.qr(self._weights[:, None] * basis(model.sample_x, model.sample_y))[0]
         self._tilt_free = self._terms[:, :PISTON_TILT]
@@ -147,9 +154,7 @@ class CalibratedMirror:
         if hold_tilt and model.actuator_x is not None and model.actuator_y is not None:
             places = np.array([model.actuator_x, model.actuator_y]) / model.aperture_radius
             self.tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
-        self.matrix = self.rows(model.influence_zernike, model.influence_sag)
-        if self.tilt is not None:
-            self.matrix[:2] = TILT_WEIGHT * self.tilt
+        self.matrix = self.rows(model.influence_zernike, model.influence_sag, self.tilt)
         self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
@@ -160,20 +165,25 @@ class CalibratedMirror:
         result: NDArray[np.float64] = weighted - removed @ (removed.T @ weighted)
         return result
 
-    def rows(self, coefficients: NDArray[np.float64], sag: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rows(
+        self, coefficients: NDArray[np.float64], sag: NDArray[np.float64], tilt: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
 
-        Where tilt is held, two rows above them are that of a surface that keeps it: zero, whatever tilt was measured.
+        Where tilt is held, two rows above them are the wanted one, whatever tilt was measured.
 
         Args:
             coefficients: (K,) m, or (K, N), a surface in each column.
             sag: (P,) or (P, N) m.
+            tilt: (2,) or (2, N) m, wanted; None = as it is at zero signals.
 
         Returns:
             (R,) or (R, N); R = K - 3 + P, and 2 more where tilt is held.
         """
         weighted = self._coefficient_rows @ coefficients[PISTON_TILT:]
         kept = np.zeros((0 if self.tilt is None else 2, *weighted.shape[1:]))
+        if tilt is not None and self.tilt is not None:
+            kept = TILT_WEIGHT * tilt
         return np.concatenate([kept, weighted, self._reduce(sag, self._terms)])
 
     def solve(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -199,12 +209,14 @@ class CalibratedMirror:
             TargetError: no such surface exists over the aperture.
         """
         coefficients, sag = self._wanted(target)
-        signals = self.solve(self.rows(coefficients, sag))
+        signals = self.solve(self.rows(coefficients, sag, self._wanted_tilt(target)))
         return signals, float(np.abs(self.coefficient_errors(signals, coefficients)).max())
 
-    def unlimited(self, coefficients: NDArray[np.float64], sag: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Commands (N, M) for coefficients (K, M) and sag (P, M), m, less those at zero signals, without any limit."""
-        return self._programme.unlimited(self.rows(coefficients, sag))
+    def unlimited(
+        self, coefficients: NDArray[np.float64], sag: NDArray[np.float64], tilt: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Commands (N, M) for `rows` of coefficients (K, M), sag (P, M) and tilt (2, M), m, without any limit."""
+        return self._programme.unlimited(self.rows(coefficients, sag, tilt))
 
     def predict(self, target: FocusTarget, signals: NDArray[np.float64]) -> Plan:
         """What `signals` (N,) are expected to do when `target` is wanted.
@@ -233,13 +245,19 @@ class CalibratedMirror:
         Raises:
             TargetError: no such surface exists over the aperture.
         """
-        return self.rows(*self._wanted(target))
+        return self.rows(*self._wanted(target), self._wanted_tilt(target))
 
     def _wanted(self, target: FocusTarget) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Coefficients (K,) and sag (P,) of `target` less those at zero signals, m."""
         model = self.model
         coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
         return coefficients, target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
+
+    def _wanted_tilt(self, target: FocusTarget) -> NDArray[np.float64]:
+        """Tilt (2,) of `target`, m: its own, less the slope that its sphere has on the axis."""
+        own = np.array(target.zernike[1:PISTON_TILT]) if target.zernike else np.zeros(2)
+        tilt: NDArray[np.float64] = own - target.curvature * self.model.aperture_radius * self.axis
+        return tilt
 
     def coefficient_errors(
         self, signals: NDArray[np.float64], coefficients: NDArray[np.float64]

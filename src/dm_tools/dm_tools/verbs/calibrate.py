@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from enum import StrEnum
-from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from dm_common.errors import ErrorCode
 from dm_common.figures import in_nanometres
 from dm_tools.output import (
     JsonOption,
@@ -23,6 +21,7 @@ from dm_tools.output import (
     progress_bar,
     write_json,
 )
+from dm_tools.parameter_changes import set_parameter, source_of, write_parameters
 from dm_tools.running_suite import promise, running_suite
 
 #: What tells the sentence of a result on what --until asked for.
@@ -79,25 +78,8 @@ def metres(text: str) -> float:
 
 
 def start_fresh(client: Any, fresh: bool = True) -> None:
-    """Have the next goal begin anew, or not.
-
-    Raises:
-        DeformableMirrorError: the node does not answer, or refuses.
-    """
-    from rclpy.parameter import Parameter
-    from rclpy.parameter_client import AsyncParameterClient
-
-    from dm_client import DeformableMirrorError
-    from dm_common.ros.clients import answers_arrive
-
-    parameters = AsyncParameterClient(client.node, "calibration")
-    if not client.wait(lambda: answers_arrive(parameters, parameters.services_are_ready)):
-        raise DeformableMirrorError(
-            ErrorCode.INTERNAL, "the node `calibration` does not answer: is it running (./dm up)?"
-        )
-    answer = parameters.set_parameters([Parameter("start_fresh", Parameter.Type.BOOL, fresh)])
-    if not client.wait(answer.done) or not all(each.successful for each in answer.result().results):
-        raise DeformableMirrorError(ErrorCode.INTERNAL, "the node `calibration` did not take start_fresh")
+    """Have the next goal begin anew, or not. Raises DeformableMirrorError: see `set_parameter`."""
+    set_parameter(client, "calibration", "start_fresh", fresh)
 
 
 def show_result(result: Any) -> None:
@@ -121,58 +103,6 @@ def show_result(result: Any) -> None:
         console.print(result.parameters, markup=False, highlight=False)
     if result.poke_check_passed:
         console.print("poke check: wiring and orientation are as configured")
-
-
-def source_of(target: Path, config: Path | None, serial: str) -> Path:
-    """The parameter file from which :func:`write_parameters` makes `target`.
-
-    Args:
-        config: the file that the nodes run with; None = `target` where there is one, else that of the virtual bench.
-        serial: of the running mirror.
-
-    Raises:
-        ConfigError: the file cannot be used, or is of another mirror.
-    """
-    from dm_bringup.suite import ConfigError, load_config
-    from dm_tools.verbs.up import shared_config
-
-    source = config or (target if target.exists() else shared_config("bench.yaml"))
-    written = str(load_config(source).get("pdm_driver", {}).get("mirror.serial", ""))
-    if written != serial:
-        raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
-    return source
-
-
-def write_parameters(parameters: str, target: Path, source: Path) -> None:
-    """Write the parameter file `target`: `source` with the `parameters` that a poke check found; comments are kept.
-
-    What stood at `target` is kept beside it, and nothing that was kept so before is lost.
-
-    Raises:
-        ConfigError: `source` cannot be changed without losing its form.
-        OSError: it cannot be written; what stood at `target` still does.
-    """
-    import yaml
-
-    from dm_bringup.config_edit import edited
-    from dm_common.atomic_write import write_whole
-
-    if not parameters:
-        console.print(f"no parameter has to be changed: {target} is not written")
-        return
-    changes = yaml.safe_load(parameters) or {}
-    plain = {key.rsplit("/", 1)[-1]: section["ros__parameters"] for key, section in changes.items()}
-    text = edited(source.read_text(), plain)
-    if target.exists():
-        before = target.with_name(target.name + ".before")
-        for number in count(2):
-            if not before.exists():
-                break
-            before = target.with_name(f"{target.name}.before{number}")
-        write_whole(before, target.read_bytes())
-        console.print(f"{target} as it was is kept as {before}")
-    write_whole(target.resolve(), text.encode())
-    console.print(f"{target} is written from {source}: start the nodes with it, then check again")
 
 
 def _foretold(result: Any) -> str:
@@ -227,8 +157,18 @@ def calibrate(
     activate: Annotated[bool, typer.Option(help="Use the new calibration at once.")] = True,
     note: Annotated[str, typer.Option(help="Stored with the calibration.")] = "",
     take_over: TakeOverOption = False,
+    boresight: Annotated[
+        bool,
+        typer.Option(
+            "--boresight", help="Find where the camera's axis meets the mirror, by its images; no interferometer."
+        ),
+    ] = False,
+    region: Annotated[
+        str, typer.Option(help="With --boresight: left, top, width, height of what stands still, as shares.")
+    ] = "0.25,0.25,0.5,0.5",
     write: Annotated[
-        Path | None, typer.Option(help="Write what a poke check finds into this copy of the parameter file.")
+        Path | None,
+        typer.Option(help="Write what a poke check or --boresight finds into this copy of the parameter file."),
     ] = None,
     config: Annotated[
         Path | None,
@@ -243,12 +183,16 @@ def calibrate(
 
     One run finds the influence function, the hysteresis and the creep of all actuators, and checks the wiring. Needs
     the running suite (`dm up`). Ctrl-C cancels and leaves the mirror at mid range; what was measured is kept, and the
-    same command goes on from there.
+    same command goes on from there. --boresight needs a calibration, the camera and `autofocus` instead.
     """
     from dm_msgs.action import Calibrate
 
     from dm_client import DeformableMirrorError
+    from dm_tools.boresight import run_boresight
 
+    if boresight:
+        run_boresight(namespace, region, take_over, write, config, json)
+        return
     if hysteresis is not None or until:
         plan = CalibrationPlan.hysteresis
     goal = Calibrate.Goal(

@@ -1,0 +1,101 @@
+"""`dm calibrate --boresight`: the picture of a camera stands still while the focus changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+
+from dm_common.errors import ErrorCode
+from dm_tools.output import console, next_step, write_json
+from dm_tools.parameter_changes import get_parameter, set_parameter, source_of, write_parameters
+
+#: A picture that moves by less over the range stands still [px].
+STILL_PX = 0.5
+
+
+def region_of(text: str) -> tuple[float, ...]:
+    """Left, top, width and height. Raises typer.BadParameter."""
+    from dm_autofocus.sharpness import check_region
+
+    try:
+        return check_region([float(part) for part in text.split(",")])
+    except ValueError as error:
+        raise typer.BadParameter(f"--region {text!r}: {error}") from error
+
+
+def price(client: Any, axis: Any) -> dict[str, Any]:
+    """What holding the picture costs: reachable curvatures [1/m] and residual [nm rms] with it and with free tilt."""
+    from dm_common.mirror import APERTURE_TOLERANCE
+    from dm_controller.planning.active_calibration import active_calibration
+    from dm_controller.planning.target import FocusTarget
+
+    figures: dict[str, Any] = {}
+    wanted = [client.capabilities.curvature_min, client.capabilities.curvature_max]
+    for name, hold in (("held", True), ("free", False)):
+        active = active_calibration(
+            client.latest("calibration"), client.mirror_info, APERTURE_TOLERANCE, hold, tuple(axis)
+        )
+        low, high = active.reachable_range(FocusTarget(0.0), 2e-8)
+        rms = max(active.mirror.plan(FocusTarget(curvature)).rms for curvature in wanted)
+        figures[name] = {"curvature_min": low, "curvature_max": high, "residual_rms_nm": 1e9 * rms}
+    return figures
+
+
+def run_boresight(
+    namespace: str, region: str, take_over: bool, write: Path | None, config: Path | None, json: Path | None
+) -> None:
+    """Find the camera's axis, have the focus controller keep the picture there, and see whether it stands still.
+
+    Raises:
+        DeformableMirrorError: it does not move less than before: the axis is as it was.
+    """
+    from dm_autofocus import CameraFocusClient
+    from dm_client import DeformableMirrorError
+
+    part = region_of(region)
+    with CameraFocusClient(namespace) as client:
+        source = source_of(write, config, client.mirror_info.serial) if write is not None else None
+        reach = client.focus_range()
+        span = reach.curvature_max - reach.curvature_min
+
+        def moved() -> tuple[Any, float, float]:
+            """What was found, by how much the picture moves over the range, and its standard deviation, px."""
+            with console.status("tip, tilt and focus, to and fro"):
+                found = client.boresight(part, take_over=take_over)
+            return found, float(span * np.hypot(*found.drift)), float(span * np.hypot(*found.drift_sigma))
+
+        axis = np.array(get_parameter(client, "focus_controller", "optical_axis"))
+        found, before, sigma = moved()
+        console.print(f"over the range the picture moves by {before:.2f} px (± {sigma:.2f})")
+        after = before
+        if before > max(STILL_PX, 2 * sigma):
+            held, axis = axis, axis + found.offset(client.capabilities.aperture_radius)
+            set_parameter(client, "focus_controller", "optical_axis", axis.tolist())
+            _found, after, sigma = moved()
+            if after >= before:
+                set_parameter(client, "focus_controller", "optical_axis", held.tolist())
+                raise DeformableMirrorError(
+                    ErrorCode.NOT_CONVERGED,
+                    f"with another axis it moves by {after:.2f} px: does all that is in and near the region stand "
+                    "still, at one distance? The axis is as it was",
+                )
+            console.print(f"now by {after:.2f} px (± {sigma:.2f})")
+        cost = price(client, axis)
+    console.print(f"the camera's axis meets the mirror at x = {1e3 * axis[0]:+.3f} mm, y = {1e3 * axis[1]:+.3f} mm")
+    for name, figures in cost.items():
+        console.print(
+            f"tilt {name}: {figures['curvature_min']:+.4f} to {figures['curvature_max']:+.4f} 1/m, at most "
+            f"{figures['residual_rms_nm']:.1f} nm rms"
+        )
+    figures = {"optical_axis_m": axis.tolist(), "moved_before_px": before, "moved_px": after, "sigma_px": sigma}
+    write_json(json, {"boresight": figures | cost})
+    parameters = f"/**/focus_controller:\n  ros__parameters:\n    optical_axis: [{axis[0]:.6f}, {axis[1]:.6f}]\n"
+    if write is not None and source is not None:
+        write_parameters(parameters, write, source)
+    else:
+        console.print("in use until the node ends; for its next start (--write FILE does it) put into its file:")
+        console.print(parameters, markup=False, highlight=False)
+    next_step("./dm focus 0.02")

@@ -1,0 +1,106 @@
+"""Changes to parameters that a measurement has found: of running nodes, and in their parameter file."""
+
+from __future__ import annotations
+
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from dm_common.errors import ErrorCode
+from dm_tools.output import console
+
+
+def set_parameter(client: Any, node: str, name: str, value: Any) -> None:
+    """Set a parameter of a running node.
+
+    Args:
+        client: whose namespace and node are used.
+
+    Raises:
+        DeformableMirrorError: the node does not answer, or refuses.
+    """
+    from rclpy.parameter import Parameter
+
+    answer = _answer(client, node, lambda parameters: parameters.set_parameters([Parameter(name, value=value)]))
+    if not all(each.successful for each in answer.results):
+        reasons = "; ".join(each.reason for each in answer.results)
+        raise _error(f"the node `{node}` did not take {name}: {reasons}")
+
+
+def get_parameter(client: Any, node: str, name: str) -> Any:
+    """The value of a parameter of a running node. Raises DeformableMirrorError when it does not answer."""
+    from rclpy.parameter import parameter_value_to_python
+
+    answer = _answer(client, node, lambda parameters: parameters.get_parameters([name]))
+    return parameter_value_to_python(answer.values[0])
+
+
+def _answer(client: Any, node: str, ask: Any) -> Any:
+    from rclpy.parameter_client import AsyncParameterClient
+
+    from dm_common.ros.clients import answers_arrive
+
+    parameters = AsyncParameterClient(client.node, node)
+    if client.wait(lambda: answers_arrive(parameters, parameters.services_are_ready)):
+        answer = ask(parameters)
+        if client.wait(answer.done):
+            return answer.result()
+    raise _error(f"the node `{node}` does not answer: is it running (./dm up)?")
+
+
+def _error(text: str) -> Exception:
+    from dm_client import DeformableMirrorError
+
+    return DeformableMirrorError(ErrorCode.INTERNAL, text)
+
+
+def source_of(target: Path, config: Path | None, serial: str) -> Path:
+    """The parameter file from which :func:`write_parameters` makes `target`.
+
+    Args:
+        config: the file that the nodes run with; None = `target` where there is one, else that of the virtual bench.
+        serial: of the running mirror.
+
+    Raises:
+        ConfigError: the file cannot be used, or is of another mirror.
+    """
+    from dm_bringup.suite import ConfigError, load_config
+    from dm_tools.verbs.up import shared_config
+
+    source = config or (target if target.exists() else shared_config("bench.yaml"))
+    written = str(load_config(source).get("pdm_driver", {}).get("mirror.serial", ""))
+    if written != serial:
+        raise ConfigError(f"{source} is of the mirror {written!r}, the nodes run {serial!r}: give theirs with --config")
+    return source
+
+
+def write_parameters(parameters: str, target: Path, source: Path) -> None:
+    """Write the parameter file `target`: `source` with the `parameters` that a poke check found; comments are kept.
+
+    What stood at `target` is kept beside it, and nothing that was kept so before is lost.
+
+    Raises:
+        ConfigError: `source` cannot be changed without losing its form.
+        OSError: it cannot be written; what stood at `target` still does.
+    """
+    import yaml
+
+    from dm_bringup.config_edit import edited
+    from dm_common.atomic_write import write_whole
+
+    if not parameters:
+        console.print(f"no parameter has to be changed: {target} is not written")
+        return
+    changes = yaml.safe_load(parameters) or {}
+    plain = {key.rsplit("/", 1)[-1]: section["ros__parameters"] for key, section in changes.items()}
+    text = edited(source.read_text(), plain)
+    if target.exists():
+        before = target.with_name(target.name + ".before")
+        for number in count(2):
+            if not before.exists():
+                break
+            before = target.with_name(f"{target.name}.before{number}")
+        write_whole(before, target.read_bytes())
+        console.print(f"{target} as it was is kept as {before}")
+    write_whole(target.resolve(), text.encode())
+    console.print(f"{target} is written from {source}: start the nodes with it, then check again")
