@@ -29,7 +29,6 @@ class CalibrationCard:
         self._listed: tuple[Any, ...] | None = None
         with card("Calibration"):
             self._text = ui.html("", sanitize=False).classes("text figures")
-            self._shown = ""
             self._plan = ui.select(operations.PLANS, value=Calibrate.Goal.PLAN_HYSTERESIS, label="Plan").classes(
                 "w-full"
             )
@@ -84,10 +83,8 @@ class CalibrationCard:
         self._progress.show(step if running else "")
         residuals_nm = [NM * residual for residual in list(session.ros.watched["calibrate"].residuals)]
         self._residuals.show(residual_chart(residuals_nm) if residuals_nm else None)
-        lines = "".join(f"<div>{escape(line)}</div>" for line in calibration_text(snapshot.calibration))
-        if lines != self._shown:
-            self._shown = lines
-            self._text.set_content(lines)
+        lines = calibration_text(snapshot.calibration)
+        self._text.set_content("".join(f"<div>{escape(line)}</div>" for line in lines))
         unchosen = "" if self._choice.value else "Choose a calibration first."
         self._load.allow(reason_against("store", snapshot, session.running) or unchosen)
         in_use = snapshot.calibration.id if snapshot.calibration is not None else ""

@@ -147,7 +147,7 @@ class Chart:
 
 
 class Line:
-    """A line of text that is sent only when it changed."""
+    """A line of text, out of sight while it is empty."""
 
     def __init__(self, classes: str = "text", live: bool = False) -> None:
         self.label = ui.label("").classes(classes)
@@ -155,6 +155,5 @@ class Line:
             self.label.props('role="status" aria-live="polite"')
 
     def show(self, text: str) -> None:
-        if self.label.text != text:
-            self.label.set_text(text)
+        self.label.set_text(text)  # NiceGUI sends only what has changed
         self.label.set_visibility(bool(text))

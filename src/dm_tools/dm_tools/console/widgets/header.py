@@ -18,7 +18,6 @@ class Header:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._shown: tuple[object, ...] = ()
-        self._badges_shown = ""
         with ui.element("header").classes("header"):
             with ui.element("div").classes("line one"):
                 heading("Deformable mirror console", 1)
@@ -39,10 +38,9 @@ class Header:
     def refresh(self, snapshot: Snapshot) -> None:
         progress = self._session.shown_progress
         shown = badges(snapshot, self._session.ros.observer.now(snapshot.bench_time).doubt)
-        content = "".join(f'<span class="badge {badge.kind}">{escape(badge.text)}</span>' for badge in shown)
-        if content != self._badges_shown:
-            self._badges_shown = content
-            self._badges.set_content(content)
+        self._badges.set_content(
+            "".join(f'<span class="badge {badge.kind}">{escape(badge.text)}</span>' for badge in shown)
+        )
         running = bool(progress.title)
         self._line.set_visibility(running)
         if running:

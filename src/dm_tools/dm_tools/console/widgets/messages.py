@@ -33,7 +33,6 @@ class DiagnosticsCard:
     """What the nodes say of their health, the worst first."""
 
     def __init__(self) -> None:
-        self._shown = ""
         with folded("Diagnostics"):
             self._place = ui.html("", sanitize=False).classes("scroll")
             self._place.props('tabindex="0" role="region" aria-label="Diagnostics"')
@@ -44,9 +43,7 @@ class DiagnosticsCard:
             f'<div class="faint">{_short(row.figures)}</div></div>'
             for row in diagnostic_rows(snapshot.diagnostics)
         ) or _empty("No node has reported its health yet.")
-        if content != self._shown:
-            self._shown = content
-            self._place.set_content(content)
+        self._place.set_content(content)
 
 
 class LogCard:
