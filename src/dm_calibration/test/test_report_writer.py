@@ -10,19 +10,22 @@ import pytest
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
-from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.procedure.plan import PlanKind, make_plan
+from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.report.report_writer import ReportWriter
 from dm_calibration.store.calibration_store import CalibrationStore
-from hysteretic_mirror import MIRROR
-from recorded_bench import recorded
+from hysteretic_mirror import lagging_bench
+from linear_mirror import make_mirror
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def calibration() -> Calibration:
-    outcome = recorded(PlanKind.POKES, PlanOptions())[1]
-    return calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("c1", 10**18))
+    """Of few actuators, whose report is soon drawn."""
+    mirror = make_mirror(rings=1)
+    outcome = Procedure(make_plan(PlanKind.POKES, mirror), mirror, lagging_bench(mirror)).run()
+    return calibrate(outcome, mirror=mirror, options=FitOptions(), provenance=Provenance("c1", 10**18))
 
 
 def test_a_stored_calibration_gets_its_report_beside_it(calibration: Calibration, tmp_path: Path) -> None:
