@@ -8,50 +8,16 @@ import numpy as np
 import pytest
 
 from dm_common.errors import Refusal
-from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopStep, StoppedLoop, converge, response_ratio
 from dm_controller.planning.target import FocusTarget, TargetError
 from dm_controller.solvers.base import Shape, Solver
 from dm_controller.solvers.registry import make_solver
-from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
-from perfect_calibration import perfect_model
+from linear_mirror import RADIUS
+from linear_plant import LIMITS, MODEL, LinearPlant
 
-LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().limits.pairs, dtype=np.intp), 2.0)
-MIRROR = LinearMirror(*hexagon())
-MODEL = perfect_model(MIRROR)
-
-
-class Plant:
-    """The linear mirror behind gains of its own, backlash, and a drift that follows the logarithm of time."""
-
-    def __init__(self, gain: float = 1.0, spread: float = 0.0, backlash: float = 0.0, drift: float = 0.0) -> None:
-        self.gains = gain * (1.0 + spread * np.random.default_rng(5).standard_normal(37))
-        self.backlash, self.drift = backlash, drift
-        self.position = np.zeros(37)
-        self.commands: list[np.ndarray] = []
-        self.time, self.began = 0.0, 0.0
-        self.first: np.ndarray = np.zeros(37)
-        self.disturb: dict[int, float] = {}  # map: added defocus, m
-        self.maps = 0
-
-    def apply(self, signals: np.ndarray) -> np.ndarray:
-        assert LIMITS.allow(signals)
-        if not self.commands:
-            self.began, self.first = self.time, signals
-        self.commands.append(signals)
-        self.position = np.clip(self.position, signals - self.backlash, signals + self.backlash)
-        return signals
-
-    def settle(self) -> bool:
-        self.time += 1.0
-        return True
-
-    def measure(self, label: str) -> Measurement:
-        self.maps += 1
-        moved = self.gains * (self.position + self.drift * math.log10(max(self.time - self.began, 0.1)) * self.first)
-        sag = MIRROR.sag(moved) + MIRROR.modes[:, 3] * self.disturb.get(self.maps, 0.0)
-        return MIRROR.measurement(sag, round(self.time * 1e9), sigma=np.zeros(21), residual_rms=0.0, valid_fraction=1.0)
+#: Gains that differ from actuator to actuator, about 1.
+SPREAD = np.random.default_rng(5).standard_normal(37)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +26,7 @@ def solver() -> Solver:
 
 
 def test_an_exact_mirror_takes_one_map(solver: Solver) -> None:
-    plant = Plant()
+    plant = LinearPlant()
     result = converge(solver, FocusTarget(0.02), plant)
     assert result.converged
     assert result.maps == plant.maps == len(plant.commands) == 1
@@ -69,21 +35,23 @@ def test_an_exact_mirror_takes_one_map(solver: Solver) -> None:
 
 @pytest.mark.parametrize("gain", [0.6, 0.85, 1.2, 1.5])
 def test_wrong_gains_are_corrected_within_five_maps(solver: Solver, gain: float) -> None:
-    result = converge(solver, FocusTarget(0.02), Plant(gain, spread=0.03), LoopOptions(1e-9, 5))
+    result = converge(solver, FocusTarget(0.02), LinearPlant(gain * (1.0 + 0.03 * SPREAD)), LoopOptions(1e-9, 5))
     errors = [step.max_zernike for step in result.steps]
     assert result.converged, errors
     assert result.best.max_zernike == min(errors) < 1e-2 * errors[0]
 
 
 def test_backlash_does_not_make_it_diverge(solver: Solver) -> None:
-    result = converge(solver, FocusTarget(-0.03), Plant(0.9, 0.05, backlash=0.05), LoopOptions(1e-9, 8))
+    result = converge(
+        solver, FocusTarget(-0.03), LinearPlant(0.9 * (1.0 + 0.05 * SPREAD), backlash=0.05), LoopOptions(1e-9, 8)
+    )
     errors = [step.max_zernike for step in result.steps]
     assert max(errors) == errors[0]
     assert result.best.max_zernike < 0.1 * errors[0]
 
 
 def test_the_map_limit_is_kept_and_reported(solver: Solver) -> None:
-    plant = Plant(0.8)
+    plant = LinearPlant(0.8)
     seen: list[LoopStep] = []
     result = converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 3), on_step=seen.append)
     assert not result.converged
@@ -93,7 +61,7 @@ def test_the_map_limit_is_kept_and_reported(solver: Solver) -> None:
 
 
 def test_the_best_command_is_kept_and_written_again(solver: Solver) -> None:
-    plant = Plant(0.9)
+    plant = LinearPlant(0.9)
     plant.disturb = {3: 5e-7}
     result = converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 3))
     assert result.best.map == 2
@@ -103,7 +71,7 @@ def test_the_best_command_is_kept_and_written_again(solver: Solver) -> None:
 
 
 def test_the_last_correction_may_stay_unmeasured(solver: Solver) -> None:
-    plant = Plant(0.8)
+    plant = LinearPlant(0.8)
     result = converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 2, correct_last=True))
     assert result.maps == plant.maps == 2
     assert len(plant.commands) == 3
@@ -113,7 +81,7 @@ def test_the_last_correction_may_stay_unmeasured(solver: Solver) -> None:
 
 
 def test_a_growing_error_halves_the_next_correction(solver: Solver) -> None:
-    grown = Plant()
+    grown = LinearPlant()
     grown.disturb = {2: 5e-6}
     steps = converge(solver, FocusTarget(0.01), grown, LoopOptions(1e-15, 3)).steps
     full = solver.correct(steps[1].signals, steps[1].error).signals - steps[1].signals
@@ -124,7 +92,7 @@ def test_a_growing_error_halves_the_next_correction(solver: Solver) -> None:
 def test_foreseen_creep_leaves_less(solver: Solver) -> None:
     left = {}
     for share in (0.0, 0.02):
-        plant = Plant(drift=0.02)
+        plant = LinearPlant(drift=0.02)
         creep = Creep.of_rate(share, np.zeros(37), lambda plant=plant: plant.time)  # type: ignore[misc]
         steps = converge(solver, FocusTarget(0.03), plant, LoopOptions(1e-15, 4), creep=creep).steps
         left[share] = steps[-1].max_zernike
@@ -132,7 +100,7 @@ def test_foreseen_creep_leaves_less(solver: Solver) -> None:
 
 
 def test_a_start_of_ones_own(solver: Solver) -> None:
-    plant = Plant()
+    plant = LinearPlant()
     start = np.full(37, 0.3)
     result = converge(solver, FocusTarget(0.01), plant, start=start)
     np.testing.assert_array_equal(plant.commands[0], start)
@@ -141,7 +109,7 @@ def test_a_start_of_ones_own(solver: Solver) -> None:
 
 
 def test_points_without_data_do_not_matter(solver: Solver) -> None:
-    class Holes(Plant):
+    class Holes(LinearPlant):
         def measure(self, label: str) -> Measurement:
             measured = super().measure(label)
             measured.sag[::9] = np.nan
@@ -151,14 +119,14 @@ def test_points_without_data_do_not_matter(solver: Solver) -> None:
 
 
 def test_cancelling_keeps_what_was_measured(solver: Solver) -> None:
-    plant = Plant(0.8)
+    plant = LinearPlant(0.8)
     with pytest.raises(StoppedLoop, match="cancelled after 2 maps") as caught:
         converge(solver, FocusTarget(0.02), plant, LoopOptions(1e-15, 9), cancelled=lambda: plant.maps == 2)
     assert len(caught.value.steps) == 2
 
 
 def test_failures_of_the_bench_pass_through(solver: Solver) -> None:
-    class Broken(Plant):
+    class Broken(LinearPlant):
         def measure(self, label: str) -> Measurement:
             raise Refusal(302, "no map")
 
@@ -167,7 +135,7 @@ def test_failures_of_the_bench_pass_through(solver: Solver) -> None:
 
 
 def test_maps_of_another_kind_are_refused(solver: Solver) -> None:
-    class Other(Plant):
+    class Other(LinearPlant):
         def measure(self, label: str) -> Measurement:
             measured = super().measure(label)
             object.__setattr__(measured, "sag", measured.sag[:100])
@@ -191,4 +159,4 @@ def test_bad_options_are_refused(solver: Solver) -> None:
     with pytest.raises(ValueError, match="max_maps = 0: must be at least 1"):
         LoopOptions(1e-9, 0)
     with pytest.raises(TargetError):
-        converge(solver, FocusTarget(200.0), Plant())
+        converge(solver, FocusTarget(200.0), LinearPlant())

@@ -11,9 +11,6 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_common.errors import Cancelled, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.observer import HysteresisTracker
-from dm_common.limits import Limits
-from dm_common.measurement import Measurement
-from dm_common.optics.zernike import TERM_RMS
 from dm_common.recipes import Recipe, RecipeError
 from dm_controller.converge.goals import UnreachableError, recipe_targets
 from dm_controller.converge.recipe_building import (
@@ -26,14 +23,12 @@ from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
-from linear_mirror import LinearMirror, hexagon, make_mirror
-from perfect_calibration import perfect_model
+from linear_plant import LIMITS, MODEL, LinearPlant
 from studies.comparison.compare import true_error
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
-LIMITS = Limits(-1.0, 1.0, np.asarray(make_mirror().limits.pairs, dtype=np.intp), 2.0)
 WAVELENGTH = 632.8e-9
 
 
@@ -100,50 +95,9 @@ def test_what_was_built_makes_the_shape_again(stand: Stand) -> None:
     assert max(errors) < WAVELENGTH / 400.0
 
 
-class LinearPlant:
-    """A linear mirror without hysteresis whose gains differ from its calibration; each map errs in low orders."""
-
-    def __init__(self, noise: float = 0.0) -> None:
-        self.mirror = LinearMirror(*hexagon())
-        self.gains = 1.0 + 0.03 * np.random.default_rng(2).standard_normal(37)
-        self.random = np.random.default_rng(4)
-        self.noise = noise
-        self.signals = np.zeros(37)
-        self.time = 0.0
-        self.calls: list[str] = []
-
-    def degauss(self) -> None:
-        self.calls.append("degauss")
-        self.signals = np.zeros(37)
-
-    def apply(self, signals: np.ndarray) -> np.ndarray:
-        assert LIMITS.allow(signals)
-        self.calls.append("apply")
-        self.signals = signals
-        return signals
-
-    def settle(self) -> bool:
-        self.time += 0.5
-        return True
-
-    def measure(self, label: str) -> Measurement:
-        self.calls.append("measure")
-        self.time += 0.5
-        mirror = self.mirror
-        sag = mirror.sag(self.gains * self.signals) + mirror.modes @ (
-            self.noise * self.random.standard_normal(21) / TERM_RMS
-        )
-        return mirror.measurement(sag, round(self.time * 1e9), sigma=np.zeros(21), residual_rms=0.0, valid_fraction=1.0)
-
-    def left(self, recipe: Recipe) -> float:
-        """Largest coefficient error that the recipe truly leaves, m."""
-        mirror = self.mirror
-        sag = mirror.sag(self.gains * recipe.effective)
-        wanted = FocusTarget(recipe.curvature).coefficients(perfect_model(mirror).aperture_radius)
-        return float(np.abs(mirror.fit_terms(sag) - wanted)[3:].max())
-
-
-LOOP = Planner(CalibratedMirror(perfect_model(LinearMirror(*hexagon())), LIMITS))
+#: Gains that are 3 % off.
+GAINS = 1.0 + 0.03 * np.random.default_rng(2).standard_normal(37)
+LOOP = Planner(CalibratedMirror(MODEL, LIMITS))
 
 
 def build(plant: LinearPlant, options: BuildOptions, curvature: float = 0.02) -> Recipe:
@@ -151,7 +105,7 @@ def build(plant: LinearPlant, options: BuildOptions, curvature: float = 0.02) ->
 
 
 def test_without_a_hysteresis_effective_signals_are_signals() -> None:
-    plant = LinearPlant()
+    plant = LinearPlant(GAINS)
     recipe = build(plant, BuildOptions(tolerance=1e-10))
     assert plant.left(recipe) < 1e-10
     assert recipe.max_zernike < 1e-10
@@ -159,7 +113,7 @@ def test_without_a_hysteresis_effective_signals_are_signals() -> None:
 
 
 def test_every_round_begins_with_a_degauss() -> None:
-    plant = LinearPlant(noise=1e-9)
+    plant = LinearPlant(GAINS, noise=1e-9)
     recipe = build(plant, BuildOptions(tolerance=1e-12, maps_max=12, average=4))
     assert plant.calls == 3 * ["degauss", "apply", *4 * ["measure"]]
     assert recipe.maps == 12
@@ -168,7 +122,7 @@ def test_every_round_begins_with_a_degauss() -> None:
 
 def test_the_next_shape_begins_with_what_the_last_ones_showed() -> None:
     """Gains that are 3 % off miss a shape by tens of nm; from the second shape on one round is enough."""
-    plant = LinearPlant(noise=0.1e-9)
+    plant = LinearPlant(GAINS, noise=0.1e-9)
     builder = RecipeBuilder(LOOP, plant, lambda: plant.time, BuildOptions(tolerance=2e-9))
     curvatures = (0.018, 0.019, 0.02)
     rounds = [(builder.build(FocusTarget(c)), plant.calls.count("degauss"))[1] for c in curvatures]
@@ -178,7 +132,7 @@ def test_the_next_shape_begins_with_what_the_last_ones_showed() -> None:
 
 
 def test_maps_are_averaged_as_the_noise_asks() -> None:
-    quiet, noisy = (LinearPlant(noise) for noise in (0.05e-9, 1e-9))
+    quiet, noisy = (LinearPlant(GAINS, noise) for noise in (0.05e-9, 1e-9))
     few, many = (build(plant, BuildOptions(tolerance=2e-9, maps_max=64, average=32)).maps for plant in (quiet, noisy))
     assert few <= 12 < many
 
@@ -187,22 +141,13 @@ def test_averaging_takes_the_noise_down() -> None:
     noise = 0.3e-9
     few, many = (
         np.median([plant.left(build(plant, BuildOptions(1e-12, maps, maps // 2))) for plant in plants])
-        for maps, plants in (
-            (4, [seeded(noise, k) for k in range(6)]),
-            (64, [seeded(noise, k) for k in range(6)]),
-        )
+        for maps, plants in ((maps, [LinearPlant(GAINS, noise, seed=100 + k) for k in range(6)]) for maps in (4, 64))
     )
     assert many < 0.5 * few
 
 
-def seeded(noise: float, seed: int) -> LinearPlant:
-    plant = LinearPlant(noise)
-    plant.random = np.random.default_rng(100 + seed)
-    return plant
-
-
 def test_cancelling_stops_between_two_maps() -> None:
-    plant = LinearPlant()
+    plant = LinearPlant(GAINS)
     builder = RecipeBuilder(LOOP, plant, lambda: plant.time, cancelled=lambda: plant.calls.count("measure") == 3)
     with pytest.raises(Cancelled):
         builder.build(FocusTarget(0.02))
@@ -229,7 +174,7 @@ def test_a_shape_that_only_the_law_denies_is_told(stand: Stand) -> None:
     weaker = Planner(LOOP.mirror, stand.loop.hysteresis)
     assert weaker.hysteresis is not None
     weaker.law = replace(weaker.hysteresis.law.scaled(0.05), creep_rate=0.0)
-    plant = LinearPlant()
+    plant = LinearPlant(GAINS)
     with pytest.raises(UnreachableError, match=r"actuator \d+ stands at its limit"):
         RecipeBuilder(weaker, plant, lambda: plant.time).build(FocusTarget(0.02))
     assert "measure" not in plant.calls
@@ -245,7 +190,7 @@ def test_bad_options_are_refused() -> None:
 
 
 def test_added_terms_have_no_recipe() -> None:
-    plant = LinearPlant()
+    plant = LinearPlant(GAINS)
     with pytest.raises(RecipeError, match="zernike"):
         RecipeBuilder(LOOP, plant, lambda: plant.time).build(FocusTarget(0.0, 0.0, (1e-9,) * 21))
     assert not plant.calls
