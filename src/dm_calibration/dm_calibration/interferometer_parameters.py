@@ -26,7 +26,7 @@ PARAMETERS = (
     Parameter("watch_folder", text(""), "Folder in which the instrument saves its maps; empty = watch nothing."),
     Parameter(
         "file_pattern",
-        texts(["*.dat", "*.datx", "*.asc", "*.xyz"]),
+        texts(["*.dat", "*.datx", "*.asc", "*.xyz", "*.fits", "*.h5"]),
         "Names of the files to take from watch_folder, as shell patterns.",
     ),
     Parameter("stable_time", real(0.5, 0.02, 3600.0, "s"), "Time for which size and time of a file must stand still."),
@@ -110,7 +110,8 @@ PARAMETERS = (
     Parameter(
         "xyz_unit",
         text("", choices=("", *XYZ_UNITS)),
-        "Unit of the values in .xyz files, which do not tell it; empty = refuse them.",
+        "Unit of the values in .xyz files, which do not tell it, and in .fits files without BUNIT; empty = refuse "
+        "them.",
         live=True,
     ),
     Parameter(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -153,3 +154,61 @@ def disc_counts(size: int, amplitude: int = 1000, seed: int = 0) -> NDArray[np.i
     noise = np.random.default_rng(seed).integers(-3, 4, (size, size))
     counts = np.rint(amplitude * (x**2 + y**2) + 0.1 * amplitude * x).astype(np.int64) + noise
     return np.where(x**2 + y**2 <= 1, counts, NO_DATA)
+
+
+def fits_bytes(values: NDArray[Any], checksum: bool = True, **cards: Any) -> bytes:
+    """A FITS file of `values` (height, width), row 0 = top; a card given as None is left out."""
+    kinds = {"u1": 8, "i2": 16, "i4": 32, "f4": -32, "f8": -64}
+    height, width = values.shape
+    found: dict[str, Any] = {
+        "SIMPLE": True,
+        "BITPIX": kinds[f"{values.dtype.kind}{values.dtype.itemsize}"],
+        "NAXIS": 2,
+        "NAXIS1": width,
+        "NAXIS2": height,
+        "BUNIT": "nm",
+        "WAVELEN": WAVELENGTH,
+        "PUPLSCAL": 24e-6,
+        **cards,
+    }
+    if checksum:
+        found["CHECKSUM"] = "0" * 16
+    lines = []
+    for name, value in found.items():
+        if value is not None:
+            plain = "T" if value is True else repr(value)
+            text = f"'{value:8}'".ljust(20) if isinstance(value, str) else plain.rjust(20)
+            lines.append(f"{name:8}= {text} / as the standard has it".ljust(80)[:80])
+    header = "".join([*lines, "END".ljust(80)]).encode()
+    data = values[::-1].astype(values.dtype.newbyteorder(">")).tobytes()
+    content = header.ljust(-(-len(header) // 2880) * 2880) + data.ljust(-(-len(data) // 2880) * 2880, b"\0")
+    return content.replace(b"0" * 16, _checksum(content), 1) if checksum else content
+
+
+def _checksum(content: bytes) -> bytes:
+    """The sixteen characters that make the ones' complement sum of `content`, which has zeros for them, all ones."""
+    total = sum(int.from_bytes(content[at : at + 4], "big") for at in range(0, len(content), 4))
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    columns = []
+    for byte in (total ^ 0xFFFFFFFF).to_bytes(4, "big"):
+        parts = [byte // 4 + 48 + (byte % 4 if k == 0 else 0) for k in range(4)]
+        while any(58 <= part <= 64 or 91 <= part <= 96 for part in parts):
+            for k in (0, 2):  # no punctuation: up with one, down with its neighbour
+                if any(58 <= part <= 64 or 91 <= part <= 96 for part in parts[k : k + 2]):
+                    parts[k], parts[k + 1] = parts[k] + 1, parts[k + 1] - 1
+        columns.append(parts)
+    text = bytes(columns[byte][k] for k in range(4) for byte in range(4))
+    return text[-1:] + text[:-1]
+
+
+def h5_bytes(waves: NDArray[Any], wavelength: str = "632.8 nm", xpix: str | None = "0.024 mm") -> bytes:
+    """A file of 4Sight of `waves` (height, width), NaN = no data."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        group = file.create_group("measurement0/genraw")
+        group["data"] = np.where(np.isfinite(waves), waves, np.finfo(np.float32).max).astype("<f4")
+        group.attrs["wavelength"] = np.bytes_(wavelength)
+        if xpix is not None:
+            group.attrs["xpix"] = np.bytes_(xpix)
+    return buffer.getvalue()

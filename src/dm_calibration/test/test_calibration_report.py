@@ -19,8 +19,9 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
+from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.report import content, content_hysteresis
-from dm_calibration.report.certificate import certificate, curvatures, doubts, keep_people, people
+from dm_calibration.report.certificate import certificate, curvatures, doubts, keep_people, next_calibration, people
 from dm_calibration.report.document import Section, Table
 from dm_calibration.report.figures import on_disc
 from dm_calibration.report.html_page import one_html
@@ -128,6 +129,33 @@ def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibra
     dead = replace(calibration.fit, grades=np.array([2] + [0] * 36, dtype=np.uint8))
     assert "actuators 1 are dead" in doubts(replace(calibration, fit=dead))[0]
     assert people(tmp_path / "none.json") == {}
+
+
+def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[Check]:
+    """A check every three days, whose error grows by `growth`, m a day."""
+    start, days = calibration.created_ns * 1e-9, 3.0 * np.arange(1, count + 1)
+    scatter = 1e-10 * np.random.default_rng(0).standard_normal(count)
+    return [
+        Check(start + 86400.0 * day, 1, 1e-9 + growth * day + more, 1e-9, 1.0, 1e-3, 4, 2e-10 * day)
+        for day, more in zip(days, scatter, strict=True)
+    ]
+
+
+def test_checks_say_what_drifts_and_when_to_calibrate_next(calibration: Calibration, tmp_path: Path) -> None:
+    known = replace(calibration, hysteresis=HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), 5e-9, 0.05, 120, ()))
+    start = known.created_ns * 1e-9
+    # From 1 nm by 0.1 nm a day to 5 nm: 40 days; without growth thirty days after the last check that agreed.
+    for growth, days, reason in ((1e-10, 40.0, "the error grows by +3"), (0.0, 24 + 30.0, "no growth")):
+        when, text = next_calibration(checks_of(known, growth), 5e-9, start)
+        assert (when - start) / 86400.0 == pytest.approx(days, abs=3.0) and reason in text
+    assert "too few checks" in next_calibration(checks_of(known, 1e-10, 3), 5e-9, start)[1]
+    for check in checks_of(known, 1e-10):
+        append_check(tmp_path / f"{known.id}.checks.csv", check)
+    file = CalibrationStore(tmp_path).save(known)
+    page = write_report(known, tmp_path / "out", file).html.read_text()
+    section = page[page.index("<h2>Checks since") : page.index("<h2>Summary")]
+    assert "8 maps were compared" in section and "0.10% (4)" in section and "Calibrate next by 2023-12-2" in section
+    assert section.count("<img ") == 1
 
 
 @pytest.mark.parametrize("lines", range(0, 60, 4))

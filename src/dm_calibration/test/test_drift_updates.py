@@ -14,6 +14,7 @@ from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
+from dm_calibration.recalibration.check_log import read_checks
 from dm_calibration.recalibration.drift import Drift, DriftRates
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -352,3 +353,18 @@ def test_a_rate_of_zero_keeps_the_gains(bench: SteadyMirror, made: Made, tmp_pat
         updates.take(bench.measure("later", days=100.0), bench.settled())
         widths.append(np.diag(known(updates).covariance)[: bench.mirror.actuators].max())
     assert widths[0] < 0.1 * widths[1]
+
+
+def test_every_check_is_in_the_log(bench: SteadyMirror, updates: RecalibrationManager, tmp_path: Path) -> None:
+    updates.take(bench.measure("good"), bench.settled())
+    updates.take(bench.measure("good"), bench.settled(), dry_run=True)
+    bench.drift(0.2)
+    updates.take(bench.measure("bad"), bench.settled())
+    (file,) = tmp_path.glob("*.checks.csv")
+    with file.open("a") as stream:
+        stream.write("1.7e9,1,3e-9,2e")  # power was lost
+    good, bad = read_checks(file)
+    assert (good.accepted, bad.accepted) == (1, 0) and good.time < bad.time == pytest.approx(1e-9 * bench.clock_ns)
+    assert good.max_zernike < 2e-9 < bad.max_zernike and good.surprise < 2.0 < bad.surprise
+    assert 1 <= good.actuator <= bench.mirror.actuators
+    assert read_checks(tmp_path / "none.csv") == []

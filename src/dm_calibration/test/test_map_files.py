@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dm_calibration.map_files import MapFileError, NoValidPixelsError, read_map
-from map_fixtures import NO_DATA, ORACLE_MISSING, asc_bytes, dat_bytes, disc_counts, text_header, xyz_bytes
+from map_fixtures import NO_DATA, ORACLE_MISSING, asc_bytes, dat_bytes, disc_counts, fits_bytes, text_header, xyz_bytes
 
+UNSEALED = fits_bytes(np.arange(6.0).reshape(2, 3), checksum=False)
 COUNTS = np.array([[0, 1000, -2000], [NO_DATA, 123456, 2**31 - 1]])
 W32 = struct.unpack(">f", struct.pack(">f", 632.8e-9))[0]  # as a 32-bit file stores it
 
@@ -234,7 +235,7 @@ def test_xyz_that_is_not_whole_is_refused(tmp_path: Path, change: tuple[bytes, b
 
 @settings(max_examples=150, deadline=None)
 @given(
-    which=st.sampled_from([dat_bytes(COUNTS), asc_bytes(COUNTS), xyz_bytes(XYZ)]),
+    which=st.sampled_from([dat_bytes(COUNTS), asc_bytes(COUNTS), xyz_bytes(XYZ), UNSEALED]),
     changes=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=6),
     cut=st.integers(0, 10_000),
 )

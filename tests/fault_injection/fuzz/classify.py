@@ -3,8 +3,9 @@
 A file that is refused with the reader's own error is well. One that is read must give
 
 * `intact`: the map of the intact file, in every pixel, wavelength and pitch; or
-* `other_samples`: another map only in pixels whose stored samples the damage changed. `.dat`, `.datx`, `.asc` and
-  `.xyz` have no checksum: a changed sample that is still a number the format allows is a legal other map; or
+* `other_samples`: another map only in pixels whose stored samples the damage changed. `.dat`, `.datx`, `.asc`, `.xyz`
+  and `.h5` have no checksum, that of `.fits` is a sum in any order: a changed sample that is still a number the format
+  allows is a legal other map; or
 * `other_header`: another scale, sign, wavelength or pitch, where the damage changed a header value that tells just
   that, for which the format stores no second witness, to another value inside its allowed range. `wavelength.expected`
   of the interferometer catches the wavelength; the others are in the published map info.
@@ -93,7 +94,8 @@ def changed_values(
     changed = old != new
     fields = {name for name, places in file.places.items() if any(changed[start:end].any() for start, end in places)}
     ((start, end),) = file.places["samples"]
-    return fields, changed[start:end].reshape(*shape, file.sample_bytes).any(axis=-1)
+    touched = changed[start:end].reshape(*shape, file.sample_bytes).any(axis=-1)
+    return fields, touched[::-1] if file.format == "fits" else touched  # whose first row is the bottom
 
 
 def _changed_text(file: ReferenceFile, content: bytes, shape: tuple[int, ...]) -> tuple[set[str], NDArray[np.bool_]]:

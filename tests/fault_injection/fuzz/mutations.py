@@ -51,9 +51,9 @@ def mutate(file: ReferenceFile, seed: int, number: int) -> Mutation:
         kinds += [dat_field] * 6
     elif file.suffix in (".asc", ".xyz"):
         kinds += [text_word] * 6 + [text_lines] * 2
-    else:
+    elif file.format != "fits":
         kinds += [structure_bits] * 8 + [hdf5_structure]
-        if file.format == "datx":
+        if file.format in ("datx", "h5"):
             kinds += [value_bits] * 2
     mutation = random.choice(kinds)
     outcome = mutation(file, random)

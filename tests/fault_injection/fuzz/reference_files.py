@@ -28,6 +28,7 @@ from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_simulation.interferometer.zygo_files import encode_dat, encode_datx
+from map_fixtures import fits_bytes, h5_bytes
 
 WAVELENGTH = 632.8e-9
 PITCH = 24e-6
@@ -212,7 +213,31 @@ def _calibration() -> ReferenceFile:
     return ReferenceFile("calibration", ".h5", content)
 
 
-FORMATS = {"dat": _dat, "datx": _datx, "asc": _asc, "xyz": _xyz, "calibration": _calibration}
+def _fits() -> ReferenceFile:
+    content = fits_bytes(1e9 * surface())  # with a checksum
+    start = len(content) - 2 * 2880
+    return ReferenceFile("fits", ".fits", content, {"samples": ((start, start + 8 * surface().size),)}, 8)
+
+
+def _h5() -> ReferenceFile:
+    content = h5_bytes(surface() / WAVELENGTH)
+    with h5py.File(io.BytesIO(content), "r") as file:
+        data = file["measurement0/genraw/data"]
+        samples = data.id.get_offset(), data.id.get_offset() + data.id.get_storage_size()
+    texts = {"wavelength": b"632.8 nm", "pitch": b"0.024 mm"}
+    places = {"samples": (samples,)} | {name: _occurrences(content, text, samples) for name, text in texts.items()}
+    return ReferenceFile("h5", ".h5", content, places, 4)
+
+
+FORMATS = {
+    "dat": _dat,
+    "datx": _datx,
+    "asc": _asc,
+    "xyz": _xyz,
+    "fits": _fits,
+    "h5": _h5,
+    "calibration": _calibration,
+}
 
 
 def reference_file(name: str) -> ReferenceFile:

@@ -103,6 +103,8 @@ class Ingest:
             return self._measure(source, settings)
 
     def _measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:
+        if not source.wavelength:  # the file does not tell it
+            source = replace(source, wavelength=settings.wavelength)
         difference = abs(source.wavelength - settings.wavelength)
         if settings.wavelength and difference > settings.wavelength_tolerance:
             raise MapRejectedError(

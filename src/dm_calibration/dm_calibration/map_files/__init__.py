@@ -11,6 +11,7 @@ from dm_calibration.map_files import dat
 from dm_calibration.map_files.dat import is_dat, parse_dat
 from dm_calibration.map_files.datx import is_datx
 from dm_calibration.map_files.datx_structure import check_end
+from dm_calibration.map_files.fits import is_fits, parse_fits
 from dm_calibration.map_files.surface_map import MapFileError, NoValidPixelsError, SurfaceMap
 from dm_calibration.map_files.text_maps import XYZ_TITLE, XYZ_UNITS, is_text, parse_asc, parse_xyz
 from dm_calibration.store.hdf5_sandbox import SandboxError, read_in_sandbox
@@ -24,13 +25,14 @@ _START_BYTES = 4096
 
 
 def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> SurfaceMap:
-    """Read a surface map from a ZYGO `.dat`, `.asc`, `.xyz` or `.datx` file.
+    """Read a surface map from a ZYGO `.dat`, `.asc`, `.xyz` or `.datx` file, a FITS file, or an `.h5` of 4Sight.
 
     The format is found from the content; the suffix matters only between the two text formats, whose titles are
     sometimes mixed up.
 
     Args:
-        xyz_unit: unit of the values of an `.xyz` file, one of XYZ_UNITS; other formats know theirs.
+        xyz_unit: unit of the values of an `.xyz` file, one of XYZ_UNITS, and of a FITS file without BUNIT; other
+            formats know theirs.
 
     Raises:
         MapFileError: not a whole, readable map; the message names the file, the field, its value and what is allowed.
@@ -85,9 +87,10 @@ def _read(path: Path) -> bytes:
         if status.st_size > MAX_FILE_BYTES:
             raise MapFileError(f"file length = {status.st_size} bytes: must be at most {MAX_FILE_BYTES}")
         start = file.read(_START_BYTES)
-        if not (_agrees(start, status.st_size) or is_text(start)):
+        if not (_agrees(start, status.st_size) or is_text(start) or is_fits(start)):
             raise MapFileError(
-                f"begins with bytes {start[:8].hex(' ') or '(none)'}: not a ZYGO .dat, .datx, .asc or .xyz file"
+                f"begins with bytes {start[:8].hex(' ') or '(none)'}: not a ZYGO .dat, .datx, .asc or .xyz file, no "
+                "FITS file and no .h5 of 4Sight"
             )
         file.seek(0)
         return file.read(status.st_size)
@@ -103,6 +106,8 @@ def _parse(content: bytes, suffix: str, xyz_unit: str | None) -> SurfaceMap:
         return parse_dat(content)
     if is_datx(content):
         return _parse_datx(content)
+    if is_fits(content):
+        return parse_fits(content, xyz_unit)
     if content.lstrip().startswith(XYZ_TITLE) or suffix == ".xyz":
         return parse_xyz(content, xyz_unit)
     return parse_asc(content)

@@ -14,26 +14,22 @@ from dm_calibration.map_files.datx_structure import (
     SIGNATURE,
     as_text,
     check_end,
-    check_place,
-    check_storage,
-    read_values,
+    object_at,
+    read_heights,
 )
+from dm_calibration.map_files.four_d import GROUP as FOUR_D
+from dm_calibration.map_files.four_d import parse_four_d
 from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
     check_factor,
     check_heights,
     check_pitch,
-    check_size,
     check_wavelength,
-    no_valid_pixels,
 )
 
 #: Units of length a surface may be stored in, as m. "Fringes" is scaled by the optical factors instead.
 _LENGTHS = {"nanometers": 1e-9, "micrometers": 1e-6, "millimeters": 1e-3, "meters": 1.0, "angstroms": 1e-10}
-
-#: Types that heights are stored in; a file whose type description is damaged has another.
-_HEIGHT_TYPES = ("<f8", "<f4", "<i4", "<i2", "<u4", "<u2", "<i8", "<u8")
 
 #: "No Data" lies far beyond any height; Mx stores the largest double.
 _NO_DATA_LEAST = 1e30
@@ -54,7 +50,7 @@ def is_datx(start: bytes) -> bool:
 
 
 def parse_datx(content: bytes) -> SurfaceMap:
-    """Parse a whole `.datx` file.
+    """Parse a whole `.datx` file, or one of 4Sight.
 
     The file is read from memory, and links and storage that lead out of it are refused, so nothing outside is touched.
 
@@ -64,7 +60,7 @@ def parse_datx(content: bytes) -> SurfaceMap:
     try:
         check_end(content, len(content))
         with h5py.File(io.BytesIO(content), "r") as file:
-            return _parse(file, content)
+            return parse_four_d(file, content) if FOUR_D in file else _parse(file, content)
     except MapFileError:
         raise
     except Exception as error:  # h5py raises whatever a damaged file provokes: OSError, KeyError, RuntimeError, ...
@@ -73,14 +69,7 @@ def parse_datx(content: bytes) -> SurfaceMap:
 
 def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     metadata = _metadata(file)
-    surface = _object(file, _path(metadata, "Surface"))
-    if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
-        raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
-    if surface.dtype.str not in _HEIGHT_TYPES or not surface.id.get_type().equal(h5py.h5t.py_create(surface.dtype)):
-        raise MapFileError(f"{surface.name}: type {surface.dtype}: must be a plain little-endian number")
-    height, width = surface.shape
-    check_size(width, height)
-    check_storage(surface, len(content))
+    surface = object_at(file, _path(metadata, "Surface"))
     extra = _extra_attributes(file, metadata)
 
     wavelength = check_wavelength(_required(surface, "Wavelength", _extra_number(extra, "Wavelength")))
@@ -88,19 +77,10 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     no_data = _required(surface, "No Data")
     if not (math.isnan(no_data) or no_data >= _NO_DATA_LEAST):
         raise MapFileError(f"{surface.name}: No Data = {no_data:g}: must be NaN or at least {_NO_DATA_LEAST:g}")
-    check_place(surface, content, no_data)
     pitch = _pitch(surface, extra)
     _check_witnesses(surface, extra, wavelength)
-
-    sag = read_values(surface)
-    invalid = ~np.isfinite(sag)
-    if not math.isnan(no_data):
-        with np.errstate(invalid="ignore"):
-            invalid |= sag >= no_data
-    if invalid.all():
-        raise no_valid_pixels(sag.shape)
+    sag = read_heights(surface, content, no_data)
     sag *= scale
-    sag[invalid] = math.nan
     check_heights(sag)
 
     software = " ".join(filter(None, (_extra_text(extra, "Software Info Name"), _extra_text(extra, "System Type"))))
@@ -133,7 +113,7 @@ def _required(surface: h5py.Dataset, name: str, *otherwise: float | None) -> flo
 
 def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
     """The table /MetaData as {(source, link): destination}."""
-    table = _object(file, "/MetaData")
+    table = object_at(file, "/MetaData")
     if not isinstance(table, h5py.Dataset) or len(table.dtype.names or ()) != 3:
         raise MapFileError("/MetaData: must be a table of Source, Link and Destination")
     if not 0 < (table.size or 0) <= _LINKS_MAX or table.external or table.is_virtual:
@@ -151,19 +131,6 @@ def _path(metadata: dict[tuple[str, str], str], what: str) -> str:
     return node
 
 
-def _object(file: h5py.File, path: str) -> Any:
-    """The object at `path`, reached through hard links only: others may lead out of the file."""
-    node: Any = file
-    for name in path.strip("/").split("/"):
-        link = node.get(name, getlink=True) if isinstance(node, h5py.Group) else None
-        if link is None:
-            raise MapFileError(f"{path}: missing from the file")
-        if not isinstance(link, h5py.HardLink):
-            raise MapFileError(f"{path}: '{name}' is a link elsewhere; links are not followed")
-        node = node[name]
-    return node
-
-
 def _number(node: Any, name: str) -> float | None:
     if name not in node.attrs:
         return None
@@ -176,10 +143,10 @@ def _number(node: Any, name: str) -> float | None:
 def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> dict[str, Any]:
     """What /Attributes/<id> tells, by the last part of each name without the ending ':Value'."""
     try:
-        node = _object(file, _path(metadata, "Attributes"))
+        node = object_at(file, _path(metadata, "Attributes"))
     except MapFileError:  # older files do not list it in /MetaData
         try:
-            node = next(iter(_object(file, "/Attributes").values()), None)
+            node = next(iter(object_at(file, "/Attributes").values()), None)
         except MapFileError:
             node = None
     if node is None:

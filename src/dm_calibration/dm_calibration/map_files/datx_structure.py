@@ -1,4 +1,4 @@
-"""The structure of a `.datx` file, checked before memory is claimed for what it promises, and its values."""
+"""The structure of an HDF5 map, checked before memory is claimed for what it promises, and its values."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.map_files.surface_map import MapFileError
+from dm_calibration.map_files.surface_map import MapFileError, check_size, no_valid_pixels
 
 SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 
@@ -18,6 +18,9 @@ SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 #: specification, section II.A).
 _SIZE_OF_OFFSETS = {0: 13, 1: 13, 2: 9, 3: 9}
 _END_ADDRESS = {0: 40, 1: 44, 2: 28, 3: 28}
+
+#: Types that heights are stored in; a file whose type description is damaged has another.
+_HEIGHT_TYPES = ("<f8", "<f4", "<i4", "<i2", "<u4", "<u2", "<i8", "<u8")
 
 #: Deflate, the densest filter that Mx uses, cannot shrink data further [bytes per byte].
 _DENSEST = 1032
@@ -46,7 +49,52 @@ def check_end(start: bytes, length: int) -> None:
         raise MapFileError(f"file length = {length} bytes: must be {end}; the file is {problem}")
 
 
-def check_storage(surface: h5py.Dataset, length: int) -> None:
+def object_at(file: h5py.File, path: str) -> Any:
+    """The object at `path`, reached through hard links only: others may lead out of the file.
+
+    Raises:
+        MapFileError: it is missing, or a link elsewhere.
+    """
+    node: Any = file
+    for name in path.strip("/").split("/"):
+        link = node.get(name, getlink=True) if isinstance(node, h5py.Group) else None
+        if link is None:
+            raise MapFileError(f"{path}: missing from the file")
+        if not isinstance(link, h5py.HardLink):
+            raise MapFileError(f"{path}: '{name}' is a link elsewhere; links are not followed")
+        node = node[name]
+    return node
+
+
+def read_heights(surface: Any, content: bytes, no_data: float) -> NDArray[np.float64]:
+    """(height, width) the values of a map, NaN where there is no data, all of it checked against the whole file.
+
+    Args:
+        no_data: values from this one on are no data; NaN = those that are not finite only.
+
+    Raises:
+        MapFileError: no table of numbers, or one that does not stand in the file as it is told.
+        NoValidPixelsError: every pixel is invalid.
+    """
+    if not isinstance(surface, h5py.Dataset) or surface.ndim != 2 or surface.dtype.kind not in "fiu":
+        raise MapFileError(f"{surface.name}: must be a two-dimensional table of numbers")
+    if surface.dtype.str not in _HEIGHT_TYPES or not surface.id.get_type().equal(h5py.h5t.py_create(surface.dtype)):
+        raise MapFileError(f"{surface.name}: type {surface.dtype}: must be a plain little-endian number")
+    check_size(surface.shape[1], surface.shape[0])
+    _check_storage(surface, len(content))
+    _check_place(surface, content, no_data)
+    heights = _read_values(surface)
+    invalid = ~np.isfinite(heights)
+    if not math.isnan(no_data):
+        with np.errstate(invalid="ignore"):
+            invalid |= heights >= no_data
+    if invalid.all():
+        raise no_valid_pixels(heights.shape)
+    heights[invalid] = math.nan
+    return heights
+
+
+def _check_storage(surface: h5py.Dataset, length: int) -> None:
     """Compare what the map promises with what stands in the file of `length` bytes.
 
     Raises:
@@ -73,7 +121,7 @@ def check_storage(surface: h5py.Dataset, length: int) -> None:
         )
 
 
-def check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
+def _check_place(surface: h5py.Dataset, content: bytes, no_data: float) -> None:
     """The file tells only once where its values stand; a damaged address lets them begin too early or too late.
 
     Where the map has corners without data, runs of "No Data" then stand within a row before the place, or behind it.
@@ -108,7 +156,7 @@ def _other_values(surface: h5py.Dataset, first: int, last: int) -> bool:
     return any(found)
 
 
-def read_values(surface: h5py.Dataset) -> NDArray[np.float64]:
+def _read_values(surface: h5py.Dataset) -> NDArray[np.float64]:
     """The stored values as (height, width) float64.
 
     Raises:

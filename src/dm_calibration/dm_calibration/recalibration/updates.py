@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import same_points
 from dm_calibration.procedure.applied_history import MapNotUsableError, SettledState
 from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
+from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
+from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.recalibration.displaced import described
 from dm_calibration.recalibration.drift import Drift, DriftRates
 from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter
@@ -207,6 +210,9 @@ class RecalibrationManager:
             with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
                 write_updates(self._file(calibration.id), calibration.id, self._basis, changed)
             self._updates = changed
+            with suppress(OSError):  # the update itself is stored
+                shown = Check.of(measured.stamp_ns, accepted, comparison, changed)
+                append_check(self._file(calibration.id, LOG_SUFFIX), shown)
             self._disagreement = 0.0 if accepted else max(self._disagreement, comparison.max_zernike)
             if accepted:
                 if not repeat:
@@ -236,8 +242,8 @@ class RecalibrationManager:
         same = abs(settled.since - self._since) < SAME_MOVE_S and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
         return self._repeat if same else 0
 
-    def _file(self, identifier: str) -> Path:
-        return self.folder / f"{identifier}{SUFFIX}"
+    def _file(self, identifier: str, suffix: str = SUFFIX) -> Path:
+        return self.folder / f"{identifier}{suffix}"
 
 
 def check_map(measured: Measurement, calibration: Calibration, options: UpdateOptions) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
+from dm_calibration.recalibration.check_log import SUFFIX, read_checks
 from dm_calibration.report import certificate, content, content_fit, content_hysteresis
 from dm_calibration.report.document import Section
 from dm_calibration.report.html_page import one_html
@@ -33,9 +34,11 @@ def sections(calibration: Calibration, file: Path | None = None) -> list[Section
         OSError: `file` cannot be read.
     """
     left = residuals(calibration)
+    checks = read_checks(file.with_name(f"{calibration.id}{SUFFIX}")) if file is not None else []
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
     return [
-        certificate.certificate(calibration, certificate.people()),
+        certificate.certificate(calibration, certificate.people(), checks),
+        *([certificate.checks_section(calibration, checks)] if checks else []),
         content.summary(calibration),
         content.provenance(calibration),
         content.cautions(calibration),

@@ -1,0 +1,168 @@
+"""Maps in FITS files: the primary image, its heights in the unit that BUNIT tells (docs/map-files.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.map_files.surface_map import (
+    MapFileError,
+    SurfaceMap,
+    check_heights,
+    check_pitch,
+    check_size,
+    check_wavelength,
+    no_valid_pixels,
+)
+
+CARD, BLOCK = 80, 2880
+_TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
+#: How programs write the units of `_METRES`, beside these themselves and their plurals.
+_SPOKEN = {"meter": "m", "metre": "m", "millimeter": "mm", "micron": "um", "micrometer": "um", "nanometer": "nm"}
+#: Pitches along x and y may differ by this much before pixels count as not square.
+_SQUARE_TOLERANCE = 0.01
+
+Header = Mapping[str, Any]
+
+
+def is_fits(start: bytes) -> bool:
+    """Whether the first bytes of a file are the first card of a FITS file."""
+    return start[:30].split() == [b"SIMPLE", b"=", b"T"]
+
+
+def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
+    """Parse the primary image of a whole FITS file; its heights must be surface sag, as they stand.
+
+    Args:
+        unit: of the values where there is no BUNIT: m, mm, um, nm or angstrom; None = not known.
+
+    Raises:
+        MapFileError: not a whole map with a unit; the message names the keyword.
+    """
+    header, start = _header(content)
+    width, height, kind = _layout(header)
+    size = check_size(width, height) * np.dtype(kind).itemsize
+    end = start + -(-size // BLOCK) * BLOCK
+    if len(content) < end or len(content) % BLOCK:
+        raise MapFileError(f"file length = {len(content)} bytes: must be {end}, or more by whole blocks of {BLOCK}")
+    if any(content[start + size : end]):
+        raise MapFileError(f"NAXIS1 x NAXIS2 = {width} x {height}: the values go on behind so many")
+    if "CHECKSUM" in header and _sum(content[:end]) not in (0, 0xFFFFFFFF):
+        raise MapFileError("CHECKSUM does not agree with the content: the file is damaged")
+    stored = np.frombuffer(content, kind, width * height, start).reshape(height, width)[::-1]  # row 1 = bottom
+    metres = _unit(str(header.get("BUNIT", "")) or unit)
+    sag = stored * (_real(header, "BSCALE", 1.0) * metres) + _real(header, "BZERO", 0.0) * metres
+    if stored.dtype.kind != "f" and "BLANK" in header:
+        sag[stored == header["BLANK"]] = math.nan
+    sag[~np.isfinite(sag)] = math.nan
+    if np.isnan(sag).all():
+        raise no_valid_pixels(sag.shape)
+    check_heights(sag)
+    wavelength = _real(header, "WAVELEN", 0.0)
+    return SurfaceMap(
+        sag=sag,
+        wavelength=check_wavelength(wavelength) if wavelength else 0.0,
+        pitch=_pitch(header),
+        format="fits",
+        instrument=str(header.get("INSTRUME", "")),
+        part_name=str(header.get("OBJECT", "")),
+        time_stamp=_time(str(header.get("DATE-OBS", ""))),
+    )
+
+
+def _header(content: bytes) -> tuple[Header, int]:
+    """The values by their keywords, and where the data begin."""
+    found: dict[str, Any] = {}
+    for at in range(0, len(content) - CARD + 1, CARD):
+        card = content[at : at + CARD].decode("latin-1")
+        if not card.isascii() or not card.isprintable():
+            raise MapFileError(f"header: card {at // CARD + 1} is no text")
+        keyword = card[:8].rstrip()
+        if keyword == "END" and not card[8:].strip():
+            return found, -(-(at + CARD) // BLOCK) * BLOCK
+        if card[8:10] == "= ":
+            if keyword in found:
+                raise MapFileError(f"{keyword} is there twice")
+            found[keyword] = _value(card[10:].strip(), keyword)
+    raise MapFileError("header: no END; the file is truncated")
+
+
+def _value(text: str, keyword: str) -> Any:
+    if text.startswith("'"):
+        return text[1:].replace("''", "\0").partition("'")[0].replace("\0", "'").strip()
+    text = text.partition("/")[0].strip()
+    if text in ("T", "F", ""):
+        return text == "T" if text else ""
+    for kind in (int, float):
+        try:
+            return kind(text.replace("D", "E"))
+        except ValueError:
+            continue
+    raise MapFileError(f"{keyword} = {text!r}: must be a number, a text in quotes, T or F")
+
+
+def _layout(header: Header) -> tuple[int, int, str]:
+    """Width, height and type of the image."""
+    for name, allowed in (("BITPIX", _TYPES), ("NAXIS", (2,))):
+        if header.get(name) not in allowed:
+            raise MapFileError(f"{name} = {header.get(name)}: must be one of {', '.join(map(str, allowed))}")
+    sizes = [header.get(name) for name in ("NAXIS1", "NAXIS2")]
+    if not all(type(size) is int for size in sizes):
+        raise MapFileError(f"NAXIS1, NAXIS2 = {sizes}: must be whole numbers")
+    return int(sizes[0] or 0), int(sizes[1] or 0), _TYPES[header["BITPIX"]]
+
+
+def _real(header: Header, name: str, otherwise: float) -> float:
+    value = header.get(name, otherwise)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise MapFileError(f"{name} = {value!r}: must be a finite number")
+    return float(value)
+
+
+def _unit(text: str | None, name: str = "BUNIT") -> float:
+    """m per unit."""
+    if not text:
+        raise MapFileError(f"{name} is missing: the values have no unit; xyz_unit of the interferometer may tell it")
+    plain = text.strip().lower().removesuffix("s")
+    metres = _METRES.get(_SPOKEN.get(plain, plain))
+    if metres is None:
+        raise MapFileError(f"{name} = {text!r}: must be a length: {', '.join(_METRES)}")
+    return metres
+
+
+def _pitch(header: Header) -> float | None:
+    """m per pixel, from PUPLSCAL or from CDELT with CUNIT in a length; None = not told."""
+    if "PUPLSCAL" in header:
+        return check_pitch(_real(header, "PUPLSCAL", 0.0))
+    if "CDELT1" not in header or "CUNIT1" not in header:
+        return None
+    x, y = (
+        abs(_real(header, f"CDELT{axis}", 0.0)) * _unit(str(header.get(f"CUNIT{axis}", "")), f"CUNIT{axis}")
+        for axis in (1, 2)
+    )
+    if abs(x - y) > _SQUARE_TOLERANCE * x:
+        raise MapFileError(f"CDELT1, CDELT2: pixels of {x:g} m x {y:g} m: must be square")
+    return check_pitch(x)
+
+
+def _time(text: str) -> float | None:
+    """s since the epoch, of a DATE-OBS in UTC; None = not told, or no time."""
+    try:
+        return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp() if "T" in text else None
+    except ValueError:
+        return None
+
+
+def _sum(blocks: bytes) -> int:
+    """The sum of the 32-bit words in ones' complement."""
+    words: NDArray[np.uint32] = np.frombuffer(blocks, ">u4")
+    total = int(words.sum(dtype=np.uint64))
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total

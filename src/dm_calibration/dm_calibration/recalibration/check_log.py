@@ -1,0 +1,76 @@
+"""The log of checks beside a calibration, ``<id>.checks.csv``: what each later map has shown of it."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+from dm_calibration.recalibration.drift import Drift
+from dm_calibration.recalibration.drift_filter import Comparison
+
+SUFFIX = ".checks.csv"
+
+
+@dataclass(frozen=True)
+class Check:
+    """A map that was compared with the calibration in use.
+
+    Attributes:
+        time: of the map, s since the epoch.
+        accepted: 1 = it agreed and was taken in.
+        max_zernike: largest difference of a coefficient beyond tilt, m.
+        rms: of the difference in sag, m.
+        surprise: difference over its expected size.
+        gain_drift: largest relative change of a gain since the calibration was made, after this map, and ...
+        actuator: ... whose it is, from 1.
+        offset_drift: change of the figure since then, m rms.
+    """
+
+    time: float
+    accepted: int
+    max_zernike: float
+    rms: float
+    surprise: float
+    gain_drift: float
+    actuator: int
+    offset_drift: float
+
+    @classmethod
+    def of(cls, stamp_ns: int, accepted: bool, shown: Comparison, drift: Drift) -> Check:
+        """The check of a map taken at `stamp_ns`, and the drift as it is used after it."""
+        gain, actuator = drift.largest_gain
+        departure = shown.max_zernike, shown.rms, shown.surprise
+        return cls(1e-9 * stamp_ns, int(accepted), *departure, gain, actuator + 1, drift.offset_rms)
+
+
+NAMES = tuple(item.name for item in fields(Check))
+
+
+def append_check(file: Path, check: Check) -> None:
+    """Add a line to the log. Raises OSError."""
+    new = not file.exists()
+    with file.open("a", newline="") as stream:
+        writer = csv.writer(stream)
+        if new:
+            writer.writerow(NAMES)
+        writer.writerow(astuple(check))
+
+
+def read_checks(file: Path) -> list[Check]:
+    """The checks in a log, oldest first; lines that a power cut has torn are left out. No file = none."""
+    found = []
+    try:
+        lines = file.read_text(errors="replace").splitlines()
+    except OSError:
+        return []
+    for row in csv.reader(lines[1:]):
+        try:
+            values = [float(value) for value in row]
+        except ValueError:
+            continue
+        if len(values) == len(NAMES) and all(map(math.isfinite, values)):
+            named = dict(zip(NAMES, values, strict=True))
+            found.append(Check(**named | {name: int(named[name]) for name in ("accepted", "actuator")}))  # type: ignore[arg-type]
+    return sorted(found, key=lambda check: check.time)

@@ -1,0 +1,109 @@
+"""Readers of FITS files and of 4Sight's against files made from the description of the formats."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
+from dm_calibration.map_files import MapFileError, read_map
+from map_fixtures import fits_bytes, h5_bytes
+
+#: (height, width) sag in nm, NaN = no data, no two rows alike.
+SAG = np.where(np.hypot(*np.mgrid[-1:1:12j, -1:1:14j]) > 1.1, np.nan, 90.0 + np.arange(168.0).reshape(12, 14))
+
+
+def write(folder: Path, name: str, content: bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.fits", fits_bytes(SAG)),
+        ("b.fits", fits_bytes(SAG.astype("f4"))),
+        (
+            "c.fits",
+            fits_bytes(1e-9 * SAG, BUNIT="m", PUPLSCAL=None, CDELT1=-0.024, CUNIT1="mm", CDELT2=24.0, CUNIT2="um"),
+        ),
+        (
+            "d.fits",
+            fits_bytes(np.where(np.isfinite(SAG), 2 * SAG, -7).astype("i2"), BLANK=-7, BSCALE=0.5, BUNIT="Nanometer"),
+        ),
+        ("e.fits", fits_bytes(SAG, BUNIT=None)),
+        ("f.h5", h5_bytes(SAG / 632.8)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_maps_of_other_makers(tmp_path: Path, name: str, content: bytes) -> None:
+    """What every format owes: m of sag, row 0 = top, NaN = no data, wavelength, pitch; and no half file is a map."""
+    found = read_map(write(tmp_path, name, content), xyz_unit="nm")
+    np.testing.assert_allclose(found.sag, 1e-9 * SAG, rtol=1e-6)
+    assert found.format == name.partition(".")[2]
+    assert found.wavelength == pytest.approx(632.8e-9) and found.pitch == pytest.approx(24e-6)
+    for cut in (30, len(content) // 2, len(content) - 1):
+        with pytest.raises(MapFileError):
+            read_map(write(tmp_path, "cut", content[:cut]), xyz_unit="nm")
+
+
+def test_facts_of_a_fits_file(tmp_path: Path) -> None:
+    cards: dict[str, Any] = {
+        "INSTRUME": "Hara''s",
+        "DATE-OBS": "2015-04-24T19:34:52",
+        "WAVELEN": None,
+        "PUPLSCAL": None,
+    }
+    found = read_map(write(tmp_path, "a.fits", fits_bytes(SAG, **cards)))
+    assert (found.instrument, found.time_stamp, found.wavelength, found.pitch) == ("Hara's", 1429904092.0, 0.0, None)
+    settings = IngestSettings(wavelength=532e-9)
+    assert Ingest().measure(found, settings)[1].wavelength == 532e-9
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({"BUNIT": None}, "BUNIT is missing: the values have no unit"),
+        ({"BUNIT": "waves"}, "BUNIT = 'waves': must be a length"),
+        ({"NAXIS": 3}, "NAXIS = 3: must be one of 2"),
+        ({"BITPIX": 12}, "BITPIX = 12: must be one of 8"),
+        ({"NAXIS1": 13}, "the values go on behind so many"),
+        ({"NAXIS2": 40000}, "file length = 5760 bytes: must be"),
+        ({"BSCALE": 1e30}, "height = "),
+        ({"WAVELEN": 0.5}, "wavelength = 0.5 m"),
+        ({"WAVELEN": "red"}, "WAVELEN = 'red': must be a finite number"),
+        ({"PUPLSCAL": -1.0}, "lateral resolution = -1"),
+        ({"PUPLSCAL": None, "CDELT1": 1.0, "CUNIT1": "mm", "CDELT2": 2.0, "CUNIT2": "mm"}, "must be square"),
+    ],
+)
+def test_a_fits_file_that_makes_no_sense_is_refused(tmp_path: Path, cards: dict[str, Any], words: str) -> None:
+    with pytest.raises(MapFileError, match=re.escape(words)):
+        read_map(write(tmp_path, "bad.fits", fits_bytes(SAG, **cards)))
+
+
+def test_a_fits_file_whose_checksum_does_not_agree_is_refused(tmp_path: Path) -> None:
+    content = bytearray(fits_bytes(SAG))
+    content[2880 + 300] ^= 1
+    with pytest.raises(MapFileError, match="CHECKSUM does not agree"):
+        read_map(write(tmp_path, "bad.fits", bytes(content)))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (h5_bytes(SAG, wavelength="red"), "wavelength = 'red': must be a length"),
+        (h5_bytes(SAG, xpix="3 px"), "xpix = '3 px'"),
+        (h5_bytes(SAG[0]), "must be a two-dimensional table"),
+        (h5_bytes(np.full((4, 4), np.nan)), "none of the 4 x 4 pixels is valid"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_file_of_4sight_that_makes_no_sense_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    with pytest.raises(MapFileError, match=re.escape(words)):
+        read_map(write(tmp_path, "bad.h5", content))
+    assert read_map(write(tmp_path, "a.h5", h5_bytes(SAG / 632.8, xpix=None))).pitch is None
