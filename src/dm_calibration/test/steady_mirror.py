@@ -14,6 +14,7 @@ from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
+from linear_bench import LinearBench
 from linear_mirror import LinearMirror, make_mirror
 
 Floats = NDArray[np.float64]
@@ -22,13 +23,14 @@ RINGS = 2
 NOISE = 0.5e-9
 
 
-class SteadyMirror:
-    """Implements dm_common.measurement.Bench."""
+class SteadyMirror(LinearBench):
+    """Keeps no record of its maps."""
 
     def __init__(self, seed: int = 1) -> None:
         self.mirror = make_mirror(RINGS)
-        self.plant = LinearMirror(self.mirror.x, self.mirror.y, noise=NOISE, piston_tilt=1e-7, seed=seed)
-        self.signals = self.mirror.rest
+        super().__init__(
+            self.mirror, LinearMirror(self.mirror.x, self.mirror.y, noise=NOISE, piston_tilt=1e-7, seed=seed)
+        )
         self.clock_ns = 10**15
         self._first = self.plant.influence, self.plant.figure_coefficients
 
@@ -36,17 +38,6 @@ class SteadyMirror:
         """Change gains (N,) relatively and figure coefficients (21,) m, against when it was made."""
         self.plant.influence = self._first[0] * (1.0 + gain)
         self.plant.figure_coefficients = self._first[1] + figure
-
-    def degauss(self) -> None:
-        self.signals = self.mirror.rest
-
-    def apply(self, signals: Floats) -> Floats:
-        self.signals = signals
-        return signals
-
-    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
-        self.clock_ns += 10**9
-        return True
 
     def measure(self, label: str, days: float = 0.0, bump: float = 0.0) -> Measurement:
         """One map, `days` later; `bump` (m) is astigmatism that the mirror does not have."""
@@ -62,7 +53,7 @@ class SteadyMirror:
         """Push-pull pokes, fitted; the last map not long before `stamp_ns` where given."""
         plan = make_plan(PlanKind.POKES, self.mirror)
         if stamp_ns:
-            self.clock_ns = stamp_ns - 2 * 10**9 * len(plan.steps)
+            self.clock_ns = stamp_ns - 22 * 10**8 * len(plan.steps)
         outcome = Procedure(plan, self.mirror, self).run()
         provenance = Provenance("steady", self.clock_ns)
         return calibrate(outcome, mirror=self.mirror, options=FitOptions(), provenance=provenance)
