@@ -11,7 +11,7 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.messages import doubles
 from dm_common.ros.parameters import declare
-from dm_controller.focus_parameters import LOOP_PARAMETERS
+from dm_controller.focus_parameters import LOOP_PARAMETERS, REACHABLE_TOLERANCE
 from dm_controller.loop_actions import LoopHost, serve_loops
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
@@ -72,7 +72,7 @@ class Host(Node, LoopHost):
         Node.__init__(self, "converge_host")
         self.refuse = False
         self.calibration: Calibration | None = calibration()
-        self.values = declare(self, LOOP_PARAMETERS)
+        self.values = declare(self, (*LOOP_PARAMETERS, REACHABLE_TOLERANCE))
         self.actions = serve_loops(self, self.values, self)
 
     def target(self, wanted: FocusRequest) -> FocusTarget:

@@ -11,6 +11,7 @@ from action_msgs.msg import GoalStatus
 from dm_msgs.action import BuildRecipes
 from dm_msgs.msg import ErrorCode
 from dm_msgs.srv import StoreRecipes
+from rclpy.parameter import Parameter
 
 import converge_stand_in
 from calibration_stand_in import StandIn
@@ -61,6 +62,13 @@ def goal(*curvatures: float, **fields: Any) -> BuildRecipes.Goal:
 def run(observer: Observer, wanted: BuildRecipes.Goal) -> tuple[int, Any]:
     ended = observer.run_goal(BuildRecipes, "build_recipes", wanted, timeout_s=60.0)
     return ended.status, ended.result
+
+
+def test_what_is_reachable_is_what_requests_go_by(observer: Observer, host: Host, bench: StandIn, store: Store) -> None:
+    edge = host.active_calibration().planner.mirror.reachable_range(FocusTarget(0.0), 2e-8)[1]
+    assert run(observer, goal(1.02 * edge))[1].error_code == ErrorCode.UNREACHABLE
+    host.set_parameters([Parameter("reachable_tolerance", value=1e-5)])
+    assert run(observer, goal(1.02 * edge))[1].recipes == 1
 
 
 def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: StandIn, store: Store) -> None:

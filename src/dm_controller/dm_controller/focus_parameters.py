@@ -43,14 +43,17 @@ LOOP_PARAMETERS = (
     Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
 )
 
+#: For requests and recipes alike.
+REACHABLE_TOLERANCE: Final = Parameter(
+    "reachable_tolerance",
+    real(2e-8, 1e-10, 1e-5, "m"),
+    "largest predicted Zernike coefficient error at which a curvature still counts as reachable",
+    live=True,
+)
+
 PARAMETERS: Final = (
     AUTOSTART,
-    Parameter(
-        "reachable_tolerance",
-        real(2e-8, 1e-10, 1e-5, "m"),
-        "largest predicted Zernike coefficient error at which a curvature still counts as reachable",
-        live=True,
-    ),
+    REACHABLE_TOLERANCE,
     Parameter("request_age", real(1.0, 0.0, 3600.0, "s"), "focus requests with an older stamp are refused; 0 = never"),
     Parameter(
         "settle_time",

@@ -28,8 +28,6 @@ from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag, target_shape
 
-#: Limits that deny a larger coefficient, m, make a shape unreachable from the condition.
-DENIED_MAX = 2e-8
 #: Effective signals that limits deny count from here on.
 MISS_IGNORED = 1e-3
 #: Maps of a round go on until their mean is as sure as this share of the tolerance, but fewer do not tell their noise.
@@ -61,12 +59,14 @@ class BuildOptions:
         maps_max: maps that one recipe may take.
         average: most maps of one round.
         settle_time: s after the move at which the shape is to be right.
+        reachable: largest coefficient error, m, by which limits may deny a shape from the condition.
     """
 
     tolerance: float = 6.3e-10
     maps_max: int = 32
     average: int = 8
     settle_time: float = 0.5
+    reachable: float = 2e-8
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
@@ -231,11 +231,11 @@ class RecipeBuilder:
         self.state = law.move(self.state, applied, self._now())
         missed = law.effective(law.advance(self.state, self._now() + self._options.settle_time)) - aim
         worst, denied = int(np.abs(missed).argmax()), self._response(missed).max_zernike
-        if denied > DENIED_MAX:
+        if denied > self._options.reachable:
             raise UnreachableError(
                 f"curvature = {target.curvature:+.4f} 1/m: actuator {worst + 1} stands at its limit and misses its "
                 f"effective signal by {abs(missed[worst]):.4f}, which leaves a coefficient error of "
-                f"{denied * 1e9:.1f} nm (allowed {DENIED_MAX * 1e9:g} nm): no recipe reaches this shape"
+                f"{denied * 1e9:.1f} nm (allowed {self._options.reachable * 1e9:g} nm): no recipe reaches this shape"
             )
         if not plant.settle():
             raise Cancelled("cancelled while settling")

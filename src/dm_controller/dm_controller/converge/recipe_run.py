@@ -26,8 +26,6 @@ from dm_controller.converge.recipe_building import BuildOptions, BuildStep, Reci
 from dm_controller.loop_actions import LoopBench
 from dm_controller.planning.target import FocusTarget
 
-#: A model that leaves a larger coefficient error of a curvature, m, cannot reach it.
-UNREACHABLE_ERROR = 2e-8
 #: What requests are told meanwhile.
 BUSY = "recipes are being built (action build_recipes)"
 #: Longest wait for the calibration node to store recipes, s.
@@ -39,7 +37,7 @@ class RecipeRun:
 
     Args:
         node: the hosting node.
-        values: its parameters, LOOP_PARAMETERS among them.
+        values: its parameters, LOOP_PARAMETERS and REACHABLE_TOLERANCE among them.
         bench: its host knows the calibration in use and the actuators' hysteresis.
         store: client of the service `store_recipes`.
     """
@@ -76,7 +74,7 @@ class RecipeRun:
         options = self._options(goal)
         active = bench.host.active_calibration()
         planner, calibration = active.planner, active.calibration
-        targets = recipe_targets(goal.curvatures, goal.conic_constant, planner, UNREACHABLE_ERROR)
+        targets = recipe_targets(goal.curvatures, goal.conic_constant, planner, options.reachable)
         steps = self._values["recipes.degauss_steps"]
         active.recipes.check_condition(steps)
         bench.check_ready()
@@ -151,7 +149,9 @@ class RecipeRun:
         # At least four rounds: without a model, hysteresis makes each correction miss by some share of itself.
         average = min(values["recipes.average"], max(maps // 4, 2))
         tolerance = goal.tolerance or values["recipes.tolerance"]
-        return BuildOptions(tolerance, maps, average, float(values["converge.settle_time"]))
+        return BuildOptions(
+            tolerance, maps, average, float(values["converge.settle_time"]), values["reachable_tolerance"]
+        )
 
     def _guess(self, law: HysteresisModel, now: float, middle: float) -> HysteresisState | None:
         """The mirror long rested where the driver says it stands; None when it does not say."""
