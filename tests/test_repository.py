@@ -93,7 +93,7 @@ KEYS = {
     "mcap": "mcap-ros2-support",
 }
 #: Modules that rosdep does not know; the package's README says how to install them. Starlette comes with NiceGUI.
-WITHOUT_KEY = {"nicegui", "starlette", "statsmodels"}
+WITHOUT_KEY = {"nicegui", "starlette", "statsmodels", "Pyro4"}
 
 
 @pytest.mark.parametrize("package", [path.name for path in SOURCE.iterdir() if (path / "package.xml").is_file()])

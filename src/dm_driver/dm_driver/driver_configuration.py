@@ -61,6 +61,7 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
     serial_port = values["electronics.serial_port"]
     settings = ElectronicsSettings(
         address=values["electronics.address"],
+        channels=actuators,
         port=values["electronics.port"],
         discovery_port=values["electronics.discovery_port"],
         serial_port=str(Path(serial_port).expanduser()) if serial_port else "",

@@ -48,7 +48,12 @@ PARAMETERS: Final = (
     Parameter("mirror.full_aperture_diameter", real(0.030, 1e-4, 10.0, "m"), "Diameter of the mirror."),
     Parameter("mirror.working_aperture_diameter", real(0.022, 1e-4, 10.0, "m"), "Diameter to be used."),
     Parameter("electronics.kind", text(REQUIRED, choices=tuple(BACK_ENDS)), "Drive electronics."),
-    Parameter("electronics.address", text(""), "EDAC40: host name or IPv4 address."),
+    Parameter(
+        "electronics.address",
+        text(""),
+        "EDAC40: host name or IPv4 address. microscope: URI of the mirror on the device server of python-microscope, "
+        "such as PYRO:Mirao52e@127.0.0.1:8000.",
+    ),
     Parameter("electronics.port", whole(1234, 1, 65535), "EDAC40: TCP or UDP port."),
     Parameter(
         "electronics.discovery_port",

@@ -13,6 +13,8 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from dm_driver.electronics.frame_format import FrameFormat
 
 EDAC40_TABLE = [
@@ -312,9 +314,49 @@ class FramedSerialUnit(UsbDac40Unit):
                 os.write(self._master, b"\x06")
 
 
+class MicroscopeUnit(DriveUnit):
+    """The simulated mirror of python-microscope, published as its device server does it."""
+
+    kind = "microscope"
+
+    def __init__(self) -> None:
+        super().__init__()
+        import Pyro4
+        from microscope.simulators import SimulatedDeformableMirror
+
+        unit = self
+
+        class Mirror(SimulatedDeformableMirror):
+            def _do_apply_pattern(self, pattern: np.ndarray) -> None:
+                super()._do_apply_pattern(pattern)
+                assert pattern.min() >= 0.0 and pattern.max() <= 1.0
+                unit.frames.append(dict(enumerate(np.rint(0xFFFF * self.get_current_pattern()).astype(int).tolist())))
+
+        Pyro4.config.REQUIRE_EXPOSE, Pyro4.config.SERVERTYPE = False, "multiplex"  # which closes the links it has
+        Pyro4.config.SERIALIZERS_ACCEPTED.add("pickle")
+        self._mirror, self._port, self._daemon = Mirror(n_actuators=40), 0, Pyro4.Daemon
+
+    @property
+    def settings(self) -> dict[str, object]:
+        return {"address": f"PYRO:Mirror@127.0.0.1:{self._port}", "channels": 40}
+
+    def _open(self) -> None:
+        self._server = self._daemon("127.0.0.1", self._port)
+        self._port = self._server.sock.getsockname()[1]
+        self._server.register(self._mirror, "Mirror", force=True)
+
+    def _serve(self) -> None:
+        self._server.requestLoop(lambda: not self._stop.is_set())
+
+    def _close(self) -> None:
+        self._server.unregister("Mirror")
+        self._server.close()
+
+
 UNITS: dict[str, Callable[[Path], DriveUnit]] = {
     "edac40_tcp": lambda folder: Edac40TcpUnit(),
     "edac40_udp": lambda folder: Edac40UdpUnit(),
     "usb_dac40": UsbDac40Unit,
     "framed_serial": FramedSerialUnit,
+    "microscope": lambda folder: MicroscopeUnit(),
 }

@@ -16,10 +16,13 @@ from drive_unit_servers import UNITS, DriveUnit, Edac40TcpUnit, Edac40UdpUnit
 from waiting import wait_until
 
 CHANNELS = 40
+MICROSCOPE_MISSING = "no microscope; run it with: ./dm exec python -m pip install -r requirements/test-oracles.txt"
 
 
 @pytest.fixture(params=sorted(BACK_ENDS))
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[DriveUnit]:
+    if request.param == "microscope":
+        pytest.importorskip("microscope", reason=MICROSCOPE_MISSING)
     with UNITS[request.param](tmp_path) as server:
         yield server
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
 from dm_driver.electronics.edac40 import Edac40Tcp, Edac40Udp
 from dm_driver.electronics.framed_serial import FramedSerial
+from dm_driver.electronics.microscope_mirror import MicroscopeMirror
 from dm_driver.electronics.usb_dac40 import UsbDac40
 
 BACK_ENDS: dict[str, type[DriveElectronics]] = {
@@ -16,6 +17,7 @@ BACK_ENDS: dict[str, type[DriveElectronics]] = {
     "edac40_udp": Edac40Udp,
     "usb_dac40": UsbDac40,
     "framed_serial": FramedSerial,
+    "microscope": MicroscopeMirror,
 }
 
 

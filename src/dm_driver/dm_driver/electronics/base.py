@@ -38,7 +38,8 @@ class ElectronicsSettings:
     """Where a unit is. Each back end takes what it needs.
 
     Attributes:
-        address: host name or IPv4 address.
+        address: host name or IPv4 address, or the URI of a mirror on a device server.
+        channels: output channels of a unit that has as many as it has actuators.
         port: TCP or UDP port.
         discovery_port: UDP port on which the unit answers discovery; 0 = not used.
         serial_port: device file.
@@ -49,6 +50,7 @@ class ElectronicsSettings:
     """
 
     address: str = ""
+    channels: int = 40
     port: int = 1234
     discovery_port: int = 0
     serial_port: str = ""

@@ -1,0 +1,69 @@
+"""Deformable mirrors that python-microscope drives, over its device server: ALPAO, Boston Micromachines, Mirao 52e, ...
+
+That program takes a pattern of numbers from 0 to 1, one for each actuator, and no other unit: `volts.*` of the driver
+are these numbers (0 and 1 at the ends, `amplifier_gain` 1), since the volts behind them cannot be known here.
+"""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings, LinkError
+
+
+class MicroscopeMirror(DriveElectronics):
+    """A `DeformableMirror` of python-microscope. One pattern sets all actuators, connected or not.
+
+    Pyro4, through which its device server talks, is imported when the link is opened; it sends arrays as pickles, so
+    the server must be one that is trusted.
+    """
+
+    max_code = 0xFFFF
+    needs = ("address", "the URI of the mirror on the device server, such as PYRO:Mirao52e@127.0.0.1:8000")
+
+    def __init__(self, settings: ElectronicsSettings) -> None:
+        super().__init__(settings)
+        self.channels = settings.channels
+
+    @property
+    def where(self) -> str:
+        return f"deformable mirror at {self._settings.address}"
+
+    def _do_open(self) -> None:
+        try:
+            import Pyro4
+        except ImportError as error:
+            raise LinkError(
+                "python-microscope needs the package Pyro4: ./dm exec python -m pip install Pyro4"
+            ) from error
+        self._errors: tuple[type[Exception], ...] = (Pyro4.errors.PyroError,)
+        self._link = self._asked(lambda: Pyro4.Proxy(self._settings.address))
+        self._link._pyroSerializer, self._link._pyroTimeout = "pickle", self._timeout_s
+        actuators = self._asked(lambda: self._link.n_actuators)
+        if actuators != self.channels:
+            raise LinkError(f"has {actuators} actuators, mirror.actuators is {self.channels}")
+
+    def _do_write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:
+        self._asked(lambda: self._link.apply_pattern(codes / self.max_code))
+
+    def _do_check(self) -> None:
+        # The server sends nothing unasked: a readable link is one that has ended.
+        if select.select([self._link._pyroConnection.sock], [], [], 0.0)[0]:
+            raise LinkError("the device server closed the link")
+
+    def _do_close(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link._pyroRelease()
+
+    def _asked(self, call: Callable[[], Any]) -> Any:
+        """The answer of `call`; what fails there breaks the link, for the outputs are not known then."""
+        try:
+            return call()
+        except self._errors as error:
+            raise LinkError(str(error)) from error
