@@ -72,6 +72,33 @@ def inline_commands() -> Iterator[tuple[str, str]]:
                     yield page.name, child.content
 
 
+#: Words on the screen that need no explanation.
+PLAIN = frozenset(
+    re.findall(
+        r"\w+",
+        "active adds ago back beforehand beside cancel changed clock compares connected could done fits go goal info "
+        "makes min needs newest now ok own ready running since soon starting status taken terminal there things valid "
+        "whole writes written yet",
+    )
+)
+#: Endings of a word, and what its stem has instead.
+ENDINGS = (("ies", "y"), ("es", ""), ("s", ""), ("ed", ""), ("ed", "e"), ("ing", ""), ("ing", "e"), ("ly", ""))
+
+
+def unexplained(text: str) -> set[str]:
+    """Words of what was printed that neither are plain nor stand in the glossary; names and numbers are no words."""
+    explained = PLAIN | set(re.findall(r"[^\W\d_]+", (ROOT / "docs" / "glossary.md").read_text().lower()))
+    tokens = (token.strip("()[],;:.'`\"") for token in text.lower().split())
+    words = {
+        word for token in tokens if not re.search(r"[/_\d=]", token) for word in re.findall(r"[^\W\d_]{2,}", token)
+    }
+    return {
+        word
+        for word in words - explained
+        if not any(word.endswith(end) and word[: -len(end)] + stem in explained for end, stem in ENDINGS)
+    }
+
+
 #: Blocks that are nothing to type, by their first line.
 TEXTS = {
     "header | one word per channel | check sum | terminator": "layout of a frame",
@@ -97,6 +124,7 @@ RUN = (
 #: Never end by themselves: started, watched for these words, interrupted.
 WATCHED = {
     "./dm up": "Ctrl-C stops them",
+    "./dm up --camera": "next: in another terminal: ./dm calibrate",
     "./dm console": "http://127.0.0.1:8037",
     "./dm console --port 9000 --namespace mirror_a": "http://127.0.0.1:9000",
     "./dm record --out runs/monday": "recording",
@@ -114,7 +142,6 @@ PARSED = {
     "./dm demo --config src/dm_bringup/config/mirror_19.yaml": _LONG + "test_second_mirror.py runs its parts",
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
     "./dm calibrate --boresight": "needs a camera; test_boresight_command.py runs what it does, test_held_tilt.py how",
-    "./dm up --camera": "test_many_mirrors.py checks what it adds; test_autofocus_node.py runs such nodes",
     "./dm exec python examples/camera_focus.py": "test_autofocus_node.py runs it",
     "./dm check --without 5": "that actuator is well; test_drift_updates.py checks such updates",
     "./dm test": "would run this test again",
@@ -155,7 +182,7 @@ ELSEWHERE = {
     "colcon build": "needs ROS 2 from apt; ./dm builds with colcon",
     "colcon build --packages-up-to dm_example_cpp": "needs ROS 2 from apt; `test_cpp_example` compiles it",
     "docker build -t deformable-mirror .": "needs a Docker daemon; the hosted checks build it",
-    "docker run --rm -it deformable-mirror dm demo": "the same",
+    "docker run --rm -it --shm-size 1g deformable-mirror dm demo": "the same",
     "docker run --rm -it --network host --ipc host deformable-mirror": "the same",
     "pip install -r requirements/docs.txt": "needs the network; the hosted checks do it",
     "mkdocs build": "the same",

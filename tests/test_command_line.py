@@ -6,11 +6,12 @@ import argparse
 import json
 import os
 import re
+import shutil
 import subprocess
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any, Union, get_origin, get_type_hints
 
 import pytest
 import typer
@@ -57,6 +58,20 @@ def test_what_is_mistyped_is_guessed_and_wrong_usage_is_2() -> None:
     assert wrong_verb.exit_code == wrong_option.exit_code == 2
     assert "Did you mean 'focus'" in wrong_verb.output and "--dry-run" in wrong_option.output
     assert "╭" not in wrong_verb.output, "frames are for screens"
+
+
+def test_options_have_types_that_an_older_typer_knows() -> None:
+    """That of Ubuntu 24.04 refuses `X | None`, and the whole command with it."""
+
+    def example(folder: Annotated[Path | None, typer.Option()] = None, number: float = 0.0) -> None: ...
+
+    hints = get_type_hints(cli.verb(example), include_extras=True)
+    assert hints["number"] is float
+    assert get_origin(hints["folder"].__origin__) is Union
+
+
+def test_a_sourced_workspace_has_it_on_its_path() -> None:
+    assert Path(str(shutil.which("dm"))).parts[-3:] == ("dm_tools", "bin", "dm")
 
 
 def test_the_bare_command_helps() -> None:
@@ -118,7 +133,9 @@ class FakeClient:
         self.node: Any = FakeNode()
         self._busy = busy
         state = (
-            ActuatorState(holder="calibration", holding="calibration has held the mirror for 12 s") if busy else None
+            ActuatorState(holder="calibration", holding="calibration has held the mirror for 12 s: cancel it")
+            if busy
+            else None
         )
         self.messages = {"actuator_state": state or ActuatorState()}
 
@@ -140,13 +157,16 @@ def test_who_holds_the_mirror_is_named() -> None:
     answered = DeformableMirrorError(ErrorCode.BUSY, "refused", SetFocus.Response())
     with pytest.raises(DeformableMirrorError, match="or end it with --take-over"), naming_holder(client):
         raise answered
-    refusal = DeformableMirrorError(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
-    with pytest.raises(DeformableMirrorError, match="no calibration is in use"), naming_holder(client):
+    refusal = DeformableMirrorError(ErrorCode.UNREACHABLE, "reachable: ")
+    with pytest.raises(DeformableMirrorError, match="reachable"), naming_holder(client):
         raise refusal
+    uncalibrated = DeformableMirrorError(ErrorCode.NOT_CALIBRATED, "no calibration is in use", SetFocus.Response())
+    with pytest.raises(DeformableMirrorError, match=r"for 12 s \(.*Ctrl-C[^-]*$"), naming_holder(client):
+        raise uncalibrated
     idle: Any = FakeClient(busy=False)
     assert holder(idle) is None
     with pytest.raises(DeformableMirrorError, match="no calibration is in use"), naming_holder(idle):
-        raise refusal
+        raise uncalibrated
 
 
 def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixture[str]) -> None:

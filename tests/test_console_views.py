@@ -190,6 +190,8 @@ def test_badges_warn_of_an_unknown_history() -> None:
     )
     assert status.Badge("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
     assert status.Badge("history: known") in status.badges(snapshot, "")
+    snapshot.actuator_state.history_known = True
+    assert status.Badge("history: not seen from here", "doubt") in status.badges(snapshot, "it moved before")
 
 
 def test_the_worst_diagnostics_come_first() -> None:

@@ -17,7 +17,7 @@ from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import TYPICAL_MAP_S, GoodEnough, forecast
+from dm_calibration.procedure.forecast import GoodEnough, forecast
 from dm_calibration.procedure.plan import LAST_PART_ENDS, Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
@@ -154,9 +154,9 @@ class CalibrateAction:
 
     def _forecast(self, goal: Calibrate.Goal, plan: Plan, mirror: Mirror, result: Calibrate.Result) -> None:
         """Fill in what is to be expected; the message of a dry run."""
-        in_use, map_time = self._manager.in_use, self._services.map_time
+        in_use, taken, guessed = self._manager.in_use, self._services.map_time, self._values["map_time"]
         settle_time = goal.settle_time or self._values["settle_time"]
-        expected = forecast(plan, settle_time, in_use, map_time, mirror, goal.until)
+        expected = forecast(plan, settle_time, in_use, taken, mirror, goal.until, guessed)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = expected.maps or sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
@@ -165,8 +165,8 @@ class CalibrateAction:
                 source = "" if in_use else ", by typical data sheets"
                 reach = f"{expected.max_zernike * 1e9:.1f} nm"
                 accuracy = f", moves then right to {reach} (largest coefficient, 95 %{source})"
-            known = map_time or in_use is not None
-            guess = "" if known else f" if a map takes {TYPICAL_MAP_S:g} s (none was taken yet)"
+            known = taken or in_use is not None
+            guess = "" if known else f" if a map takes {guessed:g} s (none was taken yet)"
             result.message = f"{maps} maps in about {expected.duration:.0f} s{guess}{accuracy}; nothing was moved"
 
     def _procedure(

@@ -31,6 +31,12 @@ PARAMETERS = (
     Parameter("reference_every", whole(10, 1, 1000), "Steps between two reference frames.", live=True),
     Parameter("hysteresis_maps", whole(200, 60, 2000), "Commands of a hysteresis plan; more, less noise.", live=True),
     Parameter("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time.", live=True),
+    Parameter(
+        "map_time",
+        real(1.0, 0.001, 600.0, "s"),
+        "What a map is said to take until one was taken, in ROS time.",
+        live=True,
+    ),
     Parameter("measure_retries", whole(1, 0, 20), "Further tries after a map that failed.", live=True),
     Parameter(
         "failures_max", whole(3, 1, 1000), "Shapes in a row without a map after which a run is given up.", live=True

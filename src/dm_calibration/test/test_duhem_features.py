@@ -22,7 +22,7 @@ def test_small_changes_of_the_slope_are_found() -> None:
     true = common * (1.0 + 0.05 * rng.standard_normal(common.shape))
     values = WEIGHT * fading_feature(signals, DuhemOperator(true))[:, 0]
     columns = np.concatenate((fading_feature(signals, DuhemOperator(common)), fading_changes(signals, common)), axis=1)
-    weights = np.column_stack([np.linalg.lstsq(columns[..., n], values[:, n])[0] for n in range(ACTUATORS)])
+    weights = np.column_stack([np.linalg.lstsq(columns[..., n], values[:, n], rcond=None)[0] for n in range(ACTUATORS)])
     found = own_slopes(common, weights[0], weights[1:])
     left = WEIGHT * fading_feature(signals, DuhemOperator(found))[:, 0] - values
     assert np.abs(left).max() < 0.1 * np.abs(WEIGHT * columns[:, 0] - values).max()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError
@@ -44,6 +44,8 @@ def rough_map(shape: tuple[int, int], seed: int, dropout: float = 0.05) -> np.nd
 )
 def test_equals_plain_least_squares(seed: int, x: float, y: float, radius: float, dropout: float) -> None:
     sag = rough_map((100, 120), seed, dropout)
+    u, v = unit_coordinates(sag.shape, x, y, radius)
+    assume(np.abs(u**2 + v**2 - 1.0).min() > 1e-12)  # rounding says on which side of the rim such a pixel lies
     expected, residual, inverse = plain_fit(sag, x, y, radius)
     found = MapFitter(np.isfinite(sag), x, y, radius).fit(sag)
     np.testing.assert_allclose(found.coefficients, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())

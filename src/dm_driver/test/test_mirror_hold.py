@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -35,8 +37,11 @@ def hold(clock: Clock) -> MirrorHold:
     return hold
 
 
-def refused(code: ErrorCode) -> pytest.RaisesExc[Refusal]:
-    return pytest.RaisesExc(Refusal, check=lambda error: error.error_code == code)
+@contextmanager
+def refused(code: ErrorCode) -> Iterator[None]:
+    with pytest.raises(Refusal) as caught:
+        yield
+    assert caught.value.error_code == code
 
 
 def test_others_hear_who_holds_it_how_long_and_how_to_end_it(hold: MirrorHold, clock: Clock) -> None:

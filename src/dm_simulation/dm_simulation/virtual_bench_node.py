@@ -86,7 +86,8 @@ class VirtualBenchNode(Node):
         law = f"{values['piezo.law']} {100 * values['piezo.hysteresis']:g} %, creep {100 * values['piezo.creep']:g} %"
         if self.bench.config.membrane is not None:
             law = "membrane"
-        self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; clock speed {speed:g}")
+        pace = f"{speed:g} times as fast as real time" if speed > 0 else "in real time"
+        self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; {pace}")
 
     def _now(self) -> float:
         if self._fast_clock is not None:

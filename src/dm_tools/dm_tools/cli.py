@@ -6,9 +6,11 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import typer
 from typer.core import TyperCommand
@@ -82,6 +84,20 @@ def _options(
     """Options of the command itself."""
 
 
+def _spelt_out(hint: Any) -> Any:
+    """`X | None` as the `Union` that it is: the typer of Ubuntu 24.04 (0.9) knows no other."""
+    if get_origin(hint) is Annotated:
+        return Annotated[(_spelt_out(hint.__origin__), *hint.__metadata__)]
+    return Union[get_args(hint)] if isinstance(hint, UnionType) else hint  # noqa: UP007
+
+
+def verb(function: Callable[..., None]) -> Callable[..., None]:
+    """The function of a verb, with types that every typer takes."""
+    hints = get_type_hints(function, include_extras=True)
+    function.__annotations__ = {name: _spelt_out(hint) for name, hint in hints.items()}
+    return function
+
+
 def make_app() -> typer.Typer:
     """The command with all verbs that are there."""
     app = typer.Typer(
@@ -101,7 +117,7 @@ def make_app() -> typer.Typer:
             if error.name not in CHECKOUT:
                 raise
         else:
-            app.command(name=name, cls=Command, context_settings=SETTINGS.get(name))(function)
+            app.command(name=name, cls=Command, context_settings=SETTINGS.get(name))(verb(function))
     return app
 
 

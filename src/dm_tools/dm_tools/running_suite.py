@@ -91,7 +91,7 @@ class Holder(NamedTuple):
     """Who has the mirror for itself.
 
     Attributes:
-        holding: since when and what for, as the driver says it.
+        holding: who and since when, as the driver says it.
         step, steps: how far it is; 0 = not known.
     """
 
@@ -113,26 +113,31 @@ def holder(client: DeformableMirrorClient) -> Holder | None:
     state = client.messages.get("actuator_state")
     if state is None or not state.holder:
         return None
+    holding = state.holding.partition(": ")[0]  # how to end it is said in the words of the command
     goals = [ExternalGoals(client.node, INTERFACES[name], name) for name in LONG]
     client.wait(lambda: any(goal.running for goal in goals), 0.5)
     running = next((goal for goal in goals if goal.running), None)
     if running is None:
-        return Holder(state.holding)
+        return Holder(holding)
     client.wait(lambda: running.feedback, REPORT_S)
-    return Holder(state.holding, *(getattr(running.feedback, field, 0) for field in ("step", "steps")))
+    return Holder(holding, *(getattr(running.feedback, field, 0) for field in ("step", "steps")))
 
 
 @contextmanager
 def naming_holder(client: DeformableMirrorClient) -> Iterator[None]:
-    """Say of a request that is refused within as BUSY who has the mirror for itself, and how to end that."""
+    """Say of a request that is refused within who has the mirror for itself, and how to end that.
+
+    While the first calibration runs, that there is none says nothing either.
+    """
     from dm_client import DeformableMirrorError
 
     try:
         yield
     except DeformableMirrorError as error:
-        if error.error_code == ErrorCode.BUSY and (by := holder(client)):
+        if error.error_code in (ErrorCode.BUSY, ErrorCode.NOT_CALIBRATED) and (by := holder(client)):
             text = f"{by}: wait for its end, or cancel it (Ctrl-C where it was started, or ./dm console)"
-            if error.response is not None:  # not by the same action, which takes one goal at a time
+            # The same action takes one goal at a time, and without a calibration nothing else is possible yet.
+            if error.response is not None and error.error_code == ErrorCode.BUSY:
                 text += ", or end it with --take-over"
             raise DeformableMirrorError(error.error_code, text, error.response) from error
         raise

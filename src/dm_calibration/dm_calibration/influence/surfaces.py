@@ -208,7 +208,7 @@ def _damped(model: LinearModel) -> tuple[Floats, float]:
 def _unbounded(target: Floats, model: LinearModel) -> Floats:
     matrix, _ = _damped(model)
     wanted = np.sqrt(model.points.weight) * remove_piston_tilt(target[None, :], model.points)[0]
-    return np.asarray(np.linalg.lstsq(matrix, np.concatenate((wanted, np.zeros(matrix.shape[1]))))[0])
+    return np.asarray(np.linalg.lstsq(matrix, np.concatenate((wanted, np.zeros(matrix.shape[1]))), rcond=None)[0])
 
 
 def _tilt_surface(name: str, unit: Floats, model: LinearModel, mirror: Mirror) -> Surface:

@@ -25,8 +25,6 @@ from dm_common.optics.zernike import PISTON_TILT, basis
 
 Floats = NDArray[np.float64]
 
-#: Time that one map takes, s, where neither a map nor a calibration says so.
-TYPICAL_MAP_S = 1.0
 #: Fewest pairs of maps of the same command that tell the noise.
 PAIRS_MIN = 4
 #: A run stands still when so many parts together better it by less than this share.
@@ -53,18 +51,20 @@ def forecast(
     map_time: float = 0.0,
     mirror: Mirror | None = None,
     until: float = 0.0,
+    guessed: float = 1.0,
 ) -> Forecast:
     """Duration and accuracy to expect of `plan`; accuracy only of hysteresis plans.
 
     Args:
         settle_time: s between command and map.
         earlier: calibration of the same mirror that tells gains and noise; None = there is none.
-        map_time: s that the last map took; 0 = none was taken: then as in `earlier`, or TYPICAL_MAP_S.
+        map_time: s that the last map took; 0 = none was taken: then as in `earlier`, or `guessed`.
         mirror: whose data sheet counts where there is no calibration; None = the accuracy is then not known.
         until: m at which the run ends, where its plan may.
+        guessed: s that a map is said to take where nothing tells it.
     """
     steps = [step for step in plan.steps if step.kind is not StepKind.DEGAUSS]
-    per_map = settle_time + (map_time or TYPICAL_MAP_S)
+    per_map = settle_time + (map_time or guessed)
     if not map_time and earlier is not None and len(earlier.maps) > 1:
         gap = np.diff(np.sort(earlier.maps.stamp_ns)) * 1e-9
         per_map = max(float(np.median(gap)), settle_time)

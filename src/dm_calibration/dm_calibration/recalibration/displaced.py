@@ -41,7 +41,7 @@ def displaced_actuators(
         if explained[best] < DISPLACED_SHARE * (left @ left):
             break
         found.append(best)
-        amounts = np.linalg.lstsq(columns[:, found], whole)[0]
+        amounts = np.linalg.lstsq(columns[:, found], whole, rcond=None)[0]
         left = whole - columns[:, found] @ amounts
     order = [int(k) for k in np.argsort(-np.abs(amounts))]
     probability = {}

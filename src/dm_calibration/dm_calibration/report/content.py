@@ -75,7 +75,7 @@ def summary(calibration: Calibration) -> Section:
     dropped, warnings = calibration.maps_dropped, len(calibration.limitations)
     counted = (
         f"{_counted(dropped, 'map was', 'maps were')} dropped; "
-        f"{_counted(warnings, 'sentence', 'sentences')} of caution below."
+        f"{_counted(warnings, 'warning or limitation', 'warnings and limitations')} below."
     )
     return Section(
         "Summary",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -114,7 +115,8 @@ class DriveElectronics(ABC):
             self._do_open()
         except (OSError, LinkError) as error:
             self._abandon()
-            raise LinkError(f"cannot open {self.where}: {error}") from error
+            reason = re.sub(r".*\[Errno \d+\] ", "", str(error))  # pyserial says it twice, with the place
+            raise LinkError(f"cannot open {self.where}: {reason}") from error
         self._open = True
 
     def write(self, codes: NDArray[np.uint16], wired: NDArray[np.bool_]) -> None:

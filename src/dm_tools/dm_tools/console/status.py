@@ -67,7 +67,9 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
             Badge(f"{calibration.id}: {quality}", "" if calibration.quality == Calibration.CALIBRATED else "doubt")
         )
         if calibration.hysteresis.play_radius:
-            shown.append(Badge("history: not known" if doubt else "history: known", "doubt" if doubt else ""))
+            known = state is not None and state.history_known  # by the nodes, which may run for longer than this page
+            text = "known" if not doubt else "not seen from here" if known else "not known"
+            shown.append(Badge(f"history: {text}", "doubt" if doubt else ""))
     worst = max((ord(bytes(status.level)) for status in snapshot.diagnostics.values()), default=0)
     if worst and worst != ord(DiagnosticStatus.STALE):
         text = LEVELS.get(bytes([worst]), "?")

@@ -226,7 +226,7 @@ def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:
 
 
 def calibration_text(calibration: Any) -> list[str]:
-    """A dm_msgs/Calibration in lines: what it is, how good, and its limitations."""
+    """A dm_msgs/Calibration in lines: what it is and how good."""
     if calibration is None or not calibration.id:
         return ["No calibration is in use."]
     lines = [
@@ -245,4 +245,4 @@ def calibration_text(calibration: Any) -> list[str]:
         lines.append(f"Conditioned recipes: {len(calibration.recipes.recipes)}.")
     if calibration.revision:
         lines.append(f"Maps that updated it since: {calibration.revision}.")
-    return lines + [f"Limitation: {sentence}" for sentence in calibration.known_limitations]
+    return lines

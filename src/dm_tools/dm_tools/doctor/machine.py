@@ -125,10 +125,12 @@ def messages() -> Finding | None:
 def running_nodes(namespace: str = "") -> Finding:
     """Nodes of the suite in this domain: twice is wrong, none is worth knowing; and how their clock differs."""
     from dm_client import DeformableMirrorClient
-    from dm_tools.running_suite import nodes_of_suite, where
+    from dm_tools.running_suite import BUSY_S, NEEDED, nodes_of_suite, where
 
     with DeformableMirrorClient(namespace) as client:
         client.wait(lambda: max(nodes_of_suite(client).values(), default=0) > 1, DISCOVERY_S)
+        if nodes_of_suite(client):
+            client.wait(lambda: NEEDED.keys() <= nodes_of_suite(client).keys(), BUSY_S - DISCOVERY_S)
         count, place = nodes_of_suite(client), where(client)
         twice = [name for name in count if count[name] > 1]
         if twice:
@@ -138,6 +140,12 @@ def running_nodes(namespace: str = "") -> Finding:
             )
         if count and (skew := _skew(client)) is not None:
             return skew
+    if lacking := [f"{name} ({effect})" for name, effect in NEEDED.items() if count and name not in count]:
+        return Finding(
+            f"{', '.join(count)}, {place}; not running: {', '.join(lacking)}",
+            "end ./dm up with Ctrl-C and start it again",
+            note=True,
+        )
     if count:
         return Finding(f"{', '.join(count)}, {place}", "")
     return Finding(f"none {place}", "./dm up starts them", note=True)

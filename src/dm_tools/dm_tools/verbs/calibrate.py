@@ -22,7 +22,7 @@ from dm_tools.output import (
     write_json,
 )
 from dm_tools.parameter_changes import set_parameter, source_of, write_parameters
-from dm_tools.running_suite import promise, running_suite
+from dm_tools.running_suite import naming_holder, promise, running_suite
 
 #: What tells the sentence of a result on what --until asked for.
 REACHED = re.compile(r"^\S+ nm is (not )?reached")
@@ -208,7 +208,7 @@ def calibrate(
         note=note,
         take_over=take_over,
     )
-    with running_suite(namespace) as client:
+    with running_suite(namespace) as client, naming_holder(client):
         source = source_of(write, config, client.mirror_info.serial) if write is not None and not dry_run else None
         if fresh and not dry_run:
             start_fresh(client)

@@ -8,7 +8,7 @@ import typer
 
 from dm_common.figures import two_fold
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, nanometres, next_step, write_json
-from dm_tools.running_suite import hear_health, kept, naming_holder, running_suite, settled_shape, verdict
+from dm_tools.running_suite import REPORT_S, hear_health, kept, naming_holder, running_suite, settled_shape, verdict
 
 
 def measure(
@@ -103,6 +103,8 @@ def check(
         health = hear_health(client)
         response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
         calibration = client.latest("calibration")
+        # What the shape that stands was promised, and not what the calibration promises of any.
+        client.wait(lambda: "focus_controller" in health, REPORT_S)
     shape, capabilities = settled_shape(health), client.messages.get("capabilities")
     if shape is not None:
         promised = shape.bound

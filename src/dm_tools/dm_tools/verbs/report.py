@@ -114,7 +114,7 @@ def report(
     written = write_report(found, folder, file)
     console.print(
         f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "
-        f"{len(found.limitations)} sentences of caution"
+        f"{len(found.limitations)} known limitations"
     )
     console.print(f"page: {os.path.relpath(written.html)}\nPDF: {os.path.relpath(written.pdf)}")
     files = {"html": str(written.html), "pdf": str(written.pdf)}

@@ -46,7 +46,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "calibration": _calibration(calibration),
         "promise": _promise(capabilities) if calibration is not None else "none without a calibration",
         "absolute": _absolute(capabilities, calibration),
-        "health": "; ".join(f"{name}: {each.message}" for name, each in health.items() if each.level != b"\0") or "ok",
+        "health": _health(health),
         "next": _next(lacking, by, state, calibration, shape, capabilities),
     }
     for name, text in rows.items():
@@ -61,6 +61,15 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
         "error_bound_nm": nanometres(capabilities.error_bound) if calibration and capabilities else None,
     }
     write_json(json, {"status": figures})
+
+
+def _health(health: dict[str, Any]) -> str:
+    """What nodes say of themselves unless all is well, each sentence once."""
+    said: dict[str, list[str]] = {}
+    for name, each in health.items():
+        if each.level != b"\0":
+            said.setdefault(each.message, []).append(name)
+    return "; ".join(f"{', '.join(names)}: {message}" for message, names in said.items()) or "ok"
 
 
 def _now(by: Any, shape: SettledShape | None, state: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from html import escape
 from typing import Any
@@ -18,6 +19,10 @@ from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import NM, calibration_text
 from dm_tools.console.widgets.components import ActionButton, Chart, Line, card
+
+
+def _rows(lines: Iterable[str]) -> str:
+    return "".join(f"<div>{escape(line)}</div>" for line in lines)
 
 
 class CalibrationCard:
@@ -83,8 +88,11 @@ class CalibrationCard:
         self._progress.show(step if running else "")
         residuals_nm = [NM * residual for residual in list(session.ros.watched["calibrate"].residuals)]
         self._residuals.show(residual_chart(residuals_nm) if residuals_nm else None)
-        lines = calibration_text(snapshot.calibration)
-        self._text.set_content("".join(f"<div>{escape(line)}</div>" for line in lines))
+        limitations = snapshot.calibration.known_limitations if snapshot.calibration is not None else []
+        lines = _rows(calibration_text(snapshot.calibration))
+        if limitations:
+            lines += f"<details><summary>Known limitations: {len(limitations)}</summary>{_rows(limitations)}</details>"
+        self._text.set_content(lines)
         unchosen = "" if self._choice.value else "Choose a calibration first."
         self._load.allow(reason_against("store", snapshot, session.running) or unchosen)
         in_use = snapshot.calibration.id if snapshot.calibration is not None else ""

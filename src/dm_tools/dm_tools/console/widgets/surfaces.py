@@ -65,7 +65,7 @@ class SurfaceCard:
         self._names[1].set_text(PREDICTED[then])
         limit = max([s.extent for s in (view.measured, predicted) if s is not None], default=np.nan)
         self._panel(0, view.measured, limit, SAG_COLOURS, "measured surface", view.no_map_reason)
-        text = " ".join([f"A guess: {view.doubt}." if view.doubt else "", view.remark]).strip()
+        text = " ".join([f"A guess until a degauss: {view.doubt}." if view.doubt else "", view.remark]).strip()
         self._panel(1, predicted, limit, SAG_COLOURS, "predicted surface", view.no_prediction_reason, text)
         gap = view.difference
         extent = float(np.nanpercentile(np.abs(gap.sag), COVERED)) if gap is not None else np.nan
