@@ -76,9 +76,10 @@ def inline_commands() -> Iterator[tuple[str, str]]:
 PLAIN = frozenset(
     re.findall(
         r"\w+",
-        "active adds ago back beforehand beside cancel changed clock compares connected could done fits go goal info "
-        "makes min needs newest now ok own ready running since soon starting status taken terminal there things valid "
-        "whole writes written yet",
+        "active adds ago back beforehand beside better budget calibrate cancel changed clock compares "
+        "connected could ctrl data done dropped fast fits go goal if info makes mb min needs newest none now "
+        "ok own pdf ready real running sheets since soon starting status taken terminal there things typical "
+        "valid whole writes written yet",
     )
 )
 #: Endings of a word, and what its stem has instead.

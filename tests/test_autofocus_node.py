@@ -29,6 +29,7 @@ from dm_autofocus import CameraFocusClient
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
 from dm_client import DeformableMirrorError
 from dm_common.ros import qos
+from documentation import unexplained
 from support import NodeProcess, Observer, wait_until
 
 REST_DISTANCE = 10.0
@@ -356,3 +357,4 @@ def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) 
     assert done.returncode == 0, done.stderr
     assert f"sharpest at {distance_of(OPTICS.dioptre_for(0.0173)):.1f}" in done.stdout
     assert "of the pixels from" in done.stdout
+    assert sorted(unexplained(done.stdout)) == []
