@@ -14,7 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dm_common.figures import in_wavelengths
 
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+#: A pipe or a file gets whole lines.
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 120, soft_wrap=not sys.stdout.isatty())
 errors = Console(stderr=True, highlight=False)
 
 #: `--json -`.

@@ -22,6 +22,7 @@ from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Pictur
 from dm_common.atomic_write import write_whole
 from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
+from dm_common.hysteresis.inverse import certain_reach
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from dm_common.optics.conic import conic_coefficients, conic_sag
@@ -79,12 +80,18 @@ def doubts(calibration: Calibration) -> list[str]:
 
 
 def curvatures(calibration: Calibration) -> tuple[float, float]:
-    """Smallest and largest curvature (1/m) of a sphere within the signals of the maps; (nan, nan) = not even 0."""
+    """Smallest and largest curvature (1/m) of a sphere that the signals of the maps reach whatever the actuators went
+    through before; (nan, nan) = not even 0.
+    """
     fit, maps, radius = calibration.fit, calibration.maps, calibration.aperture_radius
     x, y = calibration.actuator_x, calibration.actuator_y
     pairs = neighbour_pairs(x, y)
     apart = float(np.abs(maps.applied[:, pairs[:, 0]] - maps.applied[:, pairs[:, 1]]).max(initial=1e-6))
-    limits = Limits(fit.signal_min, fit.signal_max, pairs, apart)
+    low, high = fit.signal_min, fit.signal_max
+    if calibration.hysteresis is not None:
+        low, high = certain_reach(calibration.hysteresis.law, low, high)
+        apart *= min((high - low) / (fit.signal_max - fit.signal_min), 1.0)
+    limits = Limits(low, high, pairs, apart)
     mirror = Mirror(calibration.mirror_name, calibration.mirror_serial, x, y, radius, limits)
 
     def reached(curvature: float) -> bool:
