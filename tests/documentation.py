@@ -77,7 +77,7 @@ PLAIN = frozenset(
     re.findall(
         r"\w+",
         "active adds ago back beforehand beside better budget calibrate cancel changed clock compares "
-        "connected could ctrl data done dropped fast fits go goal if info makes mb min needs newest none now "
+        "connected could ctrl data done dropped fast fits forgotten go goal if info makes mb min needs newest none now "
         "ok own pdf ready real running sheets since soon starting status taken terminal there things typical "
         "valid whole writes written yet",
     )

@@ -9,6 +9,7 @@ import signal
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,8 @@ from dm_tools.output import console, next_step
 
 #: A suite that is not ready after this is said to be late, s.
 LATE_S = 30.0
+#: The longest that the end waits for those who wait for a suite to be ready, s.
+END_S = 10.0
 #: How a line of a node's log looks, unless the user has chosen: with the time of the wall clock.
 LOG_FORMAT = "{date_time_with_ms} {severity} {name}: {message}"
 #: Between the ports of two virtual benches.
@@ -69,11 +72,13 @@ def up(
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""], camera)
     stop = threading.Event()
+    watchers = [threading.Thread(target=say_when_ready, args=(name, stop), daemon=True) for name in mirrors]
     # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
     # because a shell starts commands in the background with SIGINT ignored.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
+        stack.callback(end, watchers, stop)  # the last of all: the mirrors are safe first
         folder = logs if logs is not None else Path(temporary)
         suites = [
             stack.enter_context(
@@ -90,15 +95,20 @@ def up(
                     f"it keeps its last {bench['output_limit'] / 1e6:.0f} MB of maps in {bench['output_folder']}"
                 )
         console.print("Ctrl-C stops them and makes every mirror safe")
-        watchers = [threading.Thread(target=say_when_ready, args=(name, stop), daemon=True) for name in mirrors]
         for watcher in watchers:
             watcher.start()
         while not stop.wait(0.2):
             for suite in suites:
                 suite.revive(lambda text: console.print(f"[yellow]{text}[/]"))
         console.print("\nstopping")
-        for watcher in watchers:
-            watcher.join(1.0)
+
+
+def end(watchers: Sequence[threading.Thread], stop: threading.Event) -> None:
+    """End those who wait for a suite to be ready: a process that ends while they ask ROS is aborted."""
+    stop.set()
+    for watcher in watchers:
+        if watcher.is_alive():
+            watcher.join(END_S)
 
 
 def say_when_ready(namespace: str, stop: threading.Event) -> None:
