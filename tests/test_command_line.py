@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import subprocess
+import threading
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
+from dm_tools.verbs.up import end
 from test_console_external_goals import EXECUTING, FakeNode, Goal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -208,6 +210,14 @@ def test_its_nodes_run_as_those_of_launch_files(monkeypatch: pytest.MonkeyPatch)
         cli.run(["--version"], "dm")
     assert Path(os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
     assert os.environ["OPENBLAS_NUM_THREADS"] == "2", "what the user has set stays"
+
+
+def test_up_ends_those_who_wait_before_the_process_does() -> None:
+    stop = threading.Event()
+    waits, never_began = threading.Thread(target=stop.wait), threading.Thread(target=stop.wait)
+    waits.start()
+    end([waits, never_began], stop)
+    assert not waits.is_alive()
 
 
 @pytest.mark.parametrize(
