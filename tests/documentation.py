@@ -78,7 +78,8 @@ PLAIN = frozenset(
         r"\w+",
         "active adds ago back beforehand beside better budget calibrate cancel changed clock compares "
         "connected could ctrl data done dropped fast fits forgotten go goal if info makes mb min needs newest none now "
-        "ok own pdf ready real running sheets since soon starting status taken terminal there things typical "
+        "again doctor have long ok own pdf ready real running said sheets since soon start status taken terminal there "
+        "things took typical "
         "valid whole writes written yet",
     )
 )
