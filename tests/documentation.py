@@ -145,6 +145,7 @@ PARSED = {
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
     "./dm calibrate --boresight": "needs a camera; test_boresight_command.py runs what it does, test_held_tilt.py how",
     "./dm exec python examples/camera_focus.py": "test_autofocus_node.py runs it",
+    "./dm measure --reference-sphere -1.5": "no sphere stands there; test_ingest.py checks what it finds",
     "./dm check --without 5": "that actuator is well; test_drift_updates.py checks such updates",
     "./dm test": "would run this test again",
     "./dm test --fast": "would run tests within a test",

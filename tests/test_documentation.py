@@ -149,7 +149,7 @@ def test_options_exist(command: str) -> None:
 @pytest.mark.parametrize(("page", "command"), sorted(set(told.inline_commands())))
 def test_options_exist_within_the_text(page: str, command: str) -> None:
     """Placeholders are replaced; a command that is only named need not be whole."""
-    for word, instead in (("…", "x.yaml"), ("FILE", "x.yaml"), ("LAW", "preisach")):
+    for word, instead in (("…", "x.yaml"), ("FILE", "x.yaml"), ("LAW", "preisach"), ("METRES", "-1.5")):
         command = command.replace(word, instead)
     if len(command.split()) > 2:
         check_dm(command)

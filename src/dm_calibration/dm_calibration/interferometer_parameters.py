@@ -84,8 +84,8 @@ PARAMETERS = (
     Parameter(
         "pitch",
         real(0.0, 0.0, 0.1, "m"),
-        "Lateral resolution per pixel, as `./dm measure --reference-sphere` finds it; files that tell one that differs "
-        "by more than 5 % are refused. 0 = as the files tell.",
+        "Lateral resolution per pixel, as `./dm measure --reference-sphere METRES` finds it; files that tell one "
+        "that differs by more than 5 % are refused. 0 = as the files tell.",
         live=True,
     ),
     Parameter(
