@@ -55,6 +55,12 @@ def test_rectangular_field_gets_its_inscribed_circle() -> None:
     assert framed[found.disc(framed.shape)].all()
 
 
+def test_two_mirrors_in_view_are_refused() -> None:
+    both = disc((200, 400), 100, 100, 90) | disc((200, 400), 320, 100, 60)
+    with pytest.raises(InsufficientDataError, match="two regions of 25445 and 11289 pixels: is another mirror in view"):
+        find_aperture(both)
+
+
 def test_no_valid_pixel_is_refused() -> None:
     with pytest.raises(InsufficientDataError, match="no valid pixel"):
         find_aperture(np.zeros((5, 5), dtype=bool))

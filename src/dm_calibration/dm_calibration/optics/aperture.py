@@ -14,6 +14,9 @@ from dm_common.errors import CodedError, ErrorCode
 #: Scatter of the rim about the fitted circle, relative to its radius, up to which the region counts as a disc.
 _ROUND = 0.02
 
+#: A second region of valid pixels of more than this share of the largest may be the mirror as well.
+SECOND_SHARE = 0.3
+
 #: Fewest rim points for a circle fit.
 _FEWEST_RIM_POINTS = 16
 
@@ -78,7 +81,7 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
         valid: (height, width), True where there is data.
 
     Raises:
-        InsufficientDataError: no valid pixels to speak of.
+        InsufficientDataError: no valid pixels to speak of, or two regions of like size.
     """
     region = _filled_largest_region(valid)
     x, y = _rim(region)
@@ -95,6 +98,12 @@ def _filled_largest_region(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
         raise InsufficientDataError("the map has no valid pixel, so no aperture can be found")
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
+    second, largest = np.sort(sizes)[-2:]
+    if second > SECOND_SHARE * largest:
+        raise InsufficientDataError(
+            f"the map shows two regions of {largest} and {second} pixels: is another mirror in view? Mask it, or tell "
+            "which one by aperture.radius and aperture.centre_*"
+        )
     region = labels == sizes.argmax()
     # Holes are the parts outside the region that do not touch the border; much quicker than binary_fill_holes.
     gaps, _count = ndimage.label(np.pad(~region, 1, constant_values=True))
