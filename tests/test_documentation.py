@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -371,18 +372,20 @@ def test_it_starts_and_ends_on_ctrl_c(scene: Scene, command: str) -> None:
 
 @pytest.mark.parametrize("command", WITH_OWN_DOMAIN)
 def test_the_shipped_bench_starts_and_ends_on_ctrl_c(scene: Scene, command: str) -> None:
-    _skip_without_port(12340)
+    _skip_without_port(12340, 12341, 12342, 12343)
     with own_domain() as domain:
         scene.watch(command, told.WATCHED[command], domain)
 
 
-def _skip_without_port(port: int) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            pytest.skip(f"port {port} is in use on this machine")
+def _skip_without_port(*ports: int) -> None:
+    for port, kind in product(ports, (socket.SOCK_STREAM, socket.SOCK_DGRAM)):
+        with socket.socket(type=kind) as probe:
+            if kind == socket.SOCK_STREAM:  # a connection that was closed a moment ago is in nobody's way
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                pytest.skip(f"port {port} is in use on this machine")
 
 
 @pytest.mark.parametrize("command", told.REPLAYED)
