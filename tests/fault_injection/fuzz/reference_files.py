@@ -28,8 +28,8 @@ from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_simulation.interferometer.zygo_files import encode_dat, encode_datx
-from map_fixtures import fits_bytes, h5_bytes
 
+SAMPLES = Path(__file__).parent
 WAVELENGTH = 632.8e-9
 PITCH = 24e-6
 TIME = 1571391436
@@ -214,13 +214,15 @@ def _calibration() -> ReferenceFile:
 
 
 def _fits() -> ReferenceFile:
-    content = fits_bytes(1e9 * surface())  # with a checksum
+    """`fits_bytes` of dm_calibration's test/map_fixtures.py made it of 1e9 * surface(), with a checksum."""
+    content = (SAMPLES / "sample.fits").read_bytes()
     start = len(content) - 2 * 2880
     return ReferenceFile("fits", ".fits", content, {"samples": ((start, start + 8 * surface().size),)}, 8)
 
 
 def _h5() -> ReferenceFile:
-    content = h5_bytes(surface() / WAVELENGTH)
+    """`h5_bytes` made it, there too, of surface() / WAVELENGTH."""
+    content = (SAMPLES / "sample.h5").read_bytes()
     with h5py.File(io.BytesIO(content), "r") as file:
         data = file["measurement0/genraw/data"]
         samples = data.id.get_offset(), data.id.get_offset() + data.id.get_storage_size()
