@@ -235,8 +235,7 @@ class FocusController:
             raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "action degauss: pdm_driver does not offer it (yet)")
         self.hold.end("the mirror is conditioned")
         effects: list[Effect] = []
-        before = self.conditioning.wait(order)
-        if before is not None:
+        if (before := self.conditioning.wait(order)) is not None:
             before.pending = False
             refusal = Refusal(ErrorCode.PREEMPTED, "a newer request took its place during the degauss")
             effects += self._refuse(before, refusal, now)
@@ -274,8 +273,7 @@ class FocusController:
         """
         self.monitor.lost(driver_gone)
         effects: list[Effect] = []
-        failure = self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady)
-        if failure is not None:
+        if failure := self.conditioning.failure(self.monitor, self._values["condition.timeout"], now.steady):
             effects += self._degauss_ended(now, failure)
         if (untaken := self.monitor.untaken(now.steady)) is not None:
             order, refusal = untaken
@@ -297,6 +295,6 @@ class FocusController:
         self.hold.end("the move was cancelled")
         shape.kept = False
         effects: list[Effect] = [*self.monitor.settled("it was cancelled before the driver confirmed it")]
-        if report is None or not report.applied.signals.size:
-            return effects
-        return [*effects, shape.send_on(report.applied.signals, now)]
+        if report is not None and report.applied.signals.size:
+            effects.append(shape.send_on(report.applied.signals, now))
+        return effects
