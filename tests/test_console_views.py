@@ -30,9 +30,6 @@ from dm_tools.console.loops import effective_change, modelled_loop, modelled_way
 from dm_tools.console.session import SHOWN_S, Session
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
-from dm_tools.console.widgets.actuators import towards
-from dm_tools.console.widgets.components import decimal
-from dm_tools.console.widgets.recipes import evenly
 from dm_tools.running_suite import NEEDED
 
 COUNT = 7
@@ -107,7 +104,7 @@ def test_the_command_map_has_every_actuator_where_it_is() -> None:
 @pytest.mark.parametrize(("direction", "axis", "sign"), [(0.0, "x", 1), (np.pi, "x", -1), (np.pi / 2, "y", 1)])
 def test_arrows_go_to_the_nearest_actuator_that_way(direction: float, axis: str, sign: int) -> None:
     found = view_models.cells(mirror_info(), None, None)
-    target = found[towards(found, 1, direction) - 1]
+    target = found[view_models.towards(found, 1, direction) - 1]
     assert sign * getattr(target, axis) > 0
     assert np.hypot(target.x, target.y) == pytest.approx(4.3)
 
@@ -237,7 +234,7 @@ def test_the_page_says_where_the_mirror_stands() -> None:
     ("text", "value"), [("0,02", 0.02), (" -0.02 ", -0.02), ("−1", -1.0), ("", None), ("1,2,3", None), ("nan", None)]
 )
 def test_numbers_are_taken_as_people_write_them(text: str, value: float | None) -> None:
-    assert decimal(text) == value
+    assert view_models.decimal(text) == value
 
 
 def test_the_reachable_range_needs_a_calibration() -> None:
@@ -388,8 +385,8 @@ def test_paths_are_shortened_and_topics_are_not() -> None:
 
 
 def test_recipes_are_spread_evenly() -> None:
-    assert evenly(-0.02, 0.02, 5) == [-0.02, -0.01, 0.0, 0.01, 0.02]
-    assert evenly(0.01, 0.05, 1) == [0.01]
+    assert view_models.evenly(-0.02, 0.02, 5) == [-0.02, -0.01, 0.0, 0.01, 0.02]
+    assert view_models.evenly(0.01, 0.05, 1) == [0.01]
 
 
 @pytest.mark.parametrize(
@@ -402,4 +399,4 @@ def test_recipes_are_spread_evenly() -> None:
 )
 def test_recipes_that_make_no_sense_are_refused(first: float, last: float, number: float | None, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        evenly(first, last, number)
+        view_models.evenly(first, last, number)

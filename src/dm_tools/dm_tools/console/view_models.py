@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 NM = 1e9
 #: Half-width of a 95 % interval in standard deviations.
 SIGMAS_95 = 1.96
+#: Most recipes of one run.
+NUMBER_MAX = 1000
 SIGNAL_COLOURS = "cividis"
 QUALITIES = {
     Calibration.UNCALIBRATED: "uncalibrated",
@@ -126,6 +128,20 @@ def _marks(flags: int, grade: int, signal: float | None, mirror: Any) -> list[tu
     return marks
 
 
+def towards(found: list[Cell], chosen: int, direction: float) -> int:
+    """Number of the nearest actuator in a direction (rad from x to y) from `chosen`; itself at the rim."""
+    here = found[chosen - 1]
+
+    def cost(cell: Cell) -> float:
+        dx, dy = cell.x - here.x, cell.y - here.y
+        along = dx * math.cos(direction) + dy * math.sin(direction)
+        across = abs(dy * math.cos(direction) - dx * math.sin(direction))
+        return along + 2.0 * across if along > 1e-6 and across <= 1.8 * along else math.inf
+
+    best = min(found, key=cost)
+    return best.number if math.isfinite(cost(best)) else chosen
+
+
 @dataclass(frozen=True)
 class Bar:
     """One Zernike coefficient.
@@ -207,6 +223,34 @@ def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: fl
     up = signals[actuator - 1] + amplitude
     signals[actuator - 1] = up if low <= up <= high else min(max(signals[actuator - 1] - amplitude, low), high)
     return signals
+
+
+def decimal(text: str | None) -> float | None:
+    """The number in `text`, whose decimal sign may be a comma; None = there is none."""
+    try:
+        value = float((text or "").strip().replace(",", ".").replace("−", "-"))
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def evenly(first: float | None, last: float | None, number: float | None) -> list[float]:
+    """`number` curvatures from `first` to `last`, 1/m.
+
+    Raises:
+        ValueError: naming the field that makes no sense.
+    """
+    for name, value in (("first", first), ("last", last), ("number", number)):
+        if value is None or not math.isfinite(value):
+            raise ValueError(f"{name}: must be a number")
+    assert first is not None and last is not None and number is not None
+    if not (float(number).is_integer() and 1 <= number <= NUMBER_MAX):
+        raise ValueError(f"number = {number:g}: must be a whole number, 1 to {NUMBER_MAX}")
+    if number == 1:
+        return [float(first)]
+    if first == last:
+        raise ValueError(f"first = last = {first:g} 1/m: must differ, or number must be 1")
+    return [round(first + (last - first) * k / (number - 1), 9) for k in range(int(number))]
 
 
 def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:

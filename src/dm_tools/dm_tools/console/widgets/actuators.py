@@ -16,24 +16,10 @@ from dm_tools.console.console_node import Snapshot
 from dm_tools.console.loops import modelled_loop
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
-from dm_tools.console.view_models import Cell, cells
+from dm_tools.console.view_models import Cell, cells, towards
 from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card, labelled
 
 ARROWS = {"right": 0.0, "up": math.pi / 2, "left": math.pi, "down": -math.pi / 2}
-
-
-def towards(found: list[Cell], chosen: int, direction: float) -> int:
-    """Number of the nearest actuator in a direction (rad from x to y) from `chosen`; itself at the rim."""
-    here = found[chosen - 1]
-
-    def cost(cell: Cell) -> float:
-        dx, dy = cell.x - here.x, cell.y - here.y
-        along = dx * math.cos(direction) + dy * math.sin(direction)
-        across = abs(dy * math.cos(direction) - dx * math.sin(direction))
-        return along + 2.0 * across if along > 1e-6 and across <= 1.8 * along else math.inf
-
-    best = min(found, key=cost)
-    return best.number if math.isfinite(cost(best)) else chosen
 
 
 class ActuatorCards:

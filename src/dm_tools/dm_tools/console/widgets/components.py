@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from nicegui import ui
 
 from dm_tools.console.charts.plots import Drawing
+from dm_tools.console.view_models import decimal
 
 
 def heading(text: str, level: int = 2) -> None:
@@ -32,15 +32,6 @@ def folded(title: str) -> Iterator[None]:
         with ui.element("summary"):
             heading(title)
         yield
-
-
-def decimal(text: str | None) -> float | None:
-    """The number in `text`, whose decimal sign may be a comma; None = there is none."""
-    try:
-        value = float((text or "").strip().replace(",", ".").replace("−", "-"))
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
 
 
 class DecimalField:

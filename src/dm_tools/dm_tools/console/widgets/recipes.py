@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from html import escape
 
@@ -12,32 +11,12 @@ from dm_tools.console import operations
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
-from dm_tools.console.view_models import recipe_rows
+from dm_tools.console.view_models import NUMBER_MAX, evenly, recipe_rows
 from dm_tools.console.widgets.components import ActionButton, DecimalField, Line, folded
 
 #: Range of [1], section 3.2, 1/m, and the number of its curvatures.
 FIRST, LAST, NUMBER = -0.05, 0.05, 11
-NUMBER_MAX = 1000
 HEADER = ("1/m", "conic", "largest coefficient, nm", "rms, nm", "maps")
-
-
-def evenly(first: float | None, last: float | None, number: float | None) -> list[float]:
-    """`number` curvatures from `first` to `last`, 1/m.
-
-    Raises:
-        ValueError: naming the field that makes no sense.
-    """
-    for name, value in (("first", first), ("last", last), ("number", number)):
-        if value is None or not math.isfinite(value):
-            raise ValueError(f"{name}: must be a number")
-    assert first is not None and last is not None and number is not None
-    if not (float(number).is_integer() and 1 <= number <= NUMBER_MAX):
-        raise ValueError(f"number = {number:g}: must be a whole number, 1 to {NUMBER_MAX}")
-    if number == 1:
-        return [float(first)]
-    if first == last:
-        raise ValueError(f"first = last = {first:g} 1/m: must differ, or number must be 1")
-    return [round(first + (last - first) * k / (number - 1), 9) for k in range(int(number))]
 
 
 class RecipesCard:
@@ -45,7 +24,6 @@ class RecipesCard:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._shown = ""
         with folded("Recipes"):
             self._text = Line("text")
             self._table = ui.html("", sanitize=False).classes("scroll")
@@ -81,6 +59,4 @@ class RecipesCard:
         head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in HEADER)
         body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         content = f'<table class="numbers"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>' if rows else ""
-        if content != self._shown:
-            self._shown = content
-            self._table.set_content(content)
+        self._table.set_content(content)
