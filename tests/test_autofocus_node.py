@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import math
 import os
+import runpy
 import subprocess
 import sys
 import threading
@@ -17,13 +18,14 @@ from typing import Any
 import defocused_camera
 import numpy as np
 import pytest
+import rclpy
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import GetFocusRange, HoldMirror, SetFocus, SetFocusDistance
 from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, Range
 
 from dm_autofocus import CameraFocusClient
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
@@ -358,3 +360,19 @@ def test_the_example_of_the_documentation_runs(scene: FilmedScene, domain: int) 
     assert f"sharpest at {distance_of(OPTICS.dioptre_for(0.0173)):.1f}" in done.stdout
     assert "of the pixels from" in done.stdout
     assert sorted(unexplained(done.stdout)) == []
+
+
+def test_the_vision_node_of_the_examples_focuses_on_what_it_detects() -> None:
+    root = Path(__file__).resolve().parents[1]
+    rclpy.init()
+    try:
+        node = runpy.run_path(str(root / "examples" / "vision_node.py"))["VisionNode"]()
+        asked: list[FocusRequest] = []
+        node._request.publish = asked.append
+        for distance in (12.0, -1.0, math.inf):
+            node._on_distance(Range(range=distance))
+        node._on_state(FocusState(curvature=0.01, predicted_duration=0.02))
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    assert [request.curvature for request in asked] == [OPTICS.curvature_for(1 / 12.0), OPTICS.curvature_for(0.0)]

@@ -30,8 +30,8 @@ START, SPEED, NEAREST = 9.0, 1.0, 5.2
 CHANGE, WALK, BROAD, WALKER = 1.0, 320.0, 120, 0.04
 #: Of the lamps [Hz].
 FLICKER = 100.0
-#: As the node has them: dither in depths of focus, drop, patience.
-DITHER, DROP, PATIENCE = 0.5, 0.3, 3
+#: As the node has them: dither in depths of focus, drop, patience, wait [s].
+DITHER, DROP, PATIENCE, WAIT = 0.5, 0.3, 3, 1.0
 KINDS = ("approach", "light", "flicker", "walker")
 
 
@@ -93,7 +93,7 @@ class Stage:
 def track(stage: Stage, by_optics: bool = True) -> None:
     """As the node does, by the optics or by sharpness alone."""
     config, model = search_of(stage.scene), model_of(stage.scene)
-    trials = TrackConfig(DITHER * config.tolerance, DROP, PATIENCE)
+    trials = TrackConfig(DITHER * config.tolerance, DROP, PATIENCE, WAIT)
 
     def tracker_of(peak: Peak) -> Tracker:
         if by_optics:

@@ -22,6 +22,8 @@ SIZE, FINER = 256, 2
 #: Range of the mirror's curvature [1/m].
 RANGE = 0.05
 TEXTURES = ("cloud", "leaves", "text", "points", "grating", "tiles", "soft")
+#: One more, which is not drawn: a part of the photograph that Matplotlib ships.
+PHOTOGRAPH = "photograph"
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Scene:
 
     Attributes:
         seed: everything is drawn from it.
-        texture: one of TEXTURES; "" = none at all.
+        texture: one of TEXTURES, or PHOTOGRAPH; "" = none at all.
         object_curvature: of the mirror at which the object has no defocus [1/m].
         background: the same for what stands around the object; None = nothing else is there.
         start: where the mirror stands before the search [1/m].
@@ -234,6 +236,13 @@ def _texture(kind: str, contrast: float, size: int, rng: np.random.Generator) ->
         waves = rng.integers(size // (FINER * 24), size // (FINER * 4), 2) * rng.choice((0, 1, -1), 2)
         waves = waves if waves.any() else np.array([size // (FINER * 8), 0])
         grey = np.tanh(rng.uniform(0.5, 5) * np.sin(2 * np.pi * (waves[0] * x + waves[1] * y) / size))
+    elif kind == PHOTOGRAPH:
+        from matplotlib import image as images
+        from matplotlib.cbook import get_sample_data
+
+        photograph = images.imread(get_sample_data("grace_hopper.jpg", asfileobj=False)).astype(float).mean(2)
+        down, right = (rng.integers(0, side - size + 1) for side in photograph.shape)
+        grey = photograph[down : down + size, right : right + size][:: rng.choice((1, -1)), :: rng.choice((1, -1))]
     else:
         side = FINER * rng.integers(6, 20)
         grey = rng.random((size // side + 1, size // side + 1)).repeat(side, 0).repeat(side, 1)[:size, :size]

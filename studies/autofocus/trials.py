@@ -127,7 +127,11 @@ METHODS: dict[str, Callable[[_Stage], tuple[float | None, str]]] = {
 
 def run_scene(seed: int, textured: bool = True, methods: Iterable[str] = tuple(METHODS)) -> list[Trial]:
     """Every search on the scene of a seed."""
-    scene = draw_scene(seed, textured)
+    return run_drawn(draw_scene(seed, textured), methods)
+
+
+def run_drawn(scene: Scene, methods: Iterable[str] = tuple(METHODS)) -> list[Trial]:
+    """Every search on one scene."""
     camera = SceneCamera(scene)
     trials = []
     for method in methods:

@@ -163,7 +163,12 @@ class AutofocusAction(ProbeAction):
     def _tracker(self, peak: Peak, config: SearchConfig, region: Region) -> Tracker:
         """What stays on a peak: by the optics where camera and mirror are known, else by sharpness alone."""
         values = self._values
-        trials = TrackConfig(values["track.dither"] * config.tolerance, values["track.drop"], values["track.patience"])
+        trials = TrackConfig(
+            values["track.dither"] * config.tolerance,
+            values["track.drop"],
+            values["track.patience"],
+            values["track.wait"],
+        )
         model = self._model(config, region)
         if isinstance(model, DefocusModel) and trials.dither > 0 and self._stands_where_sent():
             return MotionTracker(peak, config, trials, model)

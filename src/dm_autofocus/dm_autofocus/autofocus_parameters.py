@@ -88,6 +88,11 @@ PARAMETERS: Final = (
     Parameter("track.drop", real(0.3, 0.01, 0.99), "Tracking: relative loss of sharpness that starts a new search."),
     Parameter("track.patience", whole(3, 1, 1000), "Tracking: images in a row that must have lost it."),
     Parameter(
+        "track.wait",
+        real(1.0, 0.0, 60.0, "s"),
+        "Tracking: how long the object may be hidden, by somebody who walks past, before a new search begins.",
+    ),
+    Parameter(
         "stack.step",
         real(4.0, 0.5, 1000.0),
         "Focus stack: step between its images, in units of the finest step.",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dm_autofocus.autofocus_parameters import PARAMETERS, focus_lens
 from dm_autofocus.optics import (
     FocusOptics,
     OpticsError,
@@ -132,3 +134,14 @@ def test_many_distances_are_those_of_each_curvature(optics: FocusOptics, curvatu
 def test_beyond_the_ends_of_the_focus_distances_are_infinite() -> None:
     distances = FocusOptics(0.1).distances_for(np.array([np.nan, -np.inf, np.inf, 0.0]))
     np.testing.assert_array_equal(distances, [np.nan, np.inf, -np.inf, 10.0])
+
+
+def test_a_region_that_the_camera_reads_out_leaves_its_focal_length_binning_does_not() -> None:
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    part = SimpleNamespace(x_offset=400, y_offset=300, width=320, height=240)
+    info = SimpleNamespace(k=[50_000.0, 0.0, 0.0], binning_x=0, roi=part)
+    assert focus_lens(values, 0.011, info).focal_length_px == 50_000
+    info.binning_x = 2
+    assert focus_lens(values, 0.011, info).focal_length_px == 25_000
+    with pytest.raises(ValueError, match="came not yet"):
+        focus_lens(values, 0.011, None)

@@ -49,9 +49,30 @@ def test_the_focus_stays_on_an_object_that_moves(model: DefocusModel, speed: flo
     assert tracker.speed == pytest.approx(speed, abs=0.005)
 
 
-def test_it_ends_at_the_end_of_the_range(model: DefocusModel) -> None:
+def test_it_ends_near_the_end_of_the_range(model: DefocusModel) -> None:
+    """Where the object was a few images before it was lost."""
     tracker, _off = follow(model, HIGH - 0.01, 0.03, 30)
-    assert tracker.centre == HIGH and LOW <= tracker.step.curvature <= HIGH
+    assert HIGH - tracker.centre < tracker.BEFORE * 0.03 * PERIOD + DEPTH and LOW <= tracker.step.curvature <= HIGH
+
+
+@pytest.mark.parametrize("cover", [0.1, 4.0])
+def test_the_focus_waits_while_somebody_walks_past(model: DefocusModel, cover: float) -> None:
+    """Duller or sharper than the object: for half a second nothing of theirs is believed."""
+    camera = DefocusedCamera(clouds(3), 0.01)
+    normal = tenengrad(camera.expose(0.01))
+    trials = TrackConfig(DEPTH / 2, wait=1.0)
+    tracker = MotionTracker(Peak(0.01, normal, False), SearchConfig(LOW, HIGH, DEPTH), trials, model)
+    for number in range(40):
+        image = camera.expose(tracker.step.curvature)
+        covered = 10 <= number < 25
+        tracker.feed(cover * normal if covered else tenengrad(image), (image,), number * PERIOD)
+        assert tracker.hidden == (12 <= number < 25) and not tracker.lost
+        assert abs(tracker.centre - 0.01) < DEPTH
+    for number in range(40, 40 + 40):
+        tracker.feed(cover * normal, (image,), number * PERIOD)
+        if tracker.lost:
+            break
+    assert tracker.lost == (cover < 1), "what is sharper for long is the new normal"
 
 
 def test_what_is_seen_no_more_is_lost(model: DefocusModel) -> None:

@@ -78,11 +78,10 @@ class FocusController:
         Else requests are refused with the reason.
         """
         effects: list[Effect] = []
-        before, values = self.active, self._values
+        before = self.active
+        settings = [self._values[name] for name in ("aperture_tolerance", "hold_tilt", "optical_axis")]
         try:
-            active = active_calibration(
-                calibration, mirror, values["aperture_tolerance"], values["hold_tilt"], values["optical_axis"]
-            )
+            active = active_calibration(calibration, mirror, *settings)
             # A new revision leaves the shape that stands as it is: so it can be held on.
             if before is None or before.calibration.id != active.calibration.id:
                 self.hold.end("another calibration is used")

@@ -21,6 +21,9 @@ from dm_autofocus.search.peak_search import MOST_REFUSALS, RETREAT, Peak, Phase,
 
 #: How much better than a scene that does not change with focus a place must explain the images (twice a log ratio).
 EVIDENCE = 25.0
+#: The same when the search ends. Of 4160 scenes without anything to see, 14 reached 26 to 42 by chance; scenes with a
+#: texture of 5 % contrast and more end at 100 or above.
+CERTAIN = 60.0
 #: Images at most from where they change with focus on, and in most searches.
 MOST_IMAGES, EXPECTED_IMAGES = 15, 6
 #: Step to either side of the focus, and how far beyond the range objects are thought of, in depths of focus.
@@ -59,6 +62,7 @@ class DepthFromDefocus:
         self._powers: list[Floats] = []
         self._sharpness: list[float] = []
         self._refusals = 0
+        self._evidence = 0.0
         self._blind = 0  # images until the last that left it open whether focus changes anything
         quarter = (config.high - config.low) / 4
         below, above = config.low + quarter, config.high - quarter
@@ -112,6 +116,7 @@ class DepthFromDefocus:
             evidence: by how much the best place explains the images better than a scene that focus does not change.
         """
         config, tolerance = self.config, self.config.tolerance
+        self._evidence = evidence
         places = np.array(self._places)
         # Where the range was drawn in since, an image may lie beyond it: nothing is sought there.
         inside = (places >= config.low) & (places <= config.high)
@@ -157,6 +162,9 @@ class DepthFromDefocus:
                 if self.config.low <= wanted <= self.config.high and np.abs(places - wanted).min() > 0.3 * side:
                     self.step = Step(wanted)
                     return
+        if self._evidence < CERTAIN:
+            self._give_up("so little changes with the focus that it may be noise")
+            return
         at_limit = len(three) < 3 and min(place - self.config.low, self.config.high - place) < tolerance
         self.peak = Peak(place, float(sharpness[top]), at_limit)
         self.step = Step(place)

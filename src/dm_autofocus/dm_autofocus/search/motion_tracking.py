@@ -53,7 +53,12 @@ class MotionTracker(Tracker):
         self._aim()
 
     def feed(self, sharpness: float, images: Sequence[NDArray] = (), time: float = math.nan) -> None:
-        self._watch(sharpness)
+        self._watch(sharpness, time)
+        if self.hidden:
+            self.speed = 0.0
+            self._images.clear()
+            self.step = Step(self.centre)
+            return
         if any(image.shape != self._model.shape for image in images):
             self.lost = True
             return

@@ -21,11 +21,13 @@ class TrackConfig:
         dither: the focus is tried this far below and above [1/m]; 0 = it stands still and is only watched.
         drop: relative loss of sharpness that means: lost, search again; 0..1.
         patience: images in a row that must have lost it.
+        wait: s after which it counts as lost: until then it may be hidden, and the focus stands still.
     """
 
     dither: float = 0.0
     drop: float = 0.3
     patience: int = 3
+    wait: float = 0.0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.dither) and self.dither >= 0):
@@ -34,13 +36,17 @@ class TrackConfig:
             raise ValueError(f"drop = {self.drop}: must lie between 0 and 1")
         if self.patience < 1:
             raise ValueError(f"patience = {self.patience}: must be at least 1")
+        if not self.wait >= 0:
+            raise ValueError(f"wait = {self.wait} s: must not be negative")
 
 
 @dataclass
 class Tracker:
     """Follows a peak that was found: small trials below and above, and `lost` when the sharpness has dropped.
 
-    What a lost peak needs is a new `PeakSearch`. Slow changes of the scene are taken as the new normal.
+    What a lost peak needs is a new `PeakSearch`. Slow changes of the scene are taken as the new normal. Somebody who
+    walks through the region changes it at once, to either side, and is gone soon: the focus goes back to where it was
+    before, and waits.
 
     Attributes:
         centre: where the peak is believed to be [1/m].
@@ -48,6 +54,7 @@ class Tracker:
         low, high: range of curvatures [1/m].
         step: where to measure next.
         lost: search again.
+        hidden: the sharpness is another one at once, and may come back.
     """
 
     centre: float
@@ -58,10 +65,13 @@ class Tracker:
 
     #: Share by which the normal sharpness follows each image.
     FORGETTING = 0.02
+    #: Images before a change whose centre is gone back to: who comes in changes little at first.
+    BEFORE = 6
 
     def __post_init__(self) -> None:
-        self.lost = False
-        self._dull = 0
+        self.lost = self.hidden = False
+        self._changed, self._since = 0, math.nan
+        self._before = deque([self.centre], maxlen=self.BEFORE)
         self._trial: deque[float] = deque()
         self.step = Step(self.centre)
 
@@ -76,22 +86,36 @@ class Tracker:
         Raises:
             ValueError: the sharpness is not a finite number.
         """
-        self._watch(sharpness)
-        if self.config.dither > 0:
+        self._watch(sharpness, time)
+        if self.hidden:
+            self._trial.clear()
+            self.step = Step(self.centre)
+        elif self.config.dither > 0:
             self._trial.append(sharpness)
             if len(self._trial) == 3:
                 self._move()
             self.step = Step(min(max(self.centre + self._offset(), self.low), self.high))
 
-    def _watch(self, sharpness: float) -> None:
-        """Whether the peak is lost, by the sharpness of an image."""
+    def _watch(self, sharpness: float, time: float) -> None:
+        """Whether the peak is hidden or lost, by the sharpness of an image."""
         if not math.isfinite(sharpness):
             raise ValueError(f"sharpness = {sharpness}: must be a finite number")
-        dull = sharpness < (1 - self.config.drop) * self.sharpness
-        self._dull = self._dull + 1 if dull else 0
-        self.lost = self.lost or self._dull >= self.config.patience
-        if not dull:
+        least = 1 - self.config.drop
+        dull = sharpness < least * self.sharpness
+        if not (dull or least * sharpness > self.sharpness):
             self.sharpness += self.FORGETTING * (sharpness - self.sharpness)
+            self._changed, self.hidden = 0, False
+            self._before.append(self.centre)
+            return
+        self._changed += 1
+        if self._changed < self.config.patience:
+            return
+        if not self.hidden:
+            self.hidden, self._since, self.centre = True, time, self._before[0]
+        if not time - self._since < self.config.wait:  # without times it counts as lost at once
+            self.lost = self.lost or dull
+            if not dull:
+                self.sharpness, self._changed, self.hidden = sharpness, 0, False
 
     def _offset(self) -> float:
         return (0.0, -self.config.dither, self.config.dither)[len(self._trial)]
