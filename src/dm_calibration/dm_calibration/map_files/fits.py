@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
@@ -25,6 +26,7 @@ _TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 _METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
 #: How programs write the units of `_METRES`, beside these themselves and their plurals.
 _SPOKEN = {"meter": "m", "metre": "m", "millimeter": "mm", "micron": "um", "micrometer": "um", "nanometer": "nm"}
+_KEYWORD = re.compile("[A-Z0-9_-]*")
 #: Pitches along x and y may differ by this much before pixels count as not square.
 _SQUARE_TOLERANCE = 0.01
 
@@ -86,6 +88,8 @@ def _header(content: bytes) -> tuple[Header, int]:
         keyword = card[:8].rstrip()
         if keyword == "END" and not card[8:].strip():
             return found, -(-(at + CARD) // BLOCK) * BLOCK
+        if not _KEYWORD.fullmatch(keyword) or (not keyword and card[8:10] == "= "):
+            raise MapFileError(f"header: card {at // CARD + 1} begins with {card[:10]!r}, which is no keyword")
         if card[8:10] == "= ":
             if keyword in found:
                 raise MapFileError(f"{keyword} is there twice")
