@@ -228,6 +228,7 @@ def _h5() -> ReferenceFile:
         samples = data.id.get_offset(), data.id.get_offset() + data.id.get_storage_size()
     texts = {"wavelength": b"632.8 nm", "pitch": b"0.024 mm"}
     places = {"samples": (samples,)} | {name: _occurrences(content, text, samples) for name, text in texts.items()}
+    places["pitch"] += _occurrences(content, b"xpix", samples)  # without its name it is not told
     return ReferenceFile("h5", ".h5", content, places, 4)
 
 

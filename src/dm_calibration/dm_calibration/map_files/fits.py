@@ -87,7 +87,10 @@ def _header(content: bytes) -> tuple[Header, int]:
             raise MapFileError(f"header: card {at // CARD + 1} is no text")
         keyword = card[:8].rstrip()
         if keyword == "END" and not card[8:].strip():
-            return found, -(-(at + CARD) // BLOCK) * BLOCK
+            start = -(-(at + CARD) // BLOCK) * BLOCK
+            if content[at + CARD : start].strip(b" "):
+                raise MapFileError("header: text behind END")
+            return found, start
         if not _KEYWORD.fullmatch(keyword) or (not keyword and card[8:10] == "= "):
             raise MapFileError(f"header: card {at // CARD + 1} begins with {card[:10]!r}, which is no keyword")
         if card[8:10] == "= ":
