@@ -340,7 +340,8 @@ def test_nodes_of_the_same_name(domain: int, monkeypatch: pytest.MonkeyPatch) ->
         none = doctor_machine.running_nodes("elsewhere")
         assert none.note and "./dm up" in none.cure
         once = doctor_machine.running_nodes()
-        assert not once.cure and f"pdm_driver, in the ROS domain {domain}" in once.problem
+        assert once.note and f"pdm_driver, in the ROS domain {domain}" in once.problem
+        assert "not running: interferometer (no maps" in once.problem and "pdm_driver (" not in once.problem
         nodes.append(Node("pdm_driver", context=context))
         twice = doctor_machine.running_nodes()
         assert not twice.note and "pdm_driver: running more than once" in twice.problem
