@@ -282,7 +282,10 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedSce
     assert observer.call(SetFocusDistance, "set_focus_distance", other).error_code == ErrorCode.OK
     assert [(request.holder, request.take_over) for request in scene.asked] == [("operator", True)]
     stack = observer.run_goal(FocusStack, "focus_stack", FocusStack.Goal()).result
-    assert (stack.error_code, stack.message) == (ErrorCode.BUSY, "the action autofocus is running; cancel it first")
+    assert (stack.error_code, stack.message) == (
+        ErrorCode.BUSY,
+        "the action autofocus is running; cancel it first, or take the mirror over",
+    )
     handle.cancel_goal_async()
     wait_until(result.done, what="the end after cancel")
     assert result.result().status == GoalStatus.STATUS_CANCELED

@@ -123,6 +123,7 @@ def test_images_of_the_camera(start: Start, observer: Observer) -> None:
     assert (last.width, last.height, last.encoding, len(last.data)) == (160, 240, "mono8", 160 * 240)
     wait_until(lambda: infos, 60, "camera_info")
     assert np.array_equal(infos[-1].p.reshape(3, 4)[:, :3], infos[-1].k.reshape(3, 3)) and infos[-1].k[0] > 0.0
+    assert infos[-1].header.frame_id == last.header.frame_id == "camera_optical"
     assert np.array_equal(infos[-1].r.reshape(3, 3), np.eye(3)) and infos[-1].distortion_model == "plumb_bob"
     stamps = [Time.from_msg(image.header.stamp).nanoseconds for image in images]
     assert stamps == sorted(set(stamps))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -114,6 +115,7 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
             log.close()
     assert status == 0, output
     assert "safe shape" in output
+    assert not re.findall(r".*\b(?:ERROR|FATAL)\b.*", output)
 
 
 def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
@@ -138,3 +140,5 @@ def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
         assert row["max_zernike_nm"] <= 632.8 / 500
     assert content["fitting_limit_nm"] > 0
     assert (tmp_path / "run" / "demo.png").stat().st_size > 50_000
+    logs = [path.read_text(errors="replace") for path in (tmp_path / "run").rglob("*.log")]
+    assert len(logs) >= 5 and re.findall(r".*\b(?:WARN|ERROR|FATAL)\b.*", "\n".join(logs)) == []

@@ -23,13 +23,20 @@ from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 from dm_common.ros.clients import answers_arrive, call
 from studies.documentation.answer_cases import CASES
+from studies.documentation.state_answers import SHOWN, Nodes
 
 #: Topics that carry commands: where their answers come.
 ANSWERED_ON = {"actuator_command": ("actuator_state", ActuatorState), "focus_request": ("focus_state", FocusState)}
 PATIENCE_S = 120.0
 TITLE = "## Answers\n"
 #: Codes whose sentences hold nothing that was measured.
-EXACT = (ErrorCode.INVALID_LENGTH, ErrorCode.NOT_FINITE, ErrorCode.OUT_OF_RANGE, ErrorCode.INVALID_ARGUMENT)
+EXACT = (
+    ErrorCode.INVALID_LENGTH,
+    ErrorCode.NOT_FINITE,
+    ErrorCode.OUT_OF_RANGE,
+    ErrorCode.INVALID_ARGUMENT,
+    ErrorCode.NODE_INACTIVE,
+)
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "interfaces.md"
 
 
@@ -40,13 +47,13 @@ class Answer:
     Attributes:
         name: of the interface.
         values: as typed.
-        code: ErrorCode.
+        code: ErrorCode; None = set or refused, of a parameter.
         message: as it came.
     """
 
     name: str
     values: str
-    code: int
+    code: int | None
     message: str
 
     def sentence(self) -> str:
@@ -54,7 +61,8 @@ class Answer:
         text = re.sub(r"PDM30-37_\S+?Z|/\S+/|\S+\.dat\b", "…", self.message)
         text = re.sub(r"inside [-+]0\.\d{4} to [-+]0\.\d{4}", "inside … to …", text)  # what the calibration reaches
         text = re.sub(r"; the range was swept: .*", "", text)  # which search serves depends on the images
-        return text if self.code in EXACT else re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
+        exact = self.code is None or self.code in EXACT
+        return text if exact else re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
 
 
 def fill(message: Any, values: Mapping[str, Any]) -> Any:
@@ -143,6 +151,13 @@ def run() -> Iterator[Answer]:
                 for name, (_, cases) in CASES.items():
                     yield from (asker.ask(name, values, names) for values in cases)
                     time.sleep(0.2)  # a move that the last case began
+                nodes = Nodes(asker)
+                nodes.check_every_parameter()
+                yield from (
+                    Answer(f"/{node} {name}", str(value), None, nodes.put(node, name, value) or "set")
+                    for node, name, value in SHOWN
+                )
+                yield from (Answer(*answer) for answer in nodes.at_rest())
             finally:
                 asker.close()
 
@@ -152,15 +167,16 @@ def section(answers: Iterator[Answer]) -> str:
     lines = [
         TITLE,
         "Asked of a calibrated mirror on the virtual bench; `./dm exec python -m studies.documentation.answers` writes",
-        "this section. `[37 x 0.0]` stands for so many values, LONG for a text of 5000 characters.",
+        "this section. `[37 x 0.0]` stands for so many values, LONG for a text of 5000 characters. `ros2 param set`",
+        "knows no codes; every parameter of every node refuses a value of another type, by its name.",
         "",
         "| interface | values | code | sentence |",
         "|---|---|---|---|",
     ]
     for answer in answers:
-        code = ErrorCode(answer.code)
+        code = f"{answer.code} {ErrorCode(answer.code).name}" if answer.code is not None else "-"
         sentence = answer.sentence().replace("|", r"\|")
-        lines.append(f"| `{answer.name}` | `{answer.values}` | {code.value} {code.name} | {sentence} |")
+        lines.append(f"| `{answer.name}` | `{answer.values}` | {code} | {sentence} |")
     return "\n".join(lines) + "\n"
 
 

@@ -132,7 +132,10 @@ class FocusProbe:
     def refuse_if_used(self) -> None:
         """Raise Refusal while an action of this node holds the mirror."""
         if self.user:
-            raise Refusal(ErrorCode.BUSY, f"the action {self.user} is running; cancel it first")
+            raise Refusal(ErrorCode.BUSY, self._used())
+
+    def _used(self) -> str:
+        return f"the action {self.user} is running; cancel it first, or take the mirror over"
 
     @contextmanager
     def held(self, asked: Any, action: str) -> Iterator[None]:
@@ -145,11 +148,17 @@ class FocusProbe:
         Raises:
             Refusal: another action or somebody else has it, or there is no driver.
         """
-        with self._changed:
-            self.refuse_if_used()
-            self.user = action
-            self._other_request = None
-            self.counted = self.dropped = 0
+
+        def free() -> bool:
+            with self._changed:
+                if self.user:
+                    return False
+                self.user = action
+                return True
+
+        self._hold.wait_for(free, asked, self._used(), self._values["move_timeout"])
+        self._other_request = None
+        self.counted = self.dropped = 0
         try:
             with ExitStack() as stack:
                 purpose = f"action {action}; cancel it to end it"

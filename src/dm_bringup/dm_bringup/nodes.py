@@ -135,6 +135,9 @@ LAUNCH_ARGUMENTS = (
         "true: each node configures and activates itself, also when it was started again; false: a lifecycle manager "
         "does; events: this launch does, by lifecycle events; empty = as in the file",
     ),
+    ("place", "", "of the mirror, x y z [m] yaw pitch roll [rad] frame: tf2_ros publishes it; empty = not known"),
+    ("foxglove", "false", "with a bridge for Foxglove (package foxglove_bridge)"),
+    ("aggregator", "false", "with an aggregator of diagnostics (package diagnostic_aggregator)"),
 )
 
 
@@ -164,6 +167,35 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
         "respawn": flag("respawn", values["respawn"]),
         "respawn_delay": float(values["respawn_delay"]),
     }
+
+
+def companions_of(values: Mapping[str, str], aggregation: Path) -> list[dict[str, Any]]:
+    """Keyword arguments of the launch actions that start what others offer beside the suite.
+
+    Args:
+        values: of LAUNCH_ARGUMENTS, as text.
+        aggregation: parameter file of the aggregator.
+
+    Raises:
+        ValueError: as `arguments_of`.
+    """
+    found: list[dict[str, Any]] = []
+    if values["place"]:
+        *numbers, frame = values["place"].split()
+        names = ("x", "y", "z", "yaw", "pitch", "roll")
+        if len(numbers) != len(names):
+            raise ValueError(f"place = {values['place']!r}: must be {' '.join(names)} frame")
+        options = dict(zip(names, numbers, strict=True)) | {"frame-id": frame}
+        options["child-frame-id"] = f"{values['namespace'].strip('/')}/mirror".lstrip("/")
+        arguments = [word for name, text in options.items() for word in (f"--{name}", text)]
+        place = {"name": "mirror_place", "namespace": values["namespace"], "arguments": arguments}
+        found.append({"package": "tf2_ros", "executable": "static_transform_publisher", **place})
+    if flag("foxglove", values["foxglove"]):
+        found.append({"package": "foxglove_bridge", "executable": "foxglove_bridge"})
+    if flag("aggregator", values["aggregator"]):
+        node = {"package": "diagnostic_aggregator", "executable": "aggregator_node"}
+        found.append(node | {"parameters": [str(aggregation)]})
+    return found
 
 
 def remapping(rule: str) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState
 from lifecycle_msgs.msg import Transition
 
-from dm_bringup.nodes import BY_EVENTS, LAUNCH_ARGUMENTS, arguments_of, node_environment, nodes_of
+from dm_bringup.nodes import BY_EVENTS, LAUNCH_ARGUMENTS, arguments_of, companions_of, node_environment, nodes_of
 from dm_bringup.suite import load_config
 from launch import LaunchDescription
 
@@ -35,7 +35,8 @@ def start_nodes(context):
         if node.lifecycle and values["autostart"] == BY_EVENTS:
             actions += brought_up(action)
         actions.append(action)
-    return actions
+    aggregation = Path(get_package_share_directory("dm_bringup")) / "launch" / "diagnostics.yaml"
+    return actions + [Node(output="screen", **others) for others in companions_of(values, aggregation)]
 
 
 def brought_up(action):

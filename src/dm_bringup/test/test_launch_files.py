@@ -11,7 +11,7 @@ from unittest.mock import MagicMock
 import pytest
 import yaml
 
-from dm_bringup.nodes import LAUNCH_ARGUMENTS, NAMES, NODES, arguments_of, nodes_of
+from dm_bringup.nodes import LAUNCH_ARGUMENTS, NAMES, NODES, arguments_of, companions_of, nodes_of
 from dm_bringup.suite import ConfigError, load_config
 
 SHARE = Path(__file__).resolve().parents[1]
@@ -78,6 +78,19 @@ def test_the_health_of_every_node_has_its_place_in_the_aggregator() -> None:
     analyzers = [value for value in section["ros__parameters"].values() if isinstance(value, dict)]
     assert sorted(name for analyzer in analyzers for name in analyzer["contains"]) == sorted(NAMES)
     assert all(analyzer["timeout"] > 2.0 and analyzer["path"] for analyzer in analyzers)
+
+
+def test_the_place_of_the_mirror_and_what_others_offer() -> None:
+    given = DEFAULTS | {"place": "0.1 0 0.3 0 0 1.57 base_link", "namespace": "left", "foxglove": "true"}
+    place, bridge, aggregator = companions_of(given | {"aggregator": "true"}, SHARE / "launch" / "diagnostics.yaml")
+    assert place["package"] == "tf2_ros" and place["arguments"][-4:] == [
+        *("--frame-id", "base_link"),
+        *("--child-frame-id", "left/mirror"),
+    ]
+    assert bridge["package"] == "foxglove_bridge" and Path(aggregator["parameters"][0]).is_file()
+    assert companions_of(DEFAULTS, SHARE) == []
+    with pytest.raises(ValueError, match="place = '1 2 map': must be x y z yaw pitch roll frame"):
+        companions_of(DEFAULTS | {"place": "1 2 map"}, SHARE)
 
 
 def test_what_a_fleet_sets_reaches_every_node() -> None:

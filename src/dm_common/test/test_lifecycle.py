@@ -87,7 +87,7 @@ def test_a_node_that_rests_refuses_and_ends_its_goals(served: Example, observer:
     result = ended.result().result
     assert (result.error_code, result.message) == (ErrorCode.CANCELED, "example was deactivated: canceled where it was")
     answer = observer.call(Flatten, "flatten")
-    assert answer.error_code == ErrorCode.NODE_INACTIVE and "ros2 lifecycle set /example" in answer.message
+    assert answer.error_code == ErrorCode.NODE_INACTIVE and "ros2 lifecycle set /example activate" in answer.message
     accepted = client.send_goal_async(MoveFocus.Goal())
     wait_until(accepted.done)
     refused = accepted.result().get_result_async()

@@ -93,6 +93,8 @@ def test_a_whole_number_counts_as_a_float_and_an_empty_list_is_one(observer: Obs
     assert (values["gain"], values["positions"]) == (3.0, [0.0, 1.0])
     assert get_all(node)["gain"] == 3.0
     assert node.set_parameters([RosParameter("gain", value=7)])[0].successful
+    with pytest.raises(ParameterNotDeclaredException, match="gain = 'much': must be"):  # so the service says it
+        node.set_parameters([RosParameter("gain", value="much")])
     assert isinstance(values["gain"], float) and values["gain"] == 7.0
     node.destroy_node()
     empty = Node(

@@ -10,13 +10,14 @@ from typing import Any
 
 import pytest
 from action_msgs.msg import GoalStatus
-from dm_msgs.action import MoveFocus
+from dm_msgs.action import Degauss, MoveFocus
 from dm_msgs.msg import ErrorCode
-from dm_msgs.srv import Flatten, SetSignals
+from dm_msgs.srv import Flatten, HoldMirror, SetSignals
 from std_msgs.msg import Int32
 
-from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, answers_arrive, call
-from dm_common.ros.worker import WorkerActionServer, WorkerService, never_silent, sleep
+from dm_common.errors import Refusal
+from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, answers_arrive, call
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, never_silent, sleep
 from dm_common.values import Fields, real
 from ros_fixtures import Observer
 from waiting import wait_until
@@ -179,6 +180,41 @@ def test_a_second_goal_is_refused_while_one_runs(observer: Observer) -> None:
     wait_until(result.done)
     third, _ = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
     assert third.accepted
+
+
+def test_a_goal_that_takes_over_ends_the_one_that_runs(observer: Observer) -> None:
+    def run(goal: WorkerGoal) -> tuple[str, Any]:
+        if goal.request.take_over:
+            return "succeed", Degauss.Result()
+        wait_until(lambda: goal.is_cancel_requested)
+        return "canceled", Degauss.Result(error_code=ErrorCode.CANCELED, message="at mid range")
+
+    WorkerActionServer(observer.node, Degauss, "run", run)
+    _, first = observer.send_goal(Degauss, "run", Degauss.Goal())
+    assert observer.run_goal(Degauss, "run", Degauss.Goal(take_over=True)).status == GoalStatus.STATUS_SUCCEEDED
+    wait_until(first.done)
+    result = first.result().result
+    assert (result.error_code, result.message) == (ErrorCode.PREEMPTED, "a newer goal has taken over: at mid range")
+
+
+def test_a_run_loses_the_mirror_to_another_of_its_node_that_takes_it_over(observer: Observer) -> None:
+    observer.node.create_service(HoldMirror, "hold_mirror", lambda _request, response: response)
+    holder, holding = MirrorHolder(observer.node, "node"), threading.Event()
+    lost: list[Any] = []
+
+    def run() -> None:
+        with holder.held(Degauss.Goal(), "the first", 0.0, 30.0):
+            holding.set()
+            wait_until(lambda: holder.lost is not None)
+            lost.append(holder.lost)
+
+    threading.Thread(target=run).start()
+    assert holding.wait(30.0)
+    with pytest.raises(Refusal, match="the first"), holder.held(Degauss.Goal(), "the second", 0.0, 30.0):
+        pass
+    assert not lost
+    with holder.held(Degauss.Goal(take_over=True), "the third", 0.0, 30.0):
+        assert holder.lost is None and lost[0].error_code == ErrorCode.PREEMPTED
 
 
 def test_the_newest_goal_preempts(observer: Observer) -> None:

@@ -73,10 +73,7 @@ class FocusController:
     # --- what is known ---
 
     def use(self, calibration: Any, mirror: Any) -> list[Effect]:
-        """Use a dm_msgs/Calibration if it belongs to the mirror of dm_msgs/MirrorInfo; None = not known.
-
-        Else requests are refused with the reason.
-        """
+        """Use a dm_msgs/Calibration if it belongs to the dm_msgs/MirrorInfo, None = not known; else refuse requests."""
         effects: list[Effect] = []
         before = self.active
         settings = [self._values[name] for name in ("aperture_tolerance", "hold_tilt", "optical_axis")]

@@ -93,6 +93,9 @@ class FocusControllerNode(ManagedNode):
         with self.controller() as (controller, now):
             self._do(controller.rest(Refusal(ErrorCode.NODE_INACTIVE, self.inactive()), now), now)
 
+    def clean_up(self) -> None:
+        self.deactivate()  # with another sentence
+
     def refused(self, reason: str) -> None:
         self.deactivate()
 

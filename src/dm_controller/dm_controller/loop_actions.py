@@ -12,7 +12,7 @@ from dm_msgs.msg import FocusRequest
 from dm_msgs.srv import StoreRecipes
 from rclpy.node import Node
 
-from dm_common.errors import ErrorCode, MeasurementError, Refusal
+from dm_common.errors import MeasurementError
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal
@@ -85,8 +85,9 @@ class LoopBench(BenchServices):
         Raises:
             Refusal: another goal has it, or somebody else holds the mirror.
         """
-        if not self._goal.acquire(blocking=False):
-            raise Refusal(ErrorCode.BUSY, "a closed loop or a run of recipes is under way; cancel it first")
+        busy = "a closed loop or a run of recipes is under way; cancel it first, or take the mirror over"
+        timeout = self._parameters["converge.driver_timeout"]
+        self.hold.wait_for(lambda: self._goal.acquire(blocking=False), asked, busy, timeout)
         try:
             self._values = loop_times(self._parameters)
             self.settle_time = self._values["settle_time"]

@@ -77,6 +77,7 @@ class VirtualBenchNode(Node):
             # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
             self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
             self._info_publisher = self.create_publisher(CameraInfo, "camera_info", qos.MAP)
+            self._camera_frame = f"{self.get_namespace()}/camera_optical".lstrip("/")  # REP 103
             k = camera_matrix(self.bench.config.camera)
             self._camera_info = CameraInfo(distortion_model="plumb_bob", d=[0.0] * 5, r=np.eye(3).ravel(), k=k)
             self._camera_info.p = np.pad(np.reshape(k, (3, 3)), [(0, 0), (0, 1)]).ravel()
@@ -110,7 +111,7 @@ class VirtualBenchNode(Node):
             height, width = picture.shape
             message = Image(height=height, width=width, encoding="mono8", step=width)
             message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
-            message.header.frame_id = "camera"
+            message.header.frame_id = self._camera_frame
             message.data = array.array("B", picture.tobytes())
             self._image_publisher.publish(message)
             info = self._camera_info

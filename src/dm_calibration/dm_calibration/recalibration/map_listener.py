@@ -244,8 +244,8 @@ class MapListener:
         actuators = self._calibration().fit.actuators
         wholes([], 1, actuators, sizes=range(actuators)).check("without", request.without)
         with self._turn:
-            if self._busy():
-                raise Refusal(ErrorCode.BUSY, "a calibration is running")
+            timeout = self._values["driver_timeout"]
+            self._services.hold.wait_for(lambda: not self._busy(), request, "a calibration is running", timeout)
             with self._services.held(request, "a map is compared with the calibration (service update_calibration)"):
                 self._wait_for_rest()
                 measured = self._services.measure_as_it_stands("calibration check")

@@ -55,6 +55,7 @@ class BenchServices:
     All methods block and belong into a worker thread.
 
     Attributes:
+        hold: of the mirror.
         state: the driver's last state message; None before the first.
         settle_time: s of ROS time between command and map.
         cancelled: asked while waiting.
@@ -70,7 +71,7 @@ class BenchServices:
         self._measure = node.create_client(Measure, "measure")
         self._driver = Liveliness(node, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self._interferometer = Liveliness(node, "interferometer", SurfaceMapInfo, "surface_map_info", qos.STATE)
-        self._hold = MirrorHolder(node, node.get_name())
+        self.hold = MirrorHolder(node, node.get_name())
         self.waiting: Callable[[str], None] = _not_shown
         self.state: ActuatorState | None = None
         self.settle_time = float(values["settle_time"])
@@ -106,7 +107,7 @@ class BenchServices:
         """
         with ExitStack() as stack:
             with self._answered("hold_mirror", self._driver, self._set_signals.service_is_ready) as stop:
-                stack.enter_context(self._hold.held(asked, purpose, duration, self._values["driver_timeout"], stop))
+                stack.enter_context(self.hold.held(asked, purpose, duration, self._values["driver_timeout"], stop))
             yield
 
     def check_ready(self) -> None:
@@ -139,13 +140,13 @@ class BenchServices:
 
     def _run_degauss(self, steps: int) -> None:
         """A degauss of so many half-swings, 0 = as configured in the driver. Raises as `degauss`."""
-        goal = Degauss.Goal(steps=steps, holder=self._hold.holder)
+        goal = Degauss.Goal(steps=steps, holder=self.hold.holder)
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
             result = run_goal(self._degauss, goal, self._values["degauss_timeout"], stop)
         self._check("degauss", result)
 
     def apply(self, signals: Floats) -> Floats:
-        request = SetSignals.Request(signals=doubles(signals), wait=True, holder=self._hold.holder)
+        request = SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder)
         with self._answered("set_signals", self._driver, self._set_signals.service_is_ready) as stop:
             response = call(self._set_signals, request, self._values["driver_timeout"], stop)
         self._check("set_signals", response)
@@ -158,8 +159,8 @@ class BenchServices:
             slept = sleep(self._node.get_clock(), share * self.settle_time + dwell, self._stopping)
         except TimeoutError as error:
             raise Refusal(ErrorCode.TIMEOUT, str(error)) from error
-        if self._hold.lost is not None:
-            raise self._hold.lost
+        if self.hold.lost is not None:
+            raise self.hold.lost
         return slept
 
     def measure(self, label: str) -> Measurement:
@@ -184,7 +185,7 @@ class BenchServices:
         try:
             while not answers_arrive(self._measure, lambda: not self._no_interferometer()):
                 if self._stopping():
-                    raise self._hold.lost or Cancelled("cancelled")
+                    raise self.hold.lost or Cancelled("cancelled")
                 if time.monotonic() > deadline:
                     return False
                 time.sleep(0.02)
@@ -202,7 +203,7 @@ class BenchServices:
                 response = call(self._measure, request, timeout + 5.0, stop)
             self._check("measure", response)
         except Refusal as error:
-            if error.error_code in _FATAL or self._hold.lost is not None:
+            if error.error_code in _FATAL or self.hold.lost is not None:
                 raise
             raise MeasurementError(error.error_code, str(error)) from error
         self.map_time = (self._node.get_clock().now() - began).nanoseconds * 1e-9
@@ -224,8 +225,8 @@ class BenchServices:
                 self.apply(signals)
                 return "the mirror is back at mid range"
             except Refusal as error:
-                if self._hold.lost is not None:
-                    return f"the mirror is left as it is: {self._hold.lost}"
+                if self.hold.lost is not None:
+                    return f"the mirror is left as it is: {self.hold.lost}"
                 # A degauss or ramp that was cancelled here may still be running there.
                 if error.error_code in (ErrorCode.BUSY, ErrorCode.PREEMPTED) and time.monotonic() < deadline:
                     time.sleep(0.2)
@@ -244,9 +245,7 @@ class BenchServices:
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
             if not client.wait_for_service(timeout_sec=timeout):
                 return "the mirror could NOT be brought back to mid range: the driver does not answer"
-            future = client.call_async(
-                SetSignals.Request(signals=doubles(signals), wait=True, holder=self._hold.holder)
-            )
+            future = client.call_async(SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder))
             executor.spin_until_future_complete(future, timeout_sec=timeout)
             response = future.result() if future.done() else None
             if response is None or response.error_code != ErrorCode.OK:
@@ -258,7 +257,7 @@ class BenchServices:
             context.try_shutdown()
 
     def _stopping(self) -> bool:
-        return self.cancelled() or self._hold.lost is not None
+        return self.cancelled() or self.hold.lost is not None
 
     @contextmanager
     def _answered(self, what: str, server: Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
@@ -275,8 +274,8 @@ class BenchServices:
         except ServiceCallError as error:
             if self.cancelled():
                 raise Cancelled("cancelled") from error
-            if self._hold.lost is not None:
-                raise self._hold.lost from error
+            if self.hold.lost is not None:
+                raise self.hold.lost from error
             code = ErrorCode.DRIVER_UNAVAILABLE if server is self._driver else ErrorCode.INTERFEROMETER_UNAVAILABLE
             raise Refusal(code, f"{what}: {text}" if (text := gone()) else str(error)) from error
 

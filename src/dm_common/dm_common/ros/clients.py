@@ -184,8 +184,8 @@ class MirrorHolder:
             Refusal: BUSY, somebody else holds it.
             ServiceCallError: there is no driver.
         """
-        if not self._one.acquire(blocking=False):
-            raise Refusal(ErrorCode.BUSY, f"{self._name} holds the mirror already: {self._request.purpose}")
+        busy = f"{self._name} holds the mirror already: {self._request.purpose}"
+        self.wait_for(lambda: self._one.acquire(blocking=False), asked, busy, timeout_s)
         try:
             self.lost, self.holder = None, self._name
             self._request.purpose, self._request.duration = purpose, duration
@@ -208,6 +208,19 @@ class MirrorHolder:
                     self._release()
         finally:
             self._one.release()
+
+    def wait_for(self, free: Callable[[], bool], asked: Any, busy: str, timeout_s: float) -> None:
+        """Wait until `free()`, where `asked` takes the mirror over from a run of this node; that one loses it.
+
+        Raises:
+            Refusal: BUSY with the sentence `busy`, it does not take it over, or the run does not end in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not free():
+            if not asked.take_over or time.monotonic() > deadline:
+                raise Refusal(ErrorCode.BUSY, busy)
+            self.lost = Refusal(ErrorCode.PREEMPTED, "a newer run of the same node has taken the mirror over")
+            time.sleep(0.02)
 
     def _release(self) -> None:
         try:

@@ -122,7 +122,8 @@ class ManagedNode(LifecycleNode):
         if self.active:
             return ""
         name, trouble = self.get_fully_qualified_name(), f" ({self._trouble})" if self._trouble else ""
-        return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} configure`, then `activate`"
+        steps = "activate" if self.configured else "configure`, then `activate"
+        return f"{self.get_name()} is not active{trouble}: `ros2 lifecycle set {name} {steps}`"
 
     def check_active(self) -> None:
         """Raise Refusal when it rests."""

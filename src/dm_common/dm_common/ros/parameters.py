@@ -166,7 +166,7 @@ class Values(dict[str, Any]):
             raise ParameterError("; ".join(self.problems.values()))
 
 
-class _UnknownParameterError(ParameterNotDeclaredException):
+class _RefusedParameterError(ParameterNotDeclaredException):
     """Answered by rclpy with its text, which is to name the parameter."""
 
     def __init__(self, text: str) -> None:
@@ -206,8 +206,8 @@ def declare(
         """As `Parameter.check` does; what is wrong stays as it is, to be refused."""
         for change in changes:
             if not node.has_parameter(change.name):
-                raise _UnknownParameterError(_unknown(change.name, by_name))
-        return [_converted(by_name.get(change.name), change) for change in changes]
+                raise _RefusedParameterError(_unknown(change.name, by_name))
+        return [_converted(by_name[item.name], item) if item.name in by_name else item for item in changes]
 
     def validate(changes: list[RosParameter]) -> SetParametersResult:
         try:
@@ -270,14 +270,14 @@ def frame_id(node: Node, configured: str) -> str:
     return configured or f"{node.get_namespace()}/mirror".lstrip("/")
 
 
-def _converted(parameter: Parameter | None, change: RosParameter) -> RosParameter:
-    if parameter is None:
-        return change
+def _converted(parameter: Parameter, change: RosParameter) -> RosParameter:
     empty = parameter.value.many and change.type_ != RosParameter.Type.NOT_SET and not change.value
     try:
         return parameter.as_ros(parameter.check([] if empty else change.value))
-    except ParameterError:
-        return change
+    except ParameterError as error:
+        if change.type_ == _TYPES[parameter.kind]:
+            return change
+        raise _RefusedParameterError(str(error)) from error  # what rclpy says of another type names no parameter
 
 
 def _unknown(name: str, known: Mapping[str, Parameter]) -> str:

@@ -119,7 +119,7 @@ class WorkerService:
 
 
 class WorkerGoal:
-    """A goal as its body sees it: cancelled by its client, or by the deactivation of the node that serves it.
+    """A goal as its body sees it: also cancelled by the deactivation of its node, or by a goal that takes over.
 
     Attributes:
         handle: of rclpy.
@@ -129,7 +129,7 @@ class WorkerGoal:
     def __init__(self, handle: ServerGoalHandle, node: Node) -> None:
         self.handle, self._node = handle, node
         self.request, self.publish_feedback = handle.request, handle.publish_feedback
-        self._begun = self._session
+        self.taken_over, self._begun = False, self._session
 
     @property
     def _session(self) -> int:
@@ -138,7 +138,14 @@ class WorkerGoal:
     @property
     def is_cancel_requested(self) -> bool:
         """Whether it is to end."""
-        return bool(self.handle.is_cancel_requested) or self._session != self._begun
+        return bool(self.handle.is_cancel_requested or self.ended_by)
+
+    @property
+    def ended_by(self) -> str:
+        """What ends it other than its client, as a sentence; "" = nothing."""
+        if self._session != self._begun:
+            return f"{self._node.get_name()} was deactivated"
+        return "a newer goal has taken over" if self.taken_over else ""
 
 
 class WorkerActionServer(ActionServer):
@@ -148,8 +155,8 @@ class WorkerActionServer(ActionServer):
     after `goal.is_cancel_requested` or after `preempted(goal)` becomes true.
 
     Args:
-        exclusive: "refuse" refuses a goal while another runs; "preempt" asks the running goal to stop and starts the
-            newest one after it.
+        exclusive: "refuse" refuses a goal while another runs, unless it sets `take_over`: then the running goal is
+            cancelled; "preempt" asks the running goal to stop and starts the newest one after it.
         fields, admit: of the goal, and what raises the Refusal of one and logs it; that aborts it, no other goal hears.
     """
 
@@ -198,7 +205,7 @@ class WorkerActionServer(ActionServer):
             return self._newest is not goal
 
     def _on_goal(self, goal: Any) -> GoalResponse:
-        if self._exclusive == "refuse" and self.busy:
+        if self._exclusive == "refuse" and self.busy and not getattr(goal, "take_over", False):
             self._worker_node.get_logger().warning("goal refused: another one is running")
             return GoalResponse.REJECT
         with self._bookkeeping:
@@ -224,6 +231,8 @@ class WorkerActionServer(ActionServer):
             return
         goal = WorkerGoal(goal_handle, self._worker_node)
         with self._bookkeeping:
+            if self._newest is not None and self._exclusive == "refuse":
+                self._newest.taken_over = True
             self._newest = goal
         threading.Thread(target=self._work, args=(goal,), daemon=True).start()
 
@@ -237,8 +246,9 @@ class WorkerActionServer(ActionServer):
         finally:
             with self._bookkeeping:
                 self._running -= 1
-        if goal.is_cancel_requested and not goal.handle.is_cancel_requested:
-            result.message = f"{self._worker_node.get_name()} was deactivated: {result.message}"
+        if goal.ended_by and outcome == "canceled":
+            result.message = f"{goal.ended_by}: {result.message}"
+            result.error_code = ErrorCode.PREEMPTED if goal.taken_over else result.error_code
         self._finish(goal.handle, outcome, result)
 
     def _finish(self, goal_handle: ServerGoalHandle, outcome: str, result: Any) -> None:
