@@ -24,6 +24,7 @@ from dm_msgs.srv import SetFocus
 from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode
+from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 from dm_common.messages import doubles, recipe_book_message, time_message
 from dm_common.recipes import Recipe, RecipeBook
@@ -146,7 +147,7 @@ def make_law(creep_rate: float = 0.01) -> HysteresisModel:
     weight = np.array([[0.8], [0.1], [0.1]])
     none = np.zeros(0)
     law = HysteresisModel(radius, weight, none, 0.0, creep_rate, CREEP_TIMES)
-    return law.scaled(2.0 / law.span())
+    return normalised(law)
 
 
 def hysteresis_message(law: HysteresisModel) -> ActuatorHysteresis:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import CalibratedMirror
@@ -28,7 +29,7 @@ def law(rng: np.random.Generator) -> HysteresisModel:
     radius = np.array([0.0, 0.1, 0.3, 0.6])
     weight = np.array([0.85, 0.06, 0.05, 0.04]) * np.exp(0.2 * rng.standard_normal((ACTUATORS, 4)))
     model = HysteresisModel(radius, weight[..., None], np.zeros(0), 0.0, 0.01, CREEP_TIMES)
-    return model.scaled(2.0 / model.span())
+    return normalised(model)
 
 
 def planner(difference: float, rng: np.random.Generator) -> Planner:

@@ -13,7 +13,8 @@ from dm_calibration.hysteresis.creep_uncertainty import OWN, SHARED, SHARED_CORR
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.responses import Responses
-from dm_common.hysteresis.model import CREEP_TIMES, UNSEEN, HysteresisModel
+from dm_common.hysteresis.creep_record import UNSEEN, rested
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_controller.planning.creep_error import CreepError
 from linear_mirror import make_mirror
 
@@ -101,7 +102,7 @@ def test_what_was_held_unseen_widens_the_bound_until_it_has_faded() -> None:
     law = replace(CREEPS, creep_covariance=creep_covariance(run_of(CREEPS, 150), CREEPS))
     error, position = creep_error(law), np.linspace(-0.5, 0.5, COUNT)
     known = law.demagnetised(COUNT, 0.0)
-    guessed = law.rested(np.zeros(COUNT), 0.0)
+    guessed = rested(law, np.zeros(COUNT), 0.0)
     bounds = [error.bound(law.advance(guessed, 10.0**decade), position, 0.05).max_zernike for decade in range(7)]
     assert (np.diff(bounds) < 0.0).all()
     assert bounds[0] > 1.5 * error.bound(known, position, 0.05).max_zernike
@@ -109,7 +110,7 @@ def test_what_was_held_unseen_widens_the_bound_until_it_has_faded() -> None:
 
 
 def test_a_degauss_does_not_make_old_creep_known() -> None:
-    guessed = CREEPS.rested(np.zeros(COUNT), 0.0)
+    guessed = rested(CREEPS, np.zeros(COUNT), 0.0)
     after = CREEPS.degaussed(CREEPS.advance(guessed, 5.0), 10.0)
     assert after.crept_sigma[-1] == pytest.approx(UNSEEN, rel=1e-3)
     assert after.crept_sigma[0] < 1e-9
@@ -117,7 +118,7 @@ def test_a_degauss_does_not_make_old_creep_known() -> None:
 
 def test_after_a_calibration_only_what_came_later_is_in_doubt() -> None:
     law = replace(CREEPS, crept_at=1000.0, crept=np.full(COUNT, 0.3))
-    soon, late = (law.rested(np.zeros(COUNT), 1000.0 + elapsed).crept_sigma for elapsed in (60.0, 86_400.0))
+    soon, late = (rested(law, np.zeros(COUNT), 1000.0 + elapsed).crept_sigma for elapsed in (60.0, 86_400.0))
     assert soon[-1] < 1e-3
     assert late[-4] > 0.9 * UNSEEN
 

@@ -14,22 +14,23 @@ from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.identify import ExcitationError, Identification, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_common.hysteresis.inverse import invert
+from dm_common.hysteresis.law_shape import slope_min
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from linear_mirror import make_mirror
 
 pytestmark = pytest.mark.slow
 
-LINEAR = CANDIDATES[0]
+LINEAR, PLAIN = CANDIDATES[0], PiezoConfig()
 PLAYS = next(candidate for candidate in CANDIDATES if candidate.name == "Prandtl-Ishlinskii")
 
 
 def simulated_run(
-    law: str, maps: int = 150, noise: float = 2e-10, creep: float = 0.01, seed: int = 3
+    law: str, maps: int = 150, noise: float = 2e-10, creep: float = 0.01, seed: int = 3, more: PiezoConfig = PLAIN
 ) -> tuple[Run, NDArray[np.bool_]]:
     """A run of the excitation on seven of the simulation's actuators, seen through a random matrix, and its checks."""
     mirror = make_mirror(rings=1)
     rng = np.random.default_rng(seed)
-    piezo = PiezoActuators(PiezoConfig(law=law, creep=creep), rng, np.zeros(mirror.actuators))
+    piezo = PiezoActuators(replace(more, law=law, creep=creep), rng, np.zeros(mirror.actuators))
     commands = excitation(mirror, maps)
     mixing = rng.standard_normal((mirror.actuators, 12)) / 4.0
     time = np.cumsum(1.0 + commands.dwell)
@@ -53,6 +54,17 @@ def rising() -> Run:
     return simulated_run("prandtl_ishlinskii", 80)[0]
 
 
+def test_loops_that_widen_with_speed_and_creep_that_changes_over_the_range() -> None:
+    kinds = [candidate for candidate in CANDIDATES if candidate.name.startswith("Preisach") and not candidate.slopes]
+    plain, lagging = (
+        identify(*simulated_run("preisach", 200, more=more), [LINEAR, *kinds])
+        for more in (PLAIN, PiezoConfig(rate_dependence=0.03, creep_position=0.2))
+    )
+    assert lagging.fit.candidate.own
+    assert lagging.fit.law.creep_slope == pytest.approx(0.2, abs=0.1)
+    assert held_out_rms(lagging) < 3.0 * held_out_rms(plain)
+
+
 @pytest.mark.parametrize(
     ("law", "factor"), [("prandtl_ishlinskii", 20.0), ("preisach", 20.0), ("bouc_wen", 20.0), ("mixed", 8.0)]
 )
@@ -60,7 +72,7 @@ def test_held_out_moves_are_predicted_much_better_than_by_a_linear_law(law: str,
     run, check = simulated_run(law)
     found, linear = identify(run, check), identify(run, check, [LINEAR])
     assert held_out_rms(linear) > factor * held_out_rms(found)
-    assert found.fit.law.slope_min() > 0.1
+    assert slope_min(found.fit.law) > 0.1
 
 
 def test_the_creep_rate_is_found() -> None:

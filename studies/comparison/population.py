@@ -100,7 +100,7 @@ def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -
 
 
 def _restarted(
-    bench: SimulatedBench, active: ActiveCalibration, off: float, record: CreepRecord | None = None
+    bench: SimulatedBench, active: ActiveCalibration, off: float, record: CreepRecord | None
 ) -> DrivenMirror:
     """Electronics off for `off` s, the suite started anew, with what it finds on disk, and a degauss."""
     bench.power_cycle(off)
@@ -177,8 +177,9 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
     progress(f"seed {seed}: power cut")
     first = draw_targets(active, FIRST_REQUESTS + 1, rng)
     short = np.resize(DWELLS[:4], FIRST_REQUESTS)
+    record = driven.record()  # the last before the move
     other.power_cut(driven.plan(first[0]).signals, float(rng.uniform(0.1, 0.9)))
-    driven = _restarted(other, active, float(10.0 ** rng.uniform(0, 3.5)))
+    driven = _restarted(other, active, float(10.0 ** rng.uniform(0, 3.5)), record)
     groups[POWER_CUT] = judge_requests(driven, active, surface, first[1:], short)
 
     progress(f"seed {seed}: restart")

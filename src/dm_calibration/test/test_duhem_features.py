@@ -9,7 +9,7 @@ from dm_calibration.calibration_messages import hysteresis_message
 from dm_calibration.hysteresis.features import fading_changes, fading_feature, own_slopes, padded_slope
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_common.hysteresis.duhem import DuhemOperator
-from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.messages import hysteresis_model_from
 
 ACTUATORS, WEIGHT = 4, -0.2
@@ -34,12 +34,15 @@ def test_nothing_is_said_of_an_operator_without_weight() -> None:
 
 
 @pytest.mark.parametrize("own", [True, False])
-def test_slopes_of_each_actuator_come_back_from_the_message(own: bool) -> None:
+def test_slopes_and_lags_of_each_actuator_come_back_from_the_message(own: bool) -> None:
     common = np.array([1.4, 0.5, 0.1])
     slope = np.tile(common, (ACTUATORS, 2, 1)) * np.linspace(0.9, 1.1, 2 * ACTUATORS).reshape(ACTUATORS, 2, 1)
     play = np.ones((ACTUATORS, 1, 1)) if own else np.ones((1, 1))
     weight = np.full(ACTUATORS, WEIGHT) if own else WEIGHT
-    law = HysteresisModel(np.zeros(1), play, slope if own else common, weight, 0.0, np.zeros(0))
+    lag = np.full((ACTUATORS, 4), 2.0) if own else np.full(4, 2.0)
+    law = HysteresisModel(
+        np.zeros(1), play, slope if own else common, weight, 0.01, CREEP_TIMES, lag_spectrum=lag, creep_slope=-0.1
+    )
     back = hysteresis_model_from(hysteresis_message(HysteresisFit("Duhem", law, np.zeros(21), 1e-9, 0.02, 100, ())))
     assert back is not None
     assert back.same_as(law)

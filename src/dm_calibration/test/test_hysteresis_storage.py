@@ -18,6 +18,8 @@ MODEL = HysteresisModel(
     -0.1,
     0.01,
     CREEP_TIMES,
+    lag_spectrum=np.full((2, 7), 0.5),
+    creep_slope=0.1,
 )
 HYSTERESIS = HysteresisFit("Preisach and Duhem", MODEL, np.linspace(0.0, 1e-9, 21), 2e-9, 0.03, 312, ("One.", "Two."))
 

@@ -161,6 +161,9 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         raise ValueError(
             f"hysteresis: creep_spectrum has {spectrum.size} values, must be {creep_time.size} or for each"
         )
+    lag = np.array(message.lag_spectrum, dtype=np.float64)
+    if lag.size and (not message.lags or lag.size % message.lags):
+        raise ValueError(f"hysteresis: lag_spectrum has {lag.size} values, must be {message.lags} or for each")
     covariance = np.array(message.creep_covariance, dtype=np.float64)
     if covariance.size not in (0, 2 * (1 + creep_time.size) ** 2):
         raise ValueError(
@@ -177,6 +180,8 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         1e-9 * stamp_ns(message.crept_at),
         np.array(message.crept, dtype=np.float64),
         covariance.reshape(2, 1 + creep_time.size, -1) if covariance.size else covariance,
+        lag.reshape(-1, message.lags) if lag.size > message.lags else lag,
+        message.creep_slope,
     )
 
 

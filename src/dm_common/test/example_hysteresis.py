@@ -1,6 +1,8 @@
-"""Two hysteresis models that several test modules share."""
+"""Hysteresis models that several test modules share."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,3 +21,8 @@ def rich(creep_rate: float = 0.01) -> HysteresisModel:
     """Preisach of second order and a Duhem operator, with creep."""
     weight = np.array([[0.9, 0.05], [0.1, 0.02], [0.08, 0.01], [0.05, 0.01]])
     return HysteresisModel(RADIUS, weight, np.array([1.6, 0.3]), -0.1, creep_rate, CREEP_TIMES)
+
+
+def lagging() -> HysteresisModel:
+    """One whose loops are wider for fast moves, and whose creep changes over the range."""
+    return replace(rich(), lag_spectrum=np.full(7, 2.5), creep_slope=0.15)

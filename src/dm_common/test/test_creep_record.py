@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 from dm_common.hysteresis.creep_record import (
+    UNSEEN,
     CreepRecord,
     CreepRecorder,
     read_record,
     record_file,
     record_of,
+    rested,
     write_record,
 )
-from dm_common.hysteresis.model import CREEP_TIMES, UNSEEN, HysteresisModel
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import Applied, HysteresisObserver
 from waiting import wait_until
 
@@ -104,7 +106,7 @@ def test_a_record_of_another_law_or_mirror_is_not_used() -> None:
     other = CreepRecord(0.0, elements, np.ones((3, 5)), np.zeros(5))
     larger = CreepRecord(0.0, CREEP_TIMES, np.ones((4, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
     for record in (other, larger):
-        assert (LAW.rested(np.zeros(3), 1.0, 0.0, record).crept == 0.0).all()
+        assert (rested(LAW, np.zeros(3), 1.0, 0.0, record).crept == 0.0).all()
 
 
 def test_files_are_named_for_the_mirror(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,6 +20,7 @@ from dm_calibration.hysteresis.features import crept, fading_feature, play_featu
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of, without
 from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
 Floats = NDArray[np.float64]
@@ -257,7 +258,7 @@ class CandidateProblem:
             float(nonlinear[-1]),
             CREEP_TIMES,
         )
-        return law.scaled(2.0 / law.span())
+        return normalised(law)
 
 
 def _alternate(features: Floats, measured: Floats, weights: Floats) -> Floats:

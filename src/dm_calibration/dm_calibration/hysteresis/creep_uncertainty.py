@@ -47,14 +47,14 @@ def creep_covariance(run: Run, law: HysteresisModel) -> Floats:
         rested = still.demagnetised(run.signals.shape[1], start)
         position = follow(still, rested, run.signals[part], run.time[part], moved)[0]
         states = creep_states(position, run.time[part], start, moved)
-        return np.concatenate((position[:, None], np.array(list(states))), axis=1)
+        began = law.demagnetised(run.signals.shape[1], start)
+        effective = follow(law, began, run.signals[part], run.time[part], moved)[0]
+        return np.concatenate((position[:, None], np.array(list(states)), effective[:, None]), axis=1)
 
     features = in_parts(parts, starts, features_of)
-    creep = np.einsum(
-        "mjn,nj->mn", features[:, 1:], np.broadcast_to(law.creep_share, (features.shape[2], len(CREEP_TIMES)))
-    )
+    features, effective = features[:, :-1], features[:, -1]
     figure = figure_columns(run.time, parts, starts)[keep]
-    design = np.hstack((figure, (features[:, 0] + creep)[keep]))
+    design = np.hstack((figure, effective[keep]))
     solution = np.linalg.lstsq(design, values[keep], rcond=1e-10)[0]
     left = values[keep] - design @ solution
     scatter = run.responses.scatter(np.sqrt(np.square(left).sum(axis=0) / max(len(left) - design.shape[1], 1)))

@@ -18,6 +18,7 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candid
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
+from dm_common.hysteresis import law_shape
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -95,7 +96,7 @@ def identify(
         name = problem.candidate.name
         progress(name)
         whole = problem.fit(train)
-        slope = whole.law.slope_min(*reach)
+        slope = law_shape.slope_min(whole.law, *reach)
         if slope < slope_min:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
             return

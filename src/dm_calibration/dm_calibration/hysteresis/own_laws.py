@@ -5,7 +5,9 @@ any smooth function of the value of the play operator p_r [16]. Functions are Le
 makes them alike for neighbouring r and small for high orders, and only its strongest patterns are kept, so that forty
 numbers an actuator describe a law. The patterns of all actuators are drawn towards each other: those that one
 actuator shows badly are the mean of the others. Creep is a spectrum over the elements of the model, smooth over the
-logarithm of time, with the same pull towards a common one.
+logarithm of time, with the same pull towards a common one. Fast elements may follow loops by a spectrum of their own,
+since loops are wider for fast moves, and creep may change over the range. Low-order shapes move all actuators alike, so
+what is left out here does not average out in them: without, it passes for slow creep.
 
 Responses are linear in the gains of the actuators, in their patterns and in their spectra: each is a regularised
 least-squares solution given the other two, in turn. That of the patterns is one system of all actuators, since the
@@ -20,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Run
 from dm_calibration.hysteresis.features import (
@@ -37,6 +40,7 @@ from dm_calibration.hysteresis.features import (
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
 Floats = NDArray[np.float64]
@@ -54,6 +58,11 @@ DUHEM_WEIGHT, DUHEM_CHANGE = 0.3, 0.1
 #: Prior of the creep spectrum: standard deviation relative to the common rate, correlation over elements, and the
 #: spread between actuators relative to that.
 SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD = 0.5, 12.0, 0.3
+#: Loops are followed otherwise than the rest by elements of up to so many seconds: prior standard deviation of that.
+LAG_S, LAG = 30.0, 0.02
+LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
+#: Prior standard deviation of the relative change of creep from mid range to the end.
+CREEP_SLOPE = 0.3
 #: Rounds of the three solutions in turn. With 6 the slow creep is a third less true and held-out errors up to four
 #: times as large, with 60 hardly better.
 ROUNDS = 20
@@ -68,7 +77,8 @@ class OwnFit(LawFit):
 
     Attributes:
         patterns: (F, N) weights of the features of each actuator.
-        creep: (J, N) weights of the creep elements.
+        creep: (J + L + 1, N) weights of the creep elements, what the first L of them add for loops, and the change of
+            creep per unit of position.
         scatter: (D,) uncertainty of each response, from what these laws leave.
     """
 
@@ -105,7 +115,11 @@ class OwnLaws:
         self._creeps = common.creep_rate > 0.0
         self._creep = weight_of(common.creep_rate)
         prior_of_creep = spectrum_prior(common.creep_rate, SPECTRUM, SPECTRUM_CORRELATION)
-        self._creep_prior = np.asarray(np.linalg.inv(prior_of_creep), dtype=np.float64)
+        number = np.arange(LAGS)
+        lag = LAG**2 * np.exp(-np.abs(np.subtract.outer(number, number)) / SPECTRUM_CORRELATION)
+        prior = block_diag(prior_of_creep, lag, CREEP_SLOPE**2)
+        self._creep_prior = np.asarray(np.linalg.inv(prior), dtype=np.float64)
+        self._signal_states = np.array(list(self._creep_states(signals)))[:, :LAGS]
         self._creep_between = _alike(count, SPECTRUM_SPREAD)
         self._figure = figure_columns(run.time, self._parts, self._starts)
 
@@ -120,7 +134,8 @@ class OwnLaws:
         else:
             patterns = np.eye(self._plain.shape[1], 1) * np.ones(actuators)
             # Where the maps show no common creep, no actuator has any.
-            creep = np.full((len(CREEP_TIMES), actuators), self._creep if self._creeps else 0.0)
+            creep = np.zeros((len(self._creep_prior), actuators))
+            creep[: len(CREEP_TIMES)] = self._creep if self._creeps else 0.0
             scatter, slope = self._scatter, self._slope
             if slope.size:
                 slope = padded_slope(slope, actuators)
@@ -148,14 +163,14 @@ class OwnLaws:
     def _rounds(
         self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Patterns (F, N), creep (J, N), scatter (D,) and residual (M, D) after ROUNDS solutions in turn."""
+        """Patterns (F, N), creep (J + L + 1, N), scatter (D,) and residual (M, D) after ROUNDS solutions in turn."""
         more = features.shape[1] - self._plain.shape[1]
         sigma = np.concatenate((np.ones(self._basis.shape[1]), np.full(min(more, 1), DUHEM_WEIGHT)))
         sigma = np.concatenate((sigma, np.full(max(more - 1, 0), DUHEM_CHANGE)))
         prior = np.diag(sigma**-2.0)
         patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
         free = basis_of(self._figure[keep])
-        crept = self._with_creep(features, creep)
+        crept = self._with_creep(features, creep, patterns)
         gains, residual = self._gains(crept, patterns, keep)
         for number in range(ROUNDS):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
@@ -163,13 +178,13 @@ class OwnLaws:
             patterns = self._patterns(crept[keep], gains / scatter, measured, free, prior)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
-                creep = self._spectra(position, gains / scatter, measured, keep, free)
-                crept = self._with_creep(features, creep)
+                creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
+                crept = self._with_creep(features, creep, patterns)
             gains, residual = self._gains(crept, patterns, keep)
         return patterns, creep, scatter, residual
 
     def _law(self, patterns: Floats, creep: Floats, slope: Floats) -> HysteresisModel:
-        """The law of the weights (F, N) and (J, N), each actuator's effective signal spanning 2 in a full cycle."""
+        """The law of the weights (F, N) and (J + L + 1, N), effective signals spanning 2 in a full cycle."""
         count, orders = self._basis.shape[1], self.candidate.powers
         series = (self._basis @ patterns[1 : 1 + count]).T.reshape(-1, len(self.radius), orders)
         powers = np.zeros((orders, orders + 1))
@@ -177,18 +192,22 @@ class OwnLaws:
             powers[order - 1, : order + 1] = legendre.leg2poly(np.eye(orders + 1)[order, : order + 1])
         play_weight = series @ powers[:, 1:]
         play_weight[:, 0, 0] += patterns[0]
-        share = np.maximum(creep.T, 0.0)
+        share, lag = np.maximum(creep[: len(CREEP_TIMES)].T, 0.0), creep[len(CREEP_TIMES) : -1].T
         mean = float(share.mean())
-        law = HysteresisModel(
-            self.radius,
-            play_weight,
-            slope,
-            patterns[-1].copy() if slope.size else 0.0,
-            mean / PER_ELEMENT,
-            CREEP_TIMES,
-            share / mean if mean else np.zeros(0),
+        share[:, :LAGS] += lag
+        return normalised(
+            HysteresisModel(
+                self.radius,
+                play_weight,
+                slope,
+                patterns[-1].copy() if slope.size else 0.0,
+                mean / PER_ELEMENT,
+                CREEP_TIMES,
+                share / mean if mean else np.zeros(0),
+                lag_spectrum=-lag / mean if mean else np.zeros(0),
+                creep_slope=float(creep[-1].mean()),
+            )
         )
-        return law.scaled(2.0 / law.span())
 
     def _creep_states(self, values: Floats) -> Iterator[Floats]:
         """(J, ...) what the creep elements have followed of `values` (M, ...) at each map; each part begins rested."""
@@ -196,11 +215,19 @@ class OwnLaws:
         for part, start in zip(self._parts, self._starts, strict=True):
             yield from creep_states(values[part], run.time[part], start, run.moved_in(part))
 
-    def _with_creep(self, features: Floats, creep: Floats) -> Floats:
-        """`features` (M, F, N) with the creep that the spectra `creep` (J, N) add."""
+    def _with_creep(self, features: Floats, creep: Floats, patterns: Floats) -> Floats:
+        """`features` (M, F, N) with the creep that the spectra `creep` (J + L + 1, N) add."""
         if not creep.any():
             return features
-        return features + np.array([np.einsum("jfn,jn->fn", state, creep) for state in self._creep_states(features)])
+        count = len(CREEP_TIMES)
+        loops = creep[:count].copy()
+        loops[:LAGS] += creep[count:-1]
+        added = np.empty_like(features)
+        for row, state in enumerate(self._creep_states(features)):
+            added[row, 0] = np.einsum("jn,jn->n", state[:, 0], creep[:count])
+            added[row, 1:] = np.einsum("jfn,jn->fn", state[:, 1:], loops)
+        slope = creep[-1] * np.einsum("mfn,fn->mn", added, patterns)
+        return features * (1.0 + slope[:, None]) + added
 
     def _gains(self, crept: Floats, patterns: Floats, keep: Rows) -> tuple[Floats, Floats]:
         """Gains (N, D) and residual (M, D), m."""
@@ -222,13 +249,20 @@ class OwnLaws:
         solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, prior, self._between)
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
-    def _spectra(self, position: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats) -> Floats:
-        """(J, N) weights of the creep elements."""
-        elements = np.array(list(self._creep_states(position)))[keep]
-        left = measured - (position[keep] + self._creep * elements.sum(axis=1)) @ gains
-        return self._creep + weights_of(
-            without(elements, free), without(left, free), gains, self._creep_prior, self._creep_between
-        )
+    def _spectra(
+        self, position: Floats, creep: Floats, gains: Floats, measured: Floats, keep: Rows, free: Floats
+    ) -> Floats:
+        """(J + L + 1, N) weights of the creep elements, of those that only loops follow, and creep's change."""
+        elements = np.array(list(self._creep_states(position)))
+        lags = elements[:, :LAGS] - self._signal_states
+        elements = np.concatenate((elements, lags), axis=1)
+        sloped = position * np.einsum("mjn,jn->mn", elements, creep[:-1])
+        elements = np.concatenate((elements, sloped[:, None]), axis=1)[keep]
+        count = len(CREEP_TIMES)
+        left = measured - (position[keep] + self._creep * elements[:, :count].sum(axis=1)) @ gains
+        found = weights_of(without(elements, free), without(left, free), gains, self._creep_prior, self._creep_between)
+        found[:count] += self._creep
+        return found
 
 
 def pattern_basis(radius: Floats, orders: int) -> Floats:

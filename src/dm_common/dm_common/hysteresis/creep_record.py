@@ -8,6 +8,7 @@ import re
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from dm_common.hysteresis.observer import HysteresisObserver
 
 Floats = NDArray[np.float64]
+
+#: Standard deviation of a shape that was held unseen, in shapes of the whole range.
+UNSEEN = 0.5
 
 
 class CreepRecord(NamedTuple):
@@ -83,6 +87,28 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
     if 0.0 < now < float(time):
         raise ValueError(f"{file}: written {float(time) - now:.0f} s from now: was the clock set back?")
     return CreepRecord(float(time), creep_time, crept, sigma)
+
+
+def rested(
+    law: HysteresisModel, signals: Floats, time: float, middle: float = 0.0, record: CreepRecord | None = None
+) -> HysteresisState:
+    """The state at `time` (s) of a mirror that stands at `signals` (N,), if it has stood there since it was known.
+
+    That is since `record`, or since a calibration. Elements slower than that is ago hold what they held then; what was
+    held meanwhile is in doubt.
+    """
+    moved = law.move(law.demagnetised(len(signals), time, middle), signals, time)
+    settled = np.repeat(moved.position[:, None], len(law.creep_time), axis=1)
+    sigma = np.full(len(law.creep_time), UNSEEN)
+    if record is None or record.time > time or not np.array_equal(record.creep_time, law.creep_time):
+        held = np.repeat(law.crept[:, None], len(law.creep_time), axis=1)
+        record = CreepRecord(law.crept_at, law.creep_time, held, np.zeros(len(law.creep_time)))
+    if record.crept.shape == settled.shape and time >= record.time:
+        left = np.exp(-(time - record.time) / law.creep_time)
+        settled += (record.crept - settled) * left
+        sigma = np.hypot(sigma * (1.0 - left), record.crept_sigma * left)
+    lagged = np.repeat(signals[:, None], len(law.lag_time), axis=1)
+    return replace(moved, crept=settled, crept_sigma=sigma, lagged=lagged)
 
 
 def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -> CreepRecord | None:

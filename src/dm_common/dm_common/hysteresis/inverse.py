@@ -31,6 +31,8 @@ Floats = NDArray[np.float64]
 #: Effective signals are met to this; a DAC step is three hundred times as large.
 TOLERANCE = 1e-7
 ROUNDS_MAX = 60
+#: Rounds of the inverse where a part follows the signals, which are known only then; less than two DAC steps are left.
+LAG_ROUNDS = 2
 #: Newton's step never divides by less; laws that can be inverted are steeper by far.
 SLOPE_MIN = 1e-3
 #: What neighbours stay below their limit: one step of a 16-bit DAC, since each of the two is rounded.
@@ -69,8 +71,12 @@ def invert(
     if law.is_identity:
         signals = np.clip(effective, low, high)
         return Inverted(signals, effective - signals)
-    wanted = law.position_for(state, effective, ahead)
-    inverted = pieces(law).solve(state, wanted, low, high)
+    faded, grown, followed = law.creep_ahead(state, ahead)
+    grown, apart = grown + followed, state.signals - state.position
+    for _ in range(LAG_ROUNDS if law.lag_spectrum.size else 1):
+        wanted = law.static_of(effective, grown, faded + followed * apart)
+        inverted = pieces(law).solve(state, wanted, low, high)
+        apart = inverted.signals - wanted
     limited = inverted.missed != 0.0
     if not limited.any():
         return inverted
@@ -230,16 +236,12 @@ class ConstrainedInverse:
         """
         wanted = self._project @ rows
         law, limits = self._law, self._limits
-        rest = np.exp(-ahead / law.creep_time)
-        growth = 1.0 + law.creep_share @ (1.0 - rest)  # of a step taken now, until it counts
-        crept = (law.creep_share * at.crept) @ rest
 
         def reached(signals: Floats) -> Floats:
-            return np.asarray(growth * law.position_at(at, signals) + crept)
+            return law.effective_at(at, signals, ahead)
 
         def rise(signals: Floats) -> Floats:
-            change = law.position_at(at, signals + SLOPE_STEP) - law.position_at(at, signals - SLOPE_STEP)
-            return np.asarray(growth * change / (2.0 * SLOPE_STEP))
+            return (reached(signals + SLOPE_STEP) - reached(signals - SLOPE_STEP)) / (2.0 * SLOPE_STEP)
 
         def missed(effective: Floats) -> float:
             return float(np.linalg.norm(self._root @ effective - wanted))

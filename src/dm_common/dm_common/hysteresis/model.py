@@ -9,7 +9,9 @@ the gains. Signals are normalised, so is the effective signal: it spans 2 over a
   of half-width r that are up are those centred below p_r (ibid.). Half-width 0 is the signal itself: the loading curve.
 * Optionally a :class:`~dm_common.hysteresis.duhem.DuhemOperator`, for hysteresis that fades.
 * Creep: the static part is followed by first-order elements evenly spaced over the logarithm of time, which together
-  grow by `creep_rate` of a step per decade [17, 18]; a spectrum says how much more or less each of them does.
+  grow by `creep_rate` of a step per decade [17, 18]; a spectrum says how much more or less each of them does. The first
+  of them follow the signal by a spectrum of its own: what its loops add may lag behind, or creep, otherwise than the
+  straight part does, so that loops are wider for fast moves. Creep may grow from one end of the range to the other.
 
 The weights are those of all actuators, or each actuator has its own.
 
@@ -24,15 +26,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.creep_record import CreepRecord
 from dm_common.hysteresis.duhem import DuhemOperator
 
 Floats = NDArray[np.float64]
 
 #: Time constants of creep, s: from the shortest dwell to more than a day, two per decade.
 CREEP_TIMES = np.geomspace(0.03, 3e5, 15)
-#: Standard deviation of a shape that was held unseen, in shapes of the whole range.
-UNSEEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +46,7 @@ class HysteresisState:
         position: (N,) static effective signal: hysteresis without creep.
         crept: (N, J) what the creep elements have followed so far.
         crept_sigma: (J,) its standard deviation, in shapes of the whole range: 0 but where some were held unseen.
+        lagged: (N, L) what the elements that follow the signals have followed of them.
     """
 
     time: float
@@ -56,6 +56,7 @@ class HysteresisState:
     position: Floats
     crept: Floats
     crept_sigma: Floats
+    lagged: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +75,9 @@ class HysteresisModel:
             the calibration: its figure is relative to that. Empty = not told.
         creep_covariance: (2, 1 + J, 1 + J) of the errors of the weights of `position` and of the creep elements: those
             that all actuators share, and those of each by itself. Empty = not told.
+        lag_spectrum: (L,) or (N, L) weight of each of the first L elements in following the signal, relative to an even
+            spectrum; empty = none.
+        creep_slope: relative change of creep per unit of `position`.
 
     Raises:
         ValueError: shapes, numbers that are not finite, or a law that cannot be inverted, naming the field.
@@ -89,6 +93,8 @@ class HysteresisModel:
     crept_at: float = 0.0
     crept: Floats = field(default_factory=lambda: np.zeros(0))
     creep_covariance: Floats = field(default_factory=lambda: np.zeros(0))
+    lag_spectrum: Floats = field(default_factory=lambda: np.zeros(0))
+    creep_slope: float = 0.0
 
     def __post_init__(self) -> None:
         if self.play_radius.ndim != 1 or not self.play_radius.size:
@@ -145,10 +151,23 @@ class HysteresisModel:
     def creep_share(self) -> Floats:
         """(J,) or (N, J) weight of each creep element; zeros without creep."""
         count = len(self.creep_time)
-        if count < 2:
-            return np.zeros(count)
-        even = self.creep_rate * np.log10(self.creep_time[-1] / self.creep_time[0]) / (count - 1)
-        return np.asarray(even * (self.creep_spectrum if self.creep_spectrum.size else np.ones(count)))
+        return np.asarray(self._even * (self.creep_spectrum if self.creep_spectrum.size else np.ones(count)))
+
+    @cached_property
+    def lag_share(self) -> Floats:
+        """(L,) or (N, L) weight of each element that follows the signals."""
+        return np.asarray(self._even * self.lag_spectrum)
+
+    @property
+    def _even(self) -> float:
+        """Weight of each element of an even spectrum; 0 without creep."""
+        time = self.creep_time
+        return self.creep_rate * float(np.log10(time[-1] / time[0])) / (len(time) - 1) if len(time) > 1 else 0.0
+
+    @property
+    def lag_time(self) -> Floats:
+        """(L,) s, of the elements that follow the signals."""
+        return self.creep_time[: self.lag_spectrum.shape[-1]]
 
     @property
     def actuators(self) -> int:
@@ -158,7 +177,8 @@ class HysteresisModel:
     @property
     def _own(self) -> tuple[tuple[int, ...], ...]:
         slope = self.duhem_slope.shape[:-2]
-        return self.play_weight.shape[:-2], slope, np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1]
+        lag = self.lag_spectrum.shape[:-1]
+        return self.play_weight.shape[:-2], slope, np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1], lag
 
     # --- states ---
 
@@ -166,7 +186,8 @@ class HysteresisModel:
         """The state after a degauss that ended at `middle`, long rested there."""
         play = np.full((actuators, len(self.play_radius)), middle)
         none, crept = np.zeros(actuators), np.zeros((actuators, len(self.creep_time)))
-        state = HysteresisState(time, np.full(actuators, middle), play, none, none, crept, crept.sum(axis=0))
+        lagged = np.full((actuators, len(self.lag_time)), middle)
+        state = HysteresisState(time, np.full(actuators, middle), play, none, none, crept, crept.sum(axis=0), lagged)
         position = self._position(play, state.fading)
         return replace(state, position=position, crept=np.repeat(position[:, None], len(self.creep_time), axis=1))
 
@@ -174,27 +195,7 @@ class HysteresisModel:
         """The state after a degauss that ended at `middle`; creep remembers what was before."""
         waited = self.advance(state, time)
         fresh = self.demagnetised(len(state.signals), waited.time, middle)
-        return replace(fresh, crept=waited.crept, crept_sigma=waited.crept_sigma)
-
-    def rested(
-        self, signals: Floats, time: float, middle: float = 0.0, record: CreepRecord | None = None
-    ) -> HysteresisState:
-        """The state at `time` (s) of a mirror that stands at `signals` (N,), if it has stood there since it was known.
-
-        That is since `record`, or since a calibration. Elements slower than that is ago hold what they held then; what
-        was held meanwhile is in doubt.
-        """
-        moved = self.move(self.demagnetised(len(signals), time, middle), signals, time)
-        settled = np.repeat(moved.position[:, None], len(self.creep_time), axis=1)
-        sigma = np.full(len(self.creep_time), UNSEEN)
-        if record is None or record.time > time or not np.array_equal(record.creep_time, self.creep_time):
-            held = np.repeat(self.crept[:, None], len(self.creep_time), axis=1)
-            record = CreepRecord(self.crept_at, self.creep_time, held, np.zeros(len(self.creep_time)))
-        if record.crept.shape == settled.shape and time >= record.time:
-            left = np.exp(-(time - record.time) / self.creep_time)
-            settled += (record.crept - settled) * left
-            sigma = np.hypot(sigma * (1.0 - left), record.crept_sigma * left)
-        return replace(moved, crept=settled, crept_sigma=sigma)
+        return replace(fresh, crept=waited.crept, crept_sigma=waited.crept_sigma, lagged=waited.lagged)
 
     def advance(self, state: HysteresisState, time: float) -> HysteresisState:
         """The same signals at a later time (s). A time before the state's is taken as the state's."""
@@ -205,7 +206,10 @@ class HysteresisModel:
             return replace(state, time=time)
         rest = np.exp(-elapsed / self.creep_time)
         crept = state.position[:, None] + (state.crept - state.position[:, None]) * rest
-        return replace(state, time=time, crept=crept, crept_sigma=state.crept_sigma * rest)
+        lagged = state.lagged
+        if lagged.size:
+            lagged = state.signals[:, None] + (lagged - state.signals[:, None]) * rest[: lagged.shape[1]]
+        return replace(state, time=time, crept=crept, crept_sigma=state.crept_sigma * rest, lagged=lagged)
 
     def move(self, state: HysteresisState, signals: Floats, time: float) -> HysteresisState:
         """Wait until `time` (s), then go to `signals` (N,) on a straight way."""
@@ -219,13 +223,30 @@ class HysteresisModel:
 
     def creep(self, state: HysteresisState) -> Floats:
         """(N,) the part of the effective signal that changes by itself."""
-        return np.asarray((self.creep_share * state.crept).sum(axis=1))
+        creep = (self.creep_share * state.crept).sum(axis=1) + (self.lag_share * state.lagged).sum(axis=1)
+        return np.asarray((1.0 + self.creep_slope * state.position) * creep)
 
-    def position_for(self, state: HysteresisState, effective: Floats, ahead: float = 0.0) -> Floats:
-        """(N,) static effective signals that, taken at the state's time, become `effective` (N,) `ahead` s later."""
+    def creep_ahead(self, state: HysteresisState, ahead: float) -> tuple[Floats, Floats, Floats]:
+        """Creep `ahead` s later of what is, and what shares of static effective signals and signals then add to it."""
         rest = np.exp(-ahead / self.creep_time)
-        faded = (self.creep_share * state.crept) @ rest
-        return np.asarray((effective - faded) / (1.0 + self.creep_share @ (1.0 - rest)))
+        lag_rest = rest[: self.lag_spectrum.shape[-1]]
+        faded = (self.creep_share * state.crept) @ rest + (self.lag_share * state.lagged) @ lag_rest
+        return faded, self.creep_share @ (1.0 - rest), self.lag_share @ (1.0 - lag_rest)
+
+    def static_of(self, effective: Floats, grown: Floats, faded: Floats) -> Floats:
+        """(N,) static effective signals p of which `effective` (N,) is p + (1 + creep_slope p) (grown p + faded)."""
+        position = (effective - faded) / (1.0 + grown)
+        slope = self.creep_slope
+        if slope:  # one step of Newton's method: the change is small
+            position = position - slope * position * (grown * position + faded) / (
+                1.0 + grown + slope * (2.0 * grown * position + faded)
+            )
+        return np.asarray(position)
+
+    def effective_at(self, state: HysteresisState, signals: Floats, ahead: float) -> Floats:
+        """(N,) effective signal `ahead` s after a straight move from `state` to `signals` (N,)."""
+        moved = replace(state, signals=signals, position=self.position_at(state, signals))
+        return self.effective(self.advance(moved, state.time + ahead))
 
     def position_at(self, state: HysteresisState, signals: Floats) -> Floats:
         """(N,) static effective signal that a straight move from `state` to `signals` (N,) would lead to."""
@@ -249,39 +270,6 @@ class HysteresisModel:
             result = result + self.duhem_weight * fading
         return np.asarray(result)
 
-    # --- what can be inverted ---
-
-    def slope_min(self, low: float = -1.0, high: float = 1.0) -> float:
-        """Smallest slope of the effective signal over signals of `low` .. `high`, on any way.
-
-        After a turn the operators set in one by one, narrow ones first; what has set in follows the signal at a
-        distance of its half-width. Those of half-width r have set in only where the turn can lie 2 r behind.
-        """
-        order = np.argsort(self.play_radius)
-        radius, weight = self.play_radius[order], self.play_weight[..., order, :]
-        signal, way = np.linspace(low, high, 201)[:, None], np.array([1.0, -1.0])[:, None, None]
-        behind = np.where(way > 0.0, signal - low, high - signal)
-        value = signal - way * radius
-        weight = weight[..., None, None, :, :]  # a row for each way and signal
-        slope = np.zeros(np.broadcast_shapes(value.shape, weight.shape[:-1]))
-        for power in range(weight.shape[-1], 0, -1):
-            slope = slope * value + power * weight[..., power - 1]
-        slope = np.where(2.0 * radius <= behind, slope, 0.0)
-        smallest = np.cumsum(slope, axis=-1).min(axis=(-3, -2, -1))
-        if self._duhem is not None:
-            least, most = self._duhem.slope_range
-            smallest = smallest + np.minimum(self.duhem_weight * least, self.duhem_weight * most)
-        return float(np.min(smallest))
-
-    def span(self) -> Floats:
-        """Effective signal at +1 less that at -1 in a full cycle that closes, of each law: (1,) or (N,)."""
-        count = self.actuators or 1
-        state = self.demagnetised(count, 0.0)
-        for turn in (1.0, -1.0, 1.0, -1.0):
-            state = self.move(state, np.full(count, turn), 0.0)
-        low = state.position
-        return np.asarray(self.move(state, np.ones(count), 0.0).position - low)
-
     def scaled(self, factor: float | Floats) -> HysteresisModel:
         """The same law with effective signals `factor` times as large, a number or (N,)."""
         factors = np.asarray(factor, dtype=np.float64)
@@ -293,4 +281,6 @@ class HysteresisModel:
             play_weight=factors[..., None, None] * self.play_weight,
             duhem_weight=duhem,
             crept=factors * self.crept if self.crept.size else self.crept,
+            lag_spectrum=factors[..., None] * self.lag_spectrum if self.lag_spectrum.size else self.lag_spectrum,
+            creep_slope=self.creep_slope / float(np.mean(factors)),
         )

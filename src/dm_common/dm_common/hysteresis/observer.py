@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.creep_record import CreepRecord
+from dm_common.hysteresis.creep_record import CreepRecord, rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
 Floats = NDArray[np.float64]
@@ -133,7 +133,7 @@ class HysteresisTracker:
         self.state = self.law.move(self.state, report.signals, report.time)
 
     def _guess(self, report: Applied, reason: str) -> None:
-        self.state, self.unknown = self.law.rested(report.signals, report.time, self._middle, self._record), reason
+        self.state, self.unknown = rested(self.law, report.signals, report.time, self._middle, self._record), reason
 
     def _guess_keeping_creep(self, report: Applied, reason: str) -> None:
         """Where the mirror stands is known, on which branch is not."""

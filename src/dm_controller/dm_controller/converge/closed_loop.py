@@ -24,6 +24,7 @@ from typing import Protocol
 import numpy as np
 
 from dm_common.errors import Cancelled
+from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
@@ -95,7 +96,7 @@ class Creep:
     def of_rate(cls, rate: float, signals: Floats, now: Callable[[], float]) -> Creep:
         """Of actuators without hysteresis that creep by `rate` per decade and have long stood at `signals` (N,)."""
         law = HysteresisModel.linear(rate)
-        return cls(law, law.rested(signals, now()), now)
+        return cls(law, rested(law, signals, now()), now)
 
 
 @dataclass(frozen=True, eq=False)

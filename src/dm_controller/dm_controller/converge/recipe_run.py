@@ -17,6 +17,7 @@ from rclpy.client import Client
 from rclpy.node import Node
 
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
+from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
 from dm_common.ros.clients import ServiceCallError, call
@@ -158,7 +159,7 @@ class RecipeRun:
         state = self._bench.state
         if state is None or not len(state.applied) or not np.isfinite(state.applied).all():
             return None
-        return law.rested(np.array(state.applied, dtype=float), now, middle)
+        return rested(law, np.array(state.applied, dtype=float), now, middle)
 
     def _stored(self, request: Any) -> tuple[int, str]:
         """What the calibration node answers: an ErrorCode and a sentence."""

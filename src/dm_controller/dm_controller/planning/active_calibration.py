@@ -193,7 +193,9 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
         raise ValueError(f"hysteresis: {str(error).removeprefix('hysteresis: ')}") from error
     if law is None:
         return None
-    slope = law.slope_min(limits.low, limits.high)
+    from dm_common.hysteresis.law_shape import slope_min, span  # a start does not wait for it
+
+    slope = slope_min(law, limits.low, limits.high)
     if not slope > 0.0:
         raise ValueError(
             f"hysteresis: play_weight: effective signals fall with the signal somewhere (slope {slope:.3g}); must rise"
@@ -202,11 +204,11 @@ def hysteresis_figures_of(calibration: Any, limits: Limits) -> HysteresisFigures
         raise ValueError(
             f"hysteresis: play_weight: laws of {law.actuators} actuators, must be of {calibration.actuators} or one"
         )
-    spans = law.span()
-    span = spans[np.abs(spans - SPAN).argmax()]
-    if not abs(span - SPAN) <= SPAN_TOLERANCE:
+    spans = span(law)
+    furthest = spans[np.abs(spans - SPAN).argmax()]
+    if not abs(furthest - SPAN) <= SPAN_TOLERANCE:
         raise ValueError(
-            f"hysteresis: play_weight: effective signals span {span:.3g}, must be {SPAN:g}: a law of another scale"
+            f"hysteresis: play_weight: effective signals span {furthest:.3g}, must be {SPAN:g}: a law of another scale"
         )
     sigma = np.array(hysteresis.zernike_sigma, dtype=np.float64)
     if sigma.shape != (calibration.terms,) or not (np.isfinite(sigma) & (sigma >= 0.0)).all():

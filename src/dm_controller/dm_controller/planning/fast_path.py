@@ -20,7 +20,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.inverse import Pieces, horner, pieces
+from dm_common.hysteresis.inverse import LAG_ROUNDS, Pieces, horner, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
 from dm_common.optics.conic import disc_coefficients
@@ -122,10 +122,14 @@ class PreparedInverse:
     def __init__(self, law: HysteresisModel, state: HysteresisState, limits: Limits) -> None:
         self.state, self._limits, self._low, self._high = state, limits, limits.low, limits.high
         self._rate = -1.0 / law.creep_time
-        self._share = np.atleast_2d(law.creep_share)
-        self._creeps = bool(law.creep_rate)
+        self._law, self._share, self._lag = law, np.atleast_2d(law.creep_share), np.atleast_2d(law.lag_share)
+        self._rounds = LAG_ROUNDS if law.lag_spectrum.size else 1
         self._gap = self._share * (state.crept - state.position[:, None])
-        self._rests: dict[float, tuple[Floats, float]] = {}
+        lags = self._lag.shape[1]
+        if lags:
+            self._gap[:, :lags] += self._lag * (state.lagged - state.signals[:, None])
+        self._apart = state.signals - state.position
+        self._rests: dict[float, tuple[Floats, Floats, Floats]] = {}
         parts = pieces(law)
         # Without the signal itself there is a dead zone about the state, which no piece describes.
         self._serves = parts.radius[0] == 0.0
@@ -198,26 +202,35 @@ class PreparedInverse:
         """Signals (N,) applied at `time` (s) for `effective` (N,) `ahead` s later; None = ask `invert`."""
         if not self._serves:
             return None
-        wanted = self._static(time, effective, ahead)
-        places = np.where(wanted >= self.state.position, self._rising + wanted, self._falling - wanted)
-        piece = self._table[self._places.searchsorted(places, "right") - 1].T
-        rise = wanted - piece[1]
-        if len(piece) == 3:
-            signals = piece[0] + piece[2] * rise
-        else:
-            signals = piece[0] + ((piece[4] * rise + piece[3]) * rise + piece[2]) * rise
+        faded, grown, followed = self._creep(time, ahead)
+        signals, apart = self.state.signals, self._apart
+        for _ in range(self._rounds):
+            wanted = self._law.static_of(effective, grown, faded + followed * apart)
+            signals = self._looked_up(wanted)
+            apart = signals - wanted
         # Not beyond an end by rounding either; where a piece is not exact there is no number.
         inside = np.minimum.reduce(signals) >= self._low and np.maximum.reduce(signals) <= self._high
         return np.asarray(signals) if inside and self._limits.allow_neighbours(signals) else None
 
-    def _static(self, time: float, effective: Floats, ahead: float) -> Floats:
-        """What `HysteresisModel.position_for` gives for the state at `time`."""
-        if not self._creeps:
-            return effective
+    def _looked_up(self, wanted: Floats) -> Floats:
+        """Signals (N,) for static effective signals; NaN where a piece is not exact."""
+        places = np.where(wanted >= self.state.position, self._rising + wanted, self._falling - wanted)
+        piece = self._table[self._places.searchsorted(places, "right") - 1].T
+        rise = wanted - piece[1]
+        if len(piece) == 3:
+            return np.asarray(piece[0] + piece[2] * rise)
+        return np.asarray(piece[0] + ((piece[4] * rise + piece[3]) * rise + piece[2]) * rise)
+
+    def _creep(self, time: float, ahead: float) -> tuple[Floats, Floats, Floats]:
+        """As `HysteresisModel.creep_ahead` for the state at `time`, but what signals add is in both shares."""
         elapsed = max(time - self.state.time, 0.0) + ahead
         known = self._rests.get(ahead)
         if known is None:
-            rest = self._share @ np.exp(ahead * self._rate)
-            known = rest * self.state.position, 1.0 + self._share.sum(axis=1) - rest
+            rest = np.exp(ahead * self._rate)
+            lag = self._lag @ rest[: self._lag.shape[1]]
+            followed = self._lag.sum(axis=1) - lag
+            rest = self._share @ rest
+            faded = rest * self.state.position + lag * self.state.signals
+            known = faded, self._share.sum(axis=1) - rest + followed, followed
             self._rests[ahead] = known
-        return np.asarray((effective - known[0] - self._gap @ np.exp(elapsed * self._rate)) / known[1])
+        return known[0] + self._gap @ np.exp(elapsed * self._rate), known[1], known[2]
