@@ -33,10 +33,17 @@ class CalibrationManager:
         aperture_tolerance: Callable[[], float],
         now_ns: Callable[[], int],
         publish: Callable[[Calibration | None, Path | None], None],
+        resting: Callable[[], str] = lambda: "",
     ) -> None:
-        """`publish` is called with the calibration in use and its file at every change."""
+        """Nothing is in use at first.
+
+        Args:
+            publish: called with the calibration in use and its file at every change.
+            resting: the reason why no other calibration may be used now; "" = it may.
+        """
         self.store = store
         self._aperture_tolerance, self._now_ns, self._publish = aperture_tolerance, now_ns, publish
+        self._resting = resting
         self._lock = threading.RLock()
         # Held while a stored calibration is changed, so that no change gets lost; writing may take long.
         self._changing = threading.Lock()
@@ -82,10 +89,16 @@ class CalibrationManager:
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")
 
     def use(self, calibration: Calibration | None) -> None:
-        """Use `calibration`, which is in the store, from now on."""
+        """Use `calibration`, which is in the store, from now on. Raises Refusal where the node rests by now."""
         with self._lock:
-            self.in_use = calibration
-            self._publish(calibration, self.store.find(calibration.id) if calibration else None)
+            if calibration is not None and (reason := self._resting()):
+                raise Refusal(ErrorCode.NODE_INACTIVE, f"{calibration.id} is stored, but not used: {reason}")
+            self._put(calibration)
+
+    def _put(self, calibration: Calibration | None) -> None:
+        """Take `calibration` in use; the lock must be held."""
+        self.in_use = calibration
+        self._publish(calibration, self.store.find(calibration.id) if calibration else None)
 
     def publish_again(self) -> None:
         """Publish the calibration in use anew."""
@@ -137,7 +150,7 @@ class CalibrationManager:
             self.store.replace(after)
             with self._lock:
                 self._checked_in_use(calibration_id)
-                self.use(after)
+                self._put(after)
             return after
 
     def _checked_in_use(self, calibration_id: str) -> Calibration:

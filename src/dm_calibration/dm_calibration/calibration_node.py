@@ -59,6 +59,7 @@ class CalibrationNode(ManagedNode):
             lambda: float(self._values["aperture_tolerance"]),
             lambda: int(self.get_clock().now().nanoseconds),
             self._publish,
+            self.inactive,
         )
         self._bench_services = BenchServices(self, self._values)
         self._driver_facts: dict[str, Any] = {}

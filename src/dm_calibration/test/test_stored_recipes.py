@@ -41,8 +41,9 @@ class Stand:
         self.published: list[Calibration | None] = []
         self.store = CalibrationStore(folder)
         self.file = self.store.save(calibration)
+        self.resting = ""
         self.manager = CalibrationManager(
-            self.store, lambda: 0.01, lambda: 0, lambda one, _file: self.published.append(one)
+            self.store, lambda: 0.01, lambda: 0, lambda one, _file: self.published.append(one), lambda: self.resting
         )
         self.manager.set_mirror(MIRROR)
         self.manager.load("known")
@@ -82,6 +83,15 @@ def test_recipes_join_the_calibration_and_its_file(stand: Stand) -> None:
     assert stand.published[-1] is stand.manager.in_use
     assert stand.published[-1] is not None
     assert len(stand.published[-1].recipes.recipes) == 3
+
+
+def test_what_comes_after_a_cleanup_is_not_used(stand: Stand) -> None:
+    stand.resting = "calibration is not active"
+    stand.manager.use(None)
+    with pytest.raises(Refusal, match="known is stored, but not used: calibration is not active") as caught:
+        stand.manager.load("known")
+    assert caught.value.error_code == ErrorCode.NODE_INACTIVE
+    assert stand.manager.in_use is None and stand.published[-1] is None
 
 
 def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
