@@ -183,9 +183,9 @@ def test_cancel_holds_the_shape_reached_and_the_newest_goal_preempts(bench: Benc
 
 
 def test_deactivated_in_a_move_it_holds_the_shape_reached_and_refuses_until_it_is_active_again(bench: Bench) -> None:
-    def change(transition: int) -> None:
+    def change(transition: int, possible: bool = True) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        assert bench.observer.call(ChangeState, "focus_controller/change_state", request).success
+        assert bench.observer.call(ChangeState, "focus_controller/change_state", request).success == possible
 
     bench.follow = False
     bench.ready()
@@ -207,6 +207,7 @@ def test_deactivated_in_a_move_it_holds_the_shape_reached_and_refuses_until_it_i
     wait_until(lambda: bench.focus_states and bench.focus_states[-1].error_code == ErrorCode.NODE_INACTIVE)
     assert len(bench.commands) == 2
     change(Transition.TRANSITION_ACTIVATE)
+    change(Transition.TRANSITION_CONFIGURE, possible=False)
     bench.follow = True
     wait_until(lambda: bench.set_focus(curvature=0.01).error_code == ErrorCode.OK)
 

@@ -23,7 +23,7 @@ from waiting import wait_until
 TABLE = (
     AUTOSTART,
     Parameter("gain", real(2.0, 0.0, 10.0), "gain", live=True),
-    Parameter("count", whole(3, 0, 10), "count; 7 will not do with anything"),
+    Parameter("count", whole(3, 0, 10), "count; 7 will not do with anything, 8 will not begin"),
 )
 
 
@@ -39,6 +39,8 @@ class Example(ManagedNode):
     def run(self, goal: WorkerGoal) -> tuple[str, Any]:
         if sleep(self.get_clock(), 30.0, lambda: goal.is_cancel_requested):
             return "succeed", MoveFocus.Result()
+        if goal.request.tolerance > 0.0:
+            return "succeed", MoveFocus.Result(message="it was too late")
         return "canceled", MoveFocus.Result(error_code=ErrorCode.CANCELED, message="canceled where it was")
 
     def configure(self) -> None:
@@ -47,6 +49,8 @@ class Example(ManagedNode):
         self.did.append(f"configure {self._values['count']}")
 
     def activate(self) -> None:
+        if self._values["count"] == 8:
+            raise ValueError("count = 8: will not begin")
         self.did.append("activate")
 
     def deactivate(self) -> None:
@@ -99,6 +103,14 @@ def test_a_node_that_rests_refuses_and_ends_its_goals(served: Example, observer:
     client.destroy()
 
 
+def test_a_goal_that_is_done_all_the_same_says_so(served: Example, observer: Observer) -> None:
+    _handle, ended = observer.send_goal(MoveFocus, "move_focus", MoveFocus.Goal(tolerance=1.0))
+    served.trigger_deactivate()
+    wait_until(ended.done)
+    assert ended.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert ended.result().result.message == "it was too late"
+
+
 def test_parameters_change_while_it_rests_and_wrong_ones_keep_it_resting(observer: Observer) -> None:
     node = Example(context=observer.node.context, parameter_overrides=[RosParameter("count", value=11)])
     node.autostart()
@@ -112,6 +124,9 @@ def test_parameters_change_while_it_rests_and_wrong_ones_keep_it_resting(observe
     assert node.put("count", 7) == ""
     node.trigger_activate()
     assert not node.active and node.configured and "count = 7: will not do" in node.inactive()
+    assert node.put("count", 8) == ""
+    node.trigger_activate()
+    assert not node.active and "count = 8: will not begin" in node.inactive()
     assert node.put("count", 4) == ""
     node.trigger_activate()
     assert node.did[-2:] == ["configure 4", "activate"]

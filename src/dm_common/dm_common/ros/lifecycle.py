@@ -93,6 +93,9 @@ class ManagedNode(LifecycleNode):
         self._unlock = "deactivate" if self.rests else "cleanup"
         self._values = declare(self, table, on_change, self._unlocked, self._unlock, check)
         self._diagnostics = Diagnostics(self, hardware_id, self._health_in_any_state)
+        for service in self.services:
+            if service.srv_name.endswith("/change_state"):
+                service.callback = self._answering(service.callback)
 
     # --- what nodes do ---
 
@@ -143,13 +146,26 @@ class ManagedNode(LifecycleNode):
         if self._values["autostart"] and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
 
+    def _answering(self, change: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """`change_state` that refuses transitions which its state does not have; rclpy gives no answer at all."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except RuntimeError as error:
+                self.get_logger().warning(f"transition {request.transition.label or request.transition.id}: {error}")
+                response.success = False
+                return response
+
+        return answer
+
     def _done(self, *steps: Callable[[], None]) -> TransitionCallbackReturn:
         """Take the steps of a transition; what they raise is logged, which rclpy does not."""
         try:
             for step in steps:
                 step()
         except ValueError as error:
-            self._trouble = str(error)
+            self.active, self._trouble = False, str(error)
             self.get_logger().error(f"configuration refused: {error}")
             self.refused(self._trouble)
             return TransitionCallbackReturn.FAILURE
@@ -179,7 +195,10 @@ class ManagedNode(LifecycleNode):
             return done
         super().on_activate(state)  # publishers, before anything is published
         self.active, self.session = True, self.session + self.rests
-        return self._done(self.activate)
+        done = self._done(self.activate)
+        if done == TransitionCallbackReturn.FAILURE:
+            super().on_deactivate(state)
+        return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         done = self._done(self._rest)
