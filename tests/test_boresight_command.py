@@ -76,6 +76,22 @@ def test_an_axis_that_makes_it_worse_is_not_kept(held: dict[str, Any], monkeypat
     np.testing.assert_allclose(held["optical_axis"], 0)
 
 
+def test_an_axis_that_was_not_seen_to_be_right_is_not_kept(
+    held: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    see = PlayedCamera.boresight
+
+    def interrupted(camera: PlayedCamera, region: Any, take_over: bool) -> Boresight:
+        if np.any(held["optical_axis"]):
+            raise KeyboardInterrupt
+        return see(camera, region, take_over)
+
+    monkeypatch.setattr(PlayedCamera, "boresight", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        dm_tools.boresight.run_boresight("", "0,0,1,1", False, None, None, None)
+    np.testing.assert_allclose(held["optical_axis"], 0)
+
+
 def test_a_region_outside_the_image_is_refused() -> None:
     with pytest.raises(typer.BadParameter, match="region inside it"):
         dm_tools.boresight.region_of("0.5,0,0.6,1")

@@ -157,8 +157,8 @@ class CameraFocusClient(DeformableMirrorClient):
             return cut(grey(self.messages["image_raw"]), part)
 
         try:
-            found = find_boresight(see, focus, step, pairs)
+            return find_boresight(see, focus, step, pairs)
         except BoresightError as error:
             raise DeformableMirrorError(ErrorCode.NOT_CONVERGED, str(error)) from error
-        self.focus(focus, **claim)
-        return found
+        finally:  # it was tilted on purpose
+            self.focus(focus, **claim)

@@ -74,14 +74,17 @@ def run_boresight(
         if before > max(STILL_PX, 2 * sigma):
             held, axis = axis, axis + found.offset(client.capabilities.aperture_radius)
             set_parameter(client, "focus_controller", "optical_axis", axis.tolist())
-            _found, after, sigma = moved()
-            if after >= before:
+            try:
+                _found, after, sigma = moved()
+                if after >= before:
+                    raise DeformableMirrorError(
+                        ErrorCode.NOT_CONVERGED,
+                        f"with another axis it moves by {after:.2f} px: does all that is in and near the region stand "
+                        "still, at one distance? The axis is as it was",
+                    )
+            except BaseException:  # Ctrl-C too: an axis that nobody has seen to be right is not kept
                 set_parameter(client, "focus_controller", "optical_axis", held.tolist())
-                raise DeformableMirrorError(
-                    ErrorCode.NOT_CONVERGED,
-                    f"with another axis it moves by {after:.2f} px: does all that is in and near the region stand "
-                    "still, at one distance? The axis is as it was",
-                )
+                raise
             console.print(f"now by {after:.2f} px (± {sigma:.2f})")
         cost = price(client, axis)
     console.print(f"the camera's axis meets the mirror at x = {1e3 * axis[0]:+.3f} mm, y = {1e3 * axis[1]:+.3f} mm")
