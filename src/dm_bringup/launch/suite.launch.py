@@ -10,6 +10,7 @@ from launch.actions import (
     OpaqueFunction,
     RegisterEventHandler,
     SetEnvironmentVariable,
+    TimerAction,
 )
 from launch.event_handlers import OnProcessStart
 from launch.events import matches_action
@@ -22,6 +23,9 @@ from lifecycle_msgs.msg import Transition
 from dm_bringup.nodes import BY_EVENTS, LAUNCH_ARGUMENTS, arguments_of, companions_of, node_environment, nodes_of
 from dm_bringup.suite import load_config
 from launch import LaunchDescription
+
+#: From the start of a process until it is asked to configure, s.
+DISCOVERY_S = 3.0
 
 
 def start_nodes(context):
@@ -45,9 +49,11 @@ def brought_up(action):
     def change(transition):
         return [EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(action), transition_id=transition))]
 
+    # A request that leaves before both sides have discovered each other is lost, and so is one to a process that died.
+    begin = TimerAction(period=DISCOVERY_S, actions=change(Transition.TRANSITION_CONFIGURE))
     configured = {"start_state": "configuring", "goal_state": "inactive"}
     return [
-        RegisterEventHandler(OnProcessStart(target_action=action, on_start=change(Transition.TRANSITION_CONFIGURE))),
+        RegisterEventHandler(OnProcessStart(target_action=action, on_start=[begin])),
         RegisterEventHandler(
             OnStateTransition(
                 target_lifecycle_node=action, entities=change(Transition.TRANSITION_ACTIVATE), **configured
