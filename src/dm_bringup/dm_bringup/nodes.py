@@ -133,7 +133,7 @@ LAUNCH_ARGUMENTS = (
         "autostart",
         "",
         "true: each node configures and activates itself, also when it was started again; false: a lifecycle manager "
-        "does; events: this launch does, by lifecycle events; empty = as in the file",
+        "does; events: this launch does, but for nodes that were killed; empty = as in the file",
     ),
     ("place", "", "of the mirror, x y z [m] yaw pitch roll [rad] frame: tf2_ros publishes it; empty = not known"),
     ("foxglove", "false", "with a bridge for Foxglove (package foxglove_bridge)"),
