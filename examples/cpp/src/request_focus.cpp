@@ -23,7 +23,12 @@ int main(int argc, char ** argv)
   }
 
   MoveFocus::Goal goal;
-  goal.request.curvature = argc > 1 ? std::atof(argv[1]) : 0.02;  // 1/m of the surface, positive = concave
+  char * end = nullptr;
+  goal.request.curvature = argc > 1 ? std::strtod(argv[1], &end) : 0.02;  // 1/m of the surface, positive = concave
+  if (argc > 1 && (end == argv[1] || *end != '\0')) {
+    RCLCPP_ERROR(node->get_logger(), "curvature %s: must be a number, 1/m", argv[1]);
+    return EXIT_FAILURE;
+  }
   goal.tolerance = 20e-9;  // m, largest predicted Zernike coefficient error that will do
 
   auto accepted = client->async_send_goal(goal);

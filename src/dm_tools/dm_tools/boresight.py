@@ -28,17 +28,19 @@ def region_of(text: str) -> tuple[float, ...]:
 
 def price(client: Any, axis: Any) -> dict[str, Any]:
     """What holding the picture costs: reachable curvatures [1/m] and residual [nm rms] with it and with free tilt."""
-    from dm_common.mirror import APERTURE_TOLERANCE
     from dm_controller.planning.active_calibration import active_calibration
     from dm_controller.planning.target import FocusTarget
 
     figures: dict[str, Any] = {}
+    aperture_tolerance, reachable_tolerance = (
+        get_parameter(client, "focus_controller", f"{name}_tolerance") for name in ("aperture", "reachable")
+    )
     wanted = [client.capabilities.curvature_min, client.capabilities.curvature_max]
     for name, hold in (("held", True), ("free", False)):
         active = active_calibration(
-            client.latest("calibration"), client.mirror_info, APERTURE_TOLERANCE, hold, tuple(axis)
+            client.latest("calibration"), client.mirror_info, aperture_tolerance, hold, tuple(axis)
         )
-        low, high = active.reachable_range(FocusTarget(0.0), 2e-8)
+        low, high = active.reachable_range(FocusTarget(0.0), reachable_tolerance)
         rms = max(active.mirror.plan(FocusTarget(curvature)).rms for curvature in wanted)
         figures[name] = {"curvature_min": low, "curvature_max": high, "residual_rms_nm": 1e9 * rms}
     return figures

@@ -13,7 +13,6 @@ import numpy as np
 from dm_msgs.msg import ActuatorState, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import Measure, UpdateCalibration
-from rclpy.node import Node
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_manager import CalibrationManager
@@ -27,7 +26,7 @@ from dm_common.measurement import Measurement
 from dm_common.messages import applied_from, measurement_from, stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.lifecycle import OK, WARN
+from dm_common.ros.lifecycle import OK, WARN, ManagedNode
 from dm_common.ros.worker import WorkerService
 from dm_common.values import wholes
 
@@ -50,7 +49,7 @@ class MapListener:
 
     def __init__(
         self,
-        node: Node,
+        node: ManagedNode,
         values: Mapping[str, Any],
         manager: CalibrationManager,
         services: BenchServices,
@@ -155,7 +154,7 @@ class MapListener:
             self._node.get_logger().error(f"actuator_state refused: {error}", throttle_duration_sec=10.0)
 
     def _on_part(self, name: str, message: Any) -> None:
-        if not self._values["updates.enable"] or self._busy() or self._updates.calibration is None:
+        if not (self._values["updates.enable"] and self._node.active and self._updates.calibration) or self._busy():
             return
         stamp = stamp_ns(message.header.stamp)
         parts = self._incomplete.setdefault(stamp, {})
@@ -198,6 +197,7 @@ class MapListener:
             if time.monotonic() > deadline:
                 raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
             time.sleep(0.01)
+        self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
         verdict = self._updates.take(measured, self._history.settled(at, still), dry_run, without)

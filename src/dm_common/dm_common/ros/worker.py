@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -205,9 +206,11 @@ class WorkerActionServer(ActionServer):
             return self._newest is not goal
 
     def _on_goal(self, goal: Any) -> GoalResponse:
-        if self._exclusive == "refuse" and self.busy and not getattr(goal, "take_over", False):
-            self._worker_node.get_logger().warning("goal refused: another one is running")
-            return GoalResponse.REJECT
+        with suppress(Refusal):  # a node that rests says so in the result
+            _check_active(self._worker_node)
+            if self._exclusive == "refuse" and self.busy and not getattr(goal, "take_over", False):
+                self._worker_node.get_logger().warning("goal refused: another one is running")
+                return GoalResponse.REJECT
         with self._bookkeeping:
             self._running += 1
         return GoalResponse.ACCEPT

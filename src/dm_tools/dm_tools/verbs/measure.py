@@ -54,7 +54,7 @@ def measure(
     if reference_sphere is not None:
         figures["pitch"] = _scale(info, coefficients, reference_sphere)
         write_json(json, {"measure": figures})
-        next_step("put pitch and scale_error into the parameter file; then take the sphere out")
+        next_step("put the parameters into the parameter file; then take the sphere out")
         return
     write_json(json, {"measure": figures})
     next_step("./dm check compares a map with the calibration in use")
@@ -74,7 +74,9 @@ def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> 
         "and the sphere's radius counts by half",
         soft_wrap=True,
     )
-    console.print(f"/**/interferometer:\n  ros__parameters:\n    pitch: {pitch:.12f}\n    scale_error: {share:.6f}")
+    console.print(f"/**/interferometer:\n  ros__parameters:\n    pitch: {pitch:.12f}")
+    if info.instrument_error > 0.0:
+        console.print(f"    scale_error: {1e9 * info.instrument_error * share:.6f}")
     return pitch
 
 

@@ -1,0 +1,27 @@
+"""What `./dm measure --reference-sphere` prints, to be pasted."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import yaml
+
+from dm_common.optics.conic import conic_coefficients
+from dm_common.optics.zernike import DEFOCUS
+from dm_tools.verbs import measure
+
+
+@pytest.mark.parametrize("instrument_error", [0.0, 5e-9])
+def test_the_bound_of_the_scale_is_that_of_the_instrument(
+    instrument_error: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pitch, pixels = 200e-6, 55.0
+    coefficients = conic_coefficients(1.0 / 1.5, 0.0, pixels * pitch)
+    info = SimpleNamespace(aperture_radius_px=pixels, pitch=1.002 * pitch, instrument_error=instrument_error)
+    assert measure._scale(info, list(coefficients), 1.5) == pytest.approx(pitch, rel=1e-6)
+    text = capsys.readouterr().out
+    values = yaml.safe_load(text[text.index("/**/") :])["/**/interferometer"]["ros__parameters"]
+    assert values["pitch"] == pytest.approx(pitch, rel=1e-6)
+    expected = 0.5 * instrument_error / coefficients[DEFOCUS]  # the scale goes with the root of the defocus
+    assert values.get("scale_error", 0.0) == pytest.approx(expected, rel=0.02)
