@@ -67,9 +67,7 @@ class CalibrationNode(ManagedNode):
         self._server = WorkerActionServer(
             self, Calibrate, "calibrate", action.run, exclusive="refuse", fields=requests.CALIBRATE
         )
-        self._listener = MapListener(
-            self, self._values, self._manager, self._bench_services, lambda: self._server.busy
-        )
+        self._listener = MapListener(self, self._values, self._manager, self._bench_services, lambda: self._server.busy)
         WorkerService(self, ListCalibrations, "list_calibrations", self._on_list)
         WorkerService(self, LoadCalibration, "load_calibration", self._on_load, requests.LOAD_CALIBRATION)
         fields = requests.FIT_INFLUENCE_FUNCTION
