@@ -264,7 +264,7 @@ class Scene:
             )
             assert process.poll() is None, log.read_text(errors="replace")
             if command.startswith("./dm record"):  # it fails when there was nothing to record
-                wait_until(lambda: self.client.node.count_subscribers("actuator_state") > listeners, 60.0)
+                wait_until(lambda: self.client.node.count_subscribers("actuator_state") > listeners, 150.0)
             time.sleep(2.0)  # a moment of work, not only of starting
             process.send_signal(signal.SIGINT)
             assert process.wait(60.0) in (0, INTERRUPTED), log.read_text(errors="replace")

@@ -31,8 +31,9 @@ from support import fast_bench, wait_until
 
 pytestmark = pytest.mark.processes
 
-#: Within which a missing node is known, s.
+#: Within which a missing node is known, s, and what is allowed for it on a busy machine.
 KNOWN_S = 2.0
+ALLOWED_S = 4 * KNOWN_S
 
 
 @dataclass
@@ -160,7 +161,7 @@ def test_a_calibration_is_not_harmed_by_requests_and_goes_on_when_the_interferom
     assert "calibration has held the mirror for" in busy.message and "cancel the action calibrate" in busy.message
     assert bench.set_signals(0.5).error_code == ErrorCode.BUSY
     bench.kill("interferometer")
-    running.wait_for(lambda feedback: "the node interferometer has died" in feedback.message, KNOWN_S)
+    running.wait_for(lambda feedback: "the node interferometer has died" in feedback.message, ALLOWED_S)
     running.wait_for(lambda feedback: feedback.message == "")
     result = running.end()
     timer.cancel()
@@ -207,8 +208,8 @@ def test_a_dead_driver_is_known_and_used_again(bench: Bench) -> None:
     answers = [bench.focus() for _ in range(3)]
     assert {answer.error_code for answer in answers} == {ErrorCode.DRIVER_UNAVAILABLE}
     assert not any(answer.state.applied for answer in answers)
-    assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.DRIVER_UNAVAILABLE, KNOWN_S)
-    assert time.monotonic() - began < 2 * KNOWN_S
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.DRIVER_UNAVAILABLE, ALLOWED_S)
+    assert time.monotonic() - began < 2 * ALLOWED_S
     assert bench.client.capabilities.curvature_max == 0.0
     bench.paused = False
     assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.OK, 60.0)
@@ -221,7 +222,7 @@ def test_an_unplugged_unit_is_known(bench: Bench) -> None:
     bench.client.clients["power"] = power
     assert wait_until(power.service_is_ready)
     power.call_async(SetBool.Request(data=False))
-    assert bench.client.wait(lambda: bench.client.capabilities.error_code != ErrorCode.OK, KNOWN_S + 1.0)
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code != ErrorCode.OK, ALLOWED_S)
     assert bench.client.capabilities.quality == Capabilities.UNCALIBRATED
     power.call_async(SetBool.Request(data=True))
     assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.OK, 20.0)
@@ -233,7 +234,7 @@ def test_a_closed_loop_names_the_interferometer_and_goes_on_with_it(bench: Bench
     running.wait_for(lambda feedback: feedback.step > 0)
     assert bench.focus().error_code == ErrorCode.BUSY
     bench.kill("interferometer")
-    running.wait_for(lambda feedback: "the node interferometer has died" in feedback.message, KNOWN_S)
+    running.wait_for(lambda feedback: "the node interferometer has died" in feedback.message, ALLOWED_S)
     began = time.monotonic()
     running.wait_for(lambda feedback: feedback.message == "" and np.isfinite(feedback.max_zernike))
     result = running.end()
@@ -249,7 +250,7 @@ def test_a_check_without_an_interferometer_says_so_at_once(bench: Bench) -> None
     with pytest.raises(DeformableMirrorError, match="the node interferometer has died") as refused:
         bench.client.update_calibration(dry_run=True)
     assert refused.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE
-    assert time.monotonic() - began < KNOWN_S + 2.5  # the mirror is let stand first
+    assert time.monotonic() - began < ALLOWED_S  # the mirror is let stand first
     bench.paused = False
 
 
@@ -269,7 +270,7 @@ def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(benc
     bench.paused = True
     bench.kill("virtual_bench")
     lost = ErrorCode.ELECTRONICS_UNREACHABLE
-    assert bench.client.wait(lambda: bench.client.capabilities.error_code == lost, KNOWN_S + 1.0)
+    assert bench.client.wait(lambda: bench.client.capabilities.error_code == lost, ALLOWED_S)
     assert bench.focus().error_code == lost
     bench.paused = False
     assert bench.client.wait(bench.all_serve, 60.0)

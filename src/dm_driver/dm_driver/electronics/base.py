@@ -40,7 +40,6 @@ class ElectronicsSettings:
 
     Attributes:
         address: host name or IPv4 address, or the URI of a mirror on a device server.
-        channels: output channels of a unit that has as many as it has actuators.
         port: TCP or UDP port.
         discovery_port: UDP port on which the unit answers discovery; 0 = not used.
         serial_port: device file.
@@ -48,16 +47,17 @@ class ElectronicsSettings:
         frame: of a framed serial unit.
         doubt: codes by which frames on their way may differ from what has surely arrived, where a back end can tell;
             0 = any.
+        channels: output channels of a unit that has as many as it has actuators.
     """
 
     address: str = ""
-    channels: int = 40
     port: int = 1234
     discovery_port: int = 0
     serial_port: str = ""
     timeout_s: float = 1.0
     frame: FrameFormat = field(default_factory=FrameFormat)
     doubt: int = 0
+    channels: int = 40
 
 
 class DriveElectronics(ABC):
