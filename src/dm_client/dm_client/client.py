@@ -120,8 +120,8 @@ class DeformableMirrorClient(Connection):
                 return ErrorCode.DRIVER_INACTIVE, f"pdm_driver does not accept commands: {reason}"
             return (able.error_code, able.message) if able and able.error_code == ErrorCode.NODE_INACTIVE else (0, "")
 
-        if not self.wait(lambda: not refusal()[0], timeout_s):
-            raise DeformableMirrorError(*refusal())
+        if not self.wait(lambda: not refusal()[0], timeout_s) and (refused := refusal())[0]:
+            raise DeformableMirrorError(*refused)
 
     @property
     def capabilities(self) -> Capabilities:

@@ -75,7 +75,7 @@ def source_of(target: Path, config: Path | None, serial: str) -> Path:
 
 
 def write_parameters(parameters: str, target: Path, source: Path) -> None:
-    """Write the parameter file `target`: `source` with the `parameters` that a poke check found; comments are kept.
+    """Write the parameter file `target`: `source` with the `parameters` that were found; comments are kept.
 
     What stood at `target` is kept beside it, and nothing that was kept so before is lost.
 

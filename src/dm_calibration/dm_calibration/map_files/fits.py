@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.map_files.surface_map import (
+    METRES,
     MapFileError,
     SurfaceMap,
     check_heights,
@@ -23,8 +24,7 @@ from dm_calibration.map_files.surface_map import (
 
 CARD, BLOCK = 80, 2880
 _TYPES = {8: ">u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
-_METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
-#: How programs write the units of `_METRES`, beside these themselves and their plurals.
+#: How programs write the units of `METRES`, beside these themselves and their plurals.
 _SPOKEN = {"meter": "m", "metre": "m", "millimeter": "mm", "micron": "um", "micrometer": "um", "nanometer": "nm"}
 _KEYWORD = re.compile("[A-Z0-9_-]*")
 #: Pitches along x and y may differ by this much before pixels count as not square.
@@ -137,9 +137,9 @@ def _unit(text: str | None, name: str = "BUNIT") -> float:
     if not text:
         raise MapFileError(f"{name} is missing: the values have no unit; xyz_unit of the interferometer may tell it")
     plain = text.strip().lower().removesuffix("s")
-    metres = _METRES.get(_SPOKEN.get(plain, plain))
+    metres = METRES.get(_SPOKEN.get(plain, plain))
     if metres is None:
-        raise MapFileError(f"{name} = {text!r}: must be a length: {', '.join(_METRES)}")
+        raise MapFileError(f"{name} = {text!r}: must be a length: {', '.join(METRES)}")
     return metres
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from dm_calibration.map_files.datx_structure import as_text, object_at, read_heights
 from dm_calibration.map_files.surface_map import (
+    METRES,
     MapFileError,
     SurfaceMap,
     check_heights,
@@ -21,7 +22,6 @@ from dm_calibration.map_files.surface_map import (
 GROUP = "measurement0"
 #: What stands where there is no data: the largest single-precision number.
 _NO_DATA = float(np.finfo(np.float32).max)
-_METRES = {"nm": 1e-9, "um": 1e-6, "mm": 1e-3, "m": 1.0}
 
 
 def parse_four_d(file: h5py.File, content: bytes) -> SurfaceMap:
@@ -46,4 +46,4 @@ def _length(group: Any, name: str) -> float:
     number = re.fullmatch(r"(\d+\.?\d*(?:[eE][-+]?\d+)?) (nm|um|mm|m)", text.strip("\0 "))
     if number is None:
         raise MapFileError(f"{group.name}: {name} = {text!r}: must be a length, such as '632.8 nm'")
-    return float(number[1]) * _METRES[number[2]]
+    return float(number[1]) * METRES[number[2]]

@@ -24,6 +24,9 @@ MAX_PIXELS = 2**25
 #: Pixels converted at a time: 1 MB.
 _BLOCK_PIXELS = 2**17
 
+#: Units of length that files name, as m.
+METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10}
+
 #: Largest height of a map, m: far beyond the range of any interferometer.
 HEIGHT_MAX = 10.0
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.map_files.surface_map import (
+    METRES,
     MapFileError,
     SurfaceMap,
     check_heights,
@@ -170,7 +171,7 @@ def parse_asc(content: bytes) -> SurfaceMap:
 
 
 #: Units the value column may be in, as m; None = waves of the file's wavelength.
-XYZ_UNITS: dict[str, float | None] = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "angstrom": 1e-10, "waves": None}
+XYZ_UNITS: dict[str, float | None] = {**METRES, "waves": None}
 
 
 def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
