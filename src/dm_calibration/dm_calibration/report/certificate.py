@@ -22,7 +22,7 @@ from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Pictur
 from dm_common.atomic_write import write_whole
 from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
-from dm_common.hysteresis.inverse import certain_reach
+from dm_common.hysteresis.law_shape import certain_limits
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from dm_common.optics.conic import conic_coefficients, conic_sag
@@ -87,11 +87,9 @@ def curvatures(calibration: Calibration) -> tuple[float, float]:
     x, y = calibration.actuator_x, calibration.actuator_y
     pairs = neighbour_pairs(x, y)
     apart = float(np.abs(maps.applied[:, pairs[:, 0]] - maps.applied[:, pairs[:, 1]]).max(initial=1e-6))
-    low, high = fit.signal_min, fit.signal_max
+    limits = Limits(fit.signal_min, fit.signal_max, pairs, apart)
     if calibration.hysteresis is not None:
-        low, high = certain_reach(calibration.hysteresis.law, low, high)
-        apart *= min((high - low) / (fit.signal_max - fit.signal_min), 1.0)
-    limits = Limits(low, high, pairs, apart)
+        limits = certain_limits(calibration.hysteresis.law, limits)
     mirror = Mirror(calibration.mirror_name, calibration.mirror_serial, x, y, radius, limits)
 
     def reached(curvature: float) -> bool:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dm_calibration.report.document import BLUE, GREEN, GREY, ORANGE, VERMILION
-from dm_common.hysteresis.loops import branch, closed_cycle, opening, rested
+from dm_common.hysteresis.law_shape import branch, closed_cycle, opening, turned
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.recipes import RecipeBook
 
@@ -33,8 +33,7 @@ def step_response(law: HysteresisModel, time: Floats) -> Floats:
 
     The mean over actuators whose laws are their own.
     """
-    state = rested(law)
-    state = law.move(state, np.ones_like(state.signals), 0.0)
+    state = turned(law, (1.0,))
     grown = np.array([law.effective(law.advance(state, float(when))).mean() for when in time])
     return np.asarray(grown / law.effective(law.advance(state, CREEP_FROM)).mean())
 
@@ -54,13 +53,11 @@ def loops_figure(law: HysteresisModel) -> Figure:
         (signals, falling, BLUE, "falling"),
     ]
     for turn in MINOR_TURNS:
-        state = rested(law)
-        for end in (1.0, -1.0, 1.0, turn):
-            state = branch(law, state, end)[2]
+        state = turned(law, (1.0, -1.0, 1.0, turn))
         for end in (turn + MINOR_DEPTH, turn):
             there, values, state = branch(law, state, min(end, 1.0))
             ways.append((there, values, GREY, "minor loops" if turn == MINOR_TURNS[0] and end != turn else ""))
-    there, values, _ = branch(law, rested(law), 1.0)
+    there, values, _ = branch(law, turned(law, ()), 1.0)
     ways.append((there, values, GREEN, "first rise after a degauss"))
     for there, own, colour, label in ways:
         values = own.mean(axis=1)

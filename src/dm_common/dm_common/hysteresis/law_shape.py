@@ -1,14 +1,22 @@
-"""What a law is over the whole range of the signals: how steep at least, and how far it reaches."""
+"""What a law is over the whole range of the signals: how steep at least, how far it reaches, and its loops."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.hysteresis.duhem import DuhemOperator
-from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.inverse import certain_reach
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.limits import Limits
 
 Floats = NDArray[np.float64]
+
+#: Points of a branch of a loop.
+STEPS = 81
 
 
 def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> float:
@@ -37,14 +45,59 @@ def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> flo
 
 def span(law: HysteresisModel) -> Floats:
     """Effective signal at +1 less that at -1 in a full cycle that closes, of each law: (1,) or (N,)."""
-    count = law.actuators or 1
-    state = law.demagnetised(count, 0.0)
-    for turn in (1.0, -1.0, 1.0, -1.0):
-        state = law.move(state, np.full(count, turn), 0.0)
-    low = state.position
-    return np.asarray(law.move(state, np.ones(count), 0.0).position - low)
+    low = turned(law, (1.0, -1.0, 1.0, -1.0))
+    return np.asarray(law.move(low, np.ones_like(low.signals), 0.0).position - low.position)
 
 
 def normalised(law: HysteresisModel) -> HysteresisModel:
     """The same law with effective signals that span 2."""
     return law.scaled(2.0 / span(law))
+
+
+def certain_limits(law: HysteresisModel, limits: Limits) -> Limits:
+    """Limits on effective signals that signals within `limits` reach whatever was before, see `certain_reach`."""
+    if law.is_identity:
+        return limits
+    low, high = certain_reach(law, limits.low, limits.high)
+    share = min((high - low) / (limits.high - limits.low), 1.0)
+    return replace(limits, low=low, high=high, neighbour_difference=share * limits.neighbour_difference)
+
+
+def turned(law: HysteresisModel, turns: Sequence[float], middle: float = 0.0) -> HysteresisState:
+    """The state after a degauss that ended at `middle` and straight ways of all actuators to each of `turns`.
+
+    Of as many actuators as have laws of their own, or of one.
+    """
+    state = law.demagnetised(law.actuators or 1, 0.0, middle)
+    for turn in turns:
+        state = law.move(state, np.full_like(state.signals, turn), 0.0)
+    return state
+
+
+def branch(
+    law: HysteresisModel, state: HysteresisState, end: float, steps: int = STEPS
+) -> tuple[Floats, Floats, HysteresisState]:
+    """Signals (S,), static effective signals (S, N) and the last state on a straight way of all actuators to `end`."""
+    signals = np.linspace(float(state.signals[0]), end, steps)
+    positions = np.empty((steps, len(state.signals)))
+    for step, signal in enumerate(signals):
+        state = law.move(state, np.full_like(state.signals, signal), state.time)
+        positions[step] = state.position
+    return signals, positions, state
+
+
+def closed_cycle(
+    law: HysteresisModel, low: float = -1.0, high: float = 1.0, steps: int = STEPS
+) -> tuple[Floats, Floats, Floats]:
+    """Signals (S,) from `low` to `high`, and the static effective signals (S, N) there, rising and falling.
+
+    N is the number of actuators that have laws of their own, or 1.
+    """
+    state = turned(law, (high, low), 0.5 * (low + high))
+    signals, rising, state = branch(law, state, high, steps)
+    return signals, rising, branch(law, state, low, steps)[1][::-1]
+
+
+def opening(rising: Floats, falling: Floats) -> Floats:
+    """(N,) largest distance of the branches (S, N) of a closed cycle, as a share of its span."""
+    return np.asarray(np.abs(falling - rising).max(axis=0) / (rising[-1] - rising[0]))

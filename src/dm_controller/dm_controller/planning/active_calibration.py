@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +13,6 @@ from dm_msgs.msg import Calibration, MirrorInfo
 from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.hysteresis.inverse import certain_reach
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
 from dm_common.mirror import mismatch
@@ -129,19 +128,9 @@ def active_calibration(
         planner = Planner(calibrated, hysteresis_figures_of(calibration, limits), slew_rate)
         certain = calibrated
         if not planner.law.is_identity:
-            reach = certain_reach(planner.law, limits.low, limits.high)
-            share = (reach[1] - reach[0]) / (limits.high - limits.low)
-            certain = CalibratedMirror(
-                calibrated.model,
-                replace(
-                    limits,
-                    low=reach[0],
-                    high=reach[1],
-                    neighbour_difference=min(share, 1.0) * limits.neighbour_difference,
-                ),
-                hold_tilt,
-                axis,
-            )
+            from dm_common.hysteresis.law_shape import certain_limits  # a start does not wait for it
+
+            certain = CalibratedMirror(model, certain_limits(planner.law, limits), hold_tilt, axis)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
     low, high = mirror.signal_min, mirror.signal_max

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.loops import closed_cycle, opening
+from dm_common.hysteresis.law_shape import closed_cycle, opening
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
 Floats = NDArray[np.float64]
