@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
+from dm_msgs.msg import ActuatorEstimate, ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
 from dm_msgs.srv import ListCalibrations, SetFocus, SetSignals
 from numpy.typing import NDArray
 
 from dm_common.geometry import neighbour_pairs
+from dm_common.hysteresis.observer import HysteresisObserver
+from dm_common.messages import applied_from, estimate_message
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
@@ -31,6 +33,8 @@ class StandIn:
     def __init__(self, node: Any, x: NDArray[np.float64], y: NDArray[np.float64]) -> None:
         self.node, self.signals = node, [0.0] * x.size
         self._state = node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+        self._observer = HysteresisObserver()
+        self._estimate = node.create_publisher(ActuatorEstimate, "actuator_estimate", qos.LATCHED)
         self._health = node.create_publisher(DiagnosticArray, "/diagnostics", qos.STATE)
         for message, topic in (
             (mirror_info(x, y), "mirror_info"),
@@ -51,6 +55,10 @@ class StandIn:
         state.applied = state.requested = array("d", self.signals)
         state.volts, state.flags = array("d", [150.0] * len(self.signals)), bytes(len(self.signals))
         self._state.publish(state)
+        self._observer.observe(applied_from(state))
+        estimate = estimate_message(self._observer)
+        estimate.calibration_id = "c19"
+        self._estimate.publish(estimate)
         health = DiagnosticArray(status=[DiagnosticStatus(name=name, message="well") for name in NEEDED])
         health.header.stamp = now
         self._health.publish(health)

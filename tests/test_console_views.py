@@ -7,19 +7,29 @@ import io
 import json
 import re
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from dm_msgs.msg import ActuatorState, Calibration, Capabilities, MirrorInfo, SurfaceMapInfo, ZernikeCoefficients
+from dm_msgs.msg import (
+    ActuatorEstimate,
+    ActuatorState,
+    Calibration,
+    Capabilities,
+    MirrorInfo,
+    SurfaceMapInfo,
+    ZernikeCoefficients,
+)
 from matplotlib.image import imread
 
 import console_stand_in
 from dm_common.geometry import hexagonal_positions
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.observer import HysteresisObserver
+from dm_common.messages import applied_from, estimate_from, estimate_message
 from dm_common.optics.zernike import basis
 from dm_tools.console import status, view_models
 from dm_tools.console.charts.command_map import command_map, outlines
@@ -187,8 +197,6 @@ def test_badges_warn_of_an_unknown_history() -> None:
     )
     assert status.Badge("history: not known", "doubt") in status.badges(snapshot, "moves were lost")
     assert status.Badge("history: known") in status.badges(snapshot, "")
-    snapshot.actuator_state.history_known = True
-    assert status.Badge("history: not seen from here", "doubt") in status.badges(snapshot, "it moved before")
 
 
 def test_the_worst_diagnostics_come_first() -> None:
@@ -287,28 +295,61 @@ def test_the_change_of_an_effective_signal_is_read_off_two_maps() -> None:
         effective_change(before, SimpleNamespace(x=x[1:], y=y[1:], sag=x[1:]), message, 3)
 
 
-def test_the_observer_knows_what_stood_when_a_map_was_taken() -> None:
-    observer = StateObserver()
-    for second, value in ((1, 0.0), (2, 0.5), (3, -0.5)):
-        shape = state([value] * COUNT, turns=second)
+def estimates(law: HysteresisModel, values: tuple[float, ...], calibration: Calibration) -> list[ActuatorEstimate]:
+    """What the controller publishes of a mirror that takes one signal a second."""
+    observer, found = HysteresisObserver(), []
+    observer.use(law, 0.0)
+    for second, value in enumerate(values, start=1):
+        shape = state([value] * COUNT, turns=second, degausses=1, history_known=True)
         shape.header.stamp.sec = second
-        observer.observe(shape)
-    assert not observer.creep_before  # without a law there is no creep
-    assert observer.at(2.4).effective == pytest.approx([0.5] * COUNT)
+        observer.observe(applied_from(shape))
+        message = estimate_message(observer)
+        message.calibration_id, message.revision = calibration.id, calibration.revision
+        found.append(message)
+    return found
+
+
+def test_an_estimate_survives_its_message() -> None:
+    observer = HysteresisObserver()
+    observer.use(LAW, 0.0)
+    observer.observe(applied_from(state([0.5] * COUNT)))
+    sent, found = observer.state, estimate_from(estimate_message(observer))
+    assert sent is not None and found.state is not None and found.unknown == observer.unknown
+    for item in fields(sent):
+        assert np.array_equal(getattr(found.state, item.name), getattr(sent, item.name)), item.name
+    assert estimate_from(ActuatorEstimate(message="no report")) == (None, "no report")
+
+
+def test_a_console_that_comes_late_knows_what_stands() -> None:
+    message, _ = calibration()
+    earlier, later = estimates(HysteresisModel.linear(), (0.5, -0.5), message)
+    observer = StateObserver()
+    assert observer.now(9.0).effective is None and "has not said" in observer.now(9.0).doubt
+    observer.take(earlier)
+    assert "does not use this calibration" in observer.now(9.0).doubt
+    observer.use(message)
+    observer.take(later)
+    assert observer.at(1.4).effective == pytest.approx([0.5] * COUNT)
     assert observer.now(9.0).effective == pytest.approx([-0.5] * COUNT)
     assert observer.at(0.5).effective is None and observer.at(0.5).doubt
-
-
-def test_a_calibration_that_is_published_again_loses_nothing() -> None:
-    message, _ = calibration()
-    message.hysteresis.law = "play"
-    observer = StateObserver()
-    observer.use(message, 0.0)
-    shape = state([0.5] * COUNT, turns=1)
-    shape.header.stamp.sec = 1
-    observer.observe(shape)
-    observer.use(message, 0.0)
+    observer.use(message)  # published again
     assert observer.at(1.5).effective == pytest.approx([0.5] * COUNT)
+
+
+def test_a_move_that_the_controller_does_not_follow_is_doubtful() -> None:
+    message, _ = calibration()
+    observer = StateObserver()
+    observer.use(message)
+    (estimate,) = estimates(HysteresisModel.linear(), (0.5,), message)
+    estimate.history_known, estimate.message = True, ""
+    observer.take(estimate)
+    observer.observe(state([0.5] * COUNT))
+    assert not observer.now(9.0).doubt
+    observer.observe(state([0.4] * COUNT))
+    assert "has not followed" in observer.now(9.0).doubt
+    estimate.play = estimate.play[:-1]  # of no mirror at all
+    observer.take(estimate)
+    assert "actuator_estimate" in observer.now(9.0).doubt
 
 
 def test_charts_are_described_and_have_axes() -> None:

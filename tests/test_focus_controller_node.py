@@ -12,6 +12,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from dm_msgs.action import MoveFocus
 from dm_msgs.msg import (
+    ActuatorEstimate,
     ActuatorState,
     Capabilities,
     ErrorCode,
@@ -22,6 +23,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.time import Time
 
+from dm_common.ros import qos
 from focus_bench import MIRROR, Bench, calibration, mirror_info
 from linear_mirror import RADIUS
 from support import NodeProcess, Observer, wait_until
@@ -50,6 +52,10 @@ def test_a_curvature_becomes_the_right_command(bench: Bench) -> None:
     assert state.curvature_min < 0.02 < state.curvature_max
     assert state.predicted_rms < state.predicted_rms_upper
     assert state.history_known
+    late = bench.observer.record(ActuatorEstimate, "actuator_estimate", qos.LATCHED)
+    estimate = wait_until(lambda: late and late[-1])
+    assert (estimate.calibration_id, estimate.history_known) == ("known", True)
+    np.testing.assert_array_equal(np.asarray(estimate.effective), signals)
 
 
 def test_topic_requests_are_answered_on_focus_state(bench: Bench) -> None:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from dm_msgs.msg import ActuatorEstimate as ActuatorEstimateMsg
 from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo, ZernikeCoefficients
 from dm_msgs.msg import Recipe as RecipeMsg
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.model import HysteresisModel
-from dm_common.hysteresis.observer import Applied
+from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.hysteresis.observer import ActuatorEstimate, Applied, HysteresisObserver
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
 from dm_common.recipes import Recipe, RecipeBook
@@ -183,6 +184,37 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         lag.reshape(-1, message.lags) if lag.size > message.lags else lag,
         message.creep_slope,
     )
+
+
+#: Fields of HysteresisState that a dm_msgs/ActuatorEstimate has under the same names.
+_STATE = ("signals", "position", "play", "fading", "crept", "crept_sigma", "lagged")
+
+
+def estimate_message(observer: HysteresisObserver) -> ActuatorEstimateMsg:
+    """What an observer knows as a message; no arrays before the driver's first report."""
+    state, unknown = observer.state, observer.unknown
+    message = ActuatorEstimateMsg(history_known=not unknown, message=unknown)
+    if state is not None:
+        message.header.stamp = time_message(round(state.time * 1e9))
+        message.effective = doubles(observer.law.effective(state))
+        for name in _STATE:
+            setattr(message, name, doubles(getattr(state, name)))
+    return message
+
+
+def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
+    """What a message says of the actuators.
+
+    Raises:
+        ValueError: its arrays are not of one mirror.
+    """
+    count = len(message.signals)
+    if not count:
+        return ActuatorEstimate(None, message.message)
+    values = {name: np.array(getattr(message, name), dtype=np.float64) for name in _STATE}
+    for name in ("play", "crept", "lagged"):
+        values[name] = values[name].reshape(count, -1)
+    return ActuatorEstimate(HysteresisState(seconds(message.header.stamp), **values), message.message)
 
 
 def recipe_book_message(book: RecipeBook) -> RecipeBookMsg:

@@ -12,12 +12,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
+from dm_msgs.msg import (
+    ActuatorCommand,
+    ActuatorEstimate,
+    ActuatorState,
+    Calibration,
+    Capabilities,
+    FocusRequest,
+    FocusState,
+    MirrorInfo,
+)
 from rclpy.clock import Clock, ClockType
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.creep_record import CreepRecorder
-from dm_common.messages import doubles, time_message
+from dm_common.messages import doubles, estimate_message, time_message
 from dm_common.ros import qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import Health, ManagedNode
@@ -41,6 +50,8 @@ from dm_controller.forecast import ForecastClient
 from dm_controller.loop_actions import LoopHost, serve_loops
 from dm_controller.planning.target import Request
 
+#: How often the estimate of the actuators is published while the mirror moves, s of wall time.
+ESTIMATE_PERIOD_S = 0.25
 #: How often silence of the driver is noticed, s of wall time.
 STEADY_PERIOD_S = 0.5
 #: How often what the actuators have crept to is put on disk, s of wall time.
@@ -62,6 +73,9 @@ class FocusControllerNode(ManagedNode):
         self._command = self.create_publisher(ActuatorCommand, "actuator_command", qos.COMMAND)
         self._focus_state = self.create_publisher(FocusState, "focus_state", qos.STATE)
         self._capabilities = self.create_publisher(Capabilities, "capabilities", qos.with_lease(qos.LATCHED))
+        self._estimate = self.create_publisher(ActuatorEstimate, "actuator_estimate", qos.LATCHED)
+        self._estimated: tuple[object, ...] = ()  # what was published there last, and when, s of steady time
+        self._estimated_at = 0.0
         self._degauss, self._forecast = DegaussClient(self, self._degauss_ended), ForecastClient(self)
         self._controller.degauss_offered = lambda: self._degauss.offered
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -186,6 +200,7 @@ class FocusControllerNode(ManagedNode):
                 self.get_logger().warning(effect.text, throttle_duration_sec=1.0)
             else:
                 self.get_logger().error(effect.text)
+        self._publish_estimate(now)
         # Tick quickly only while something can be due soon.
         if not self._controller.quick_ticks(now):
             self._quick.cancel()
@@ -202,6 +217,20 @@ class FocusControllerNode(ManagedNode):
         message = capabilities_message(self._controller, self._mirror, self._values, self._now())
         message.header.frame_id = self._frame_id
         self._capabilities.publish(message)
+
+    def _publish_estimate(self, now: Moment) -> None:
+        """What is known of the actuators, where it changed; while the mirror moves, now and then."""
+        observer, active = self._controller.observer, self._controller.active
+        known = (observer.state, observer.unknown, active)
+        moving = observer.latest is not None and observer.latest.moving
+        if known == self._estimated or (moving and now.steady - self._estimated_at < ESTIMATE_PERIOD_S):
+            return
+        self._estimated, self._estimated_at = known, now.steady
+        message = estimate_message(observer)
+        message.header.frame_id = self._frame_id
+        if active is not None:
+            message.calibration_id, message.revision = active.calibration.id, active.calibration.revision
+        self._estimate.publish(message)
 
     def health(self) -> Health:
         with self.controller() as (controller, now):

@@ -273,10 +273,6 @@ class HysteresisObserver:
             state = self.law.move(state, state.signals + share * gap, now)
         return ActuatorEstimate(state, unknown)
 
-    def at(self, time: float) -> ActuatorEstimate | None:
-        """As of the last report at or before `time` (s), if that is recent enough to be kept."""
-        return next((seen.estimate for seen in reversed(self.recent()) if seen.report.time <= time), None)
-
     def recent(self) -> list[Observed]:
         """The latest reports, in the order they came, with what follows from each."""
         with self._lock:

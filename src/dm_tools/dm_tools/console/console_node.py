@@ -13,7 +13,7 @@ from typing import Any
 
 from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dm_msgs.msg import SurfaceMapInfo, ZernikeCoefficients
+from dm_msgs.msg import ActuatorEstimate, SurfaceMapInfo, ZernikeCoefficients
 from rcl_interfaces.msg import Log
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -30,6 +30,7 @@ from dm_tools.console.state_observer import StateObserver
 from dm_tools.long_actions import LONG, ExternalGoals
 
 TOPICS = client.TOPICS | {
+    "actuator_estimate": (ActuatorEstimate, qos.LATCHED),
     "surface_map": (Image, qos.MAP),
     "surface_map_info": (SurfaceMapInfo, qos.MAP),
     "zernike": (ZernikeCoefficients, qos.STATE),
@@ -63,6 +64,7 @@ class Snapshot:
     calibration: Any = None
     capabilities: Any = None
     actuator_state: Any = None
+    actuator_estimate: Any = None
     surface_map: Any = None
     surface_map_info: Any = None
     zernike: Any = None
@@ -103,11 +105,10 @@ class ConsoleNode:
     def _take(self, topic: str, message: Any) -> None:
         if topic == "actuator_state":
             self.observer.observe(message)
-        elif topic in ("calibration", "mirror_info"):
-            messages = self._connection.messages
-            calibration, mirror = messages.get("calibration"), messages.get("mirror_info")
-            if calibration is not None and mirror is not None:
-                self.observer.use(calibration, 0.5 * (mirror.signal_min + mirror.signal_max))
+        elif topic == "actuator_estimate":
+            self.observer.take(message)
+        elif topic == "calibration":
+            self.observer.use(message)
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         time_s = seconds(message.header.stamp)

@@ -180,7 +180,7 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
             "a measured loop needs a calibration: it holds what the actuator does to the surface",
         )
     settled = observer.now(snapshot.bench_time)
-    state = observer.state()
+    state = observer.latest().state
     if settled.effective is None or state is None:
         raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, f"where the actuators stand is not known: {settled.doubt}")
     signals = way(start[actuator - 1], amplitude, mirror.signal_min, mirror.signal_max)

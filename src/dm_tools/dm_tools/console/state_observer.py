@@ -1,17 +1,26 @@
-"""Effective signals now and at the time of a map, from the driver's reports and the hysteresis of the calibration."""
+"""Effective signals now and at the time of a map, from what the focus controller publishes of the actuators."""
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
-from dm_common.messages import applied_from, hysteresis_model_from
+from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.observer import ActuatorEstimate
+from dm_common.messages import estimate_from, hysteresis_model_from, seconds
 
 Floats = NDArray[np.float64]
+
+#: Estimates kept for maps that arrive late.
+ESTIMATES_KEPT = 500
+#: Creep of what was held unseen is told above this standard deviation, in shapes of the whole range.
+CREEP_UNSEEN = 0.05
+#: A move that the controller has not followed after this is one it does not follow, s.
+LATE_S = 1.0
 
 
 class SettledState(NamedTuple):
@@ -25,65 +34,86 @@ class SettledState(NamedTuple):
     effective: Floats | None
     doubt: str
 
+    def same_as(self, other: SettledState) -> bool:
+        """Whether both say the same."""
+        mine, theirs = (np.array(each.effective, dtype=np.float64) for each in (self, other))
+        return self.doubt == other.doubt and np.array_equal(mine, theirs, equal_nan=True)
+
 
 class StateObserver:
-    """Follows one mirror. May be asked from any thread.
+    """Keeps the latest estimates of one mirror. May be asked from any thread.
 
     Attributes:
+        law: of the calibration; the linear one when no hysteresis was identified.
         fault: the reason why the hysteresis of the calibration is not followed; "" = it is.
     """
 
     def __init__(self) -> None:
-        self._observer = HysteresisObserver()
-        self._moved_before: bool | None = None
-        self.fault = ""
+        self.law, self.fault = HysteresisModel.linear(), ""
+        self._calibration = ("", 0)
+        self._estimates: deque[tuple[tuple[str, int], ActuatorEstimate]] = deque(maxlen=ESTIMATES_KEPT)
+        self._reported: Any = None
 
-    @property
-    def law(self) -> HysteresisModel:
-        """The law that is followed; the linear one when no hysteresis was identified."""
-        return self._observer.law
-
-    @property
-    def creep_before(self) -> bool:
-        """Whether moves before the first report still creep, which not even a degauss makes known."""
-        return bool(self._moved_before) and self.law.creep_rate > 0.0
-
-    def use(self, calibration: Any, middle: float) -> None:
-        """Follow the law of a dm_msgs/Calibration from now on."""
+    def use(self, calibration: Any) -> None:
+        """Show what a dm_msgs/Calibration says from now on."""
         try:
             law, self.fault = hysteresis_model_from(calibration.hysteresis), ""
         except ValueError as error:
             law, self.fault = None, str(error)
-        self._observer.use(law if law is not None else HysteresisModel.linear(), middle)
+        self.law = law if law is not None else HysteresisModel.linear()
+        self._calibration = calibration.id, calibration.revision
+
+    def take(self, message: Any) -> None:
+        """Take the controller's next dm_msgs/ActuatorEstimate."""
+        try:
+            estimate = estimate_from(message)
+        except ValueError as error:
+            estimate = ActuatorEstimate(None, f"actuator_estimate: {error}")
+        self._estimates.append(((message.calibration_id, message.revision), estimate))
 
     def observe(self, message: Any) -> None:
         """Take the driver's next dm_msgs/ActuatorState."""
-        if self._moved_before is None:
-            self._moved_before = message.turns > 0
-        try:
-            self._observer.observe(applied_from(message))
-        except ValueError:
-            pass  # another mirror, or numbers that are none: the estimate says so
+        self._reported = message
 
-    def state(self) -> HysteresisState | None:
-        """The last state; None before the first report."""
-        return self._observer.state
+    def latest(self) -> ActuatorEstimate:
+        """The last estimate under the calibration in use."""
+        return self._before(math.inf)
+
+    @property
+    def creep_unseen(self) -> bool:
+        """Whether actuators creep from what was held before the controller followed it."""
+        state = self.latest().state
+        return state is not None and bool((state.crept_sigma > CREEP_UNSEEN).any())
 
     def now(self, time: float) -> SettledState:
-        """The mirror at `time` (s, ROS time), taken as not before the last report."""
-        return self._settled(ActuatorEstimate(self._observer.state, self._observer.unknown), time)
+        """The mirror at `time` (s, ROS time), taken as not before the last estimate."""
+        estimate, reported = self.latest(), self._reported
+        if estimate.state is not None and not estimate.unknown and reported is not None and not reported.moving:
+            applied = np.array(reported.applied)
+            late = time > seconds(reported.header.stamp) + LATE_S
+            if late and not np.array_equal(applied, estimate.state.signals):
+                estimate = estimate._replace(unknown="focus_controller has not followed the last move")
+        return self._settled(estimate, time)
 
     def at(self, time: float) -> SettledState:
-        """The mirror at `time` (s), which may lie before the last report."""
-        found = self._observer.at(time)
-        if found is None:
-            return SettledState(None, "no report of the driver is as old as this map")
-        return self._settled(found, time)
+        """The mirror at `time` (s), which may lie before the last estimate."""
+        return self._settled(self._before(time), time)
+
+    def _before(self, time: float) -> ActuatorEstimate:
+        """The last estimate at or before `time` (s)."""
+        kept = list(self._estimates)
+        if not kept:
+            return ActuatorEstimate(None, "focus_controller has not said yet where the actuators stand")
+        own = [estimate for calibration, estimate in kept if calibration == self._calibration]
+        if not own:
+            return ActuatorEstimate(None, "focus_controller does not use this calibration")
+        fitting = (estimate for estimate in reversed(own) if estimate.state is None or estimate.state.time <= time)
+        return next(fitting, ActuatorEstimate(None, "no estimate of the actuators is as old as this map"))
 
     def _settled(self, estimate: ActuatorEstimate, time: float) -> SettledState:
-        law, state = self._observer.law, estimate.state
+        state = estimate.state
         if state is None:
-            return SettledState(None, "the driver has not reported yet")
-        if state.play.shape[1] != len(law.play_radius):
+            return SettledState(None, estimate.unknown)
+        if (state.play.shape[1], state.crept.shape[1]) != (len(self.law.play_radius), len(self.law.creep_time)):
             return SettledState(None, "the calibration is being replaced")
-        return SettledState(law.effective(law.advance(state, time)), estimate.unknown)
+        return SettledState(self.law.effective(self.law.advance(state, time)), estimate.unknown)

@@ -67,9 +67,7 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
             Badge(f"{calibration.id}: {quality}", "" if calibration.quality == Calibration.CALIBRATED else "doubt")
         )
         if calibration.hysteresis.play_radius:
-            known = state is not None and state.history_known  # by the nodes, which may run for longer than this page
-            text = "known" if not doubt else "not seen from here" if known else "not known"
-            shown.append(Badge(f"history: {text}", "doubt" if doubt else ""))
+            shown.append(Badge("history: not known", "doubt") if doubt else Badge("history: known"))
     worst = max((ord(bytes(status.level)) for status in snapshot.diagnostics.values()), default=0)
     if worst and worst != ord(DiagnosticStatus.STALE):
         text = LEVELS.get(bytes([worst]), "?")
@@ -157,12 +155,13 @@ def log_rows(lines: Sequence[tuple[str, str, str, str]], everything: bool) -> li
 def now_text(snapshot: Any) -> str:
     """Where the mirror stands, in one line."""
     names = {name.rpartition("/")[2]: status for name, status in snapshot.diagnostics.items()}
-    shape, state = settled_shape(names) if "focus_controller" in snapshot.present else None, snapshot.actuator_state
-    if "pdm_driver" not in snapshot.present or state is None:
-        return "now: not known, the driver is not heard"
+    state = snapshot.actuator_state
+    for name in ("pdm_driver", "focus_controller"):
+        if name not in snapshot.present or state is None:
+            return f"now: not known, {name} is not heard"
     if state.moving:
         return "now: moving"
-    if shape is None:
+    if (shape := settled_shape(names)) is None:
         return "now: not at a curvature that was asked for"
     return f"now: {shape.curvature:+.4f} 1/m for {ago(shape.seconds)}, within {in_nanometres(shape.bound)} (95 %)" + (
         ", held" if shape.held else ""

@@ -14,7 +14,7 @@ from dm_tools.console.surfaces import Surface, SurfaceModel, difference, measure
 from dm_tools.verify import map_of
 
 NO_CALIBRATION = "No calibration is in use: nothing can be predicted."
-CREEP_BEFORE = "Creep of moves before the console was started is not in it."
+CREEP_BEFORE = "Creep of what was held before the focus controller followed it is not known."
 #: Effective signals that differ less do not count as a move: creep, and steps of holding a shape against it.
 SMALL_MOVE = 2e-3
 #: The prediction is drawn again when an effective signal has changed by this much, normalised.
@@ -86,11 +86,11 @@ class SurfaceView:
         image, info = snapshot.surface_map, snapshot.surface_map_info
         if image is None or info is None or image.header.stamp != info.header.stamp:
             return False
-        stamp = stamp_ns(info.header.stamp)
+        stamp, before = stamp_ns(info.header.stamp), self._at_map
+        self._at_map = self._state_observer.at(1e-9 * stamp)  # an estimate may come after the map it is older than
         if image is self._map[1]:
-            return False
+            return before is None or not before.same_as(self._at_map)
         self._map = (stamp, image)
-        self._at_map = self._state_observer.at(1e-9 * stamp)
         try:
             self.measured, self.no_map_reason = measured_surface(map_of(image), info), ""
         except ValueError as error:
@@ -115,7 +115,7 @@ class SurfaceView:
         ):
             return False
         self._effective, self.doubt = settled.effective, settled.doubt
-        self.remark = CREEP_BEFORE if self._state_observer.creep_before else ""
+        self.remark = CREEP_BEFORE if self._state_observer.creep_unseen else ""
         self.predicted = self._model.surface(settled.effective)
         return True
 

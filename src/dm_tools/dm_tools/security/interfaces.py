@@ -97,7 +97,7 @@ _DECLARED = (
     NodeInterface(
         "focus_controller",
         "focus_controller",
-        publish=(*_HEALTH, "actuator_command", "capabilities", "focus_state"),
+        publish=(*_HEALTH, "actuator_command", "actuator_estimate", "capabilities", "focus_state"),
         subscribe=("actuator_state", "calibration", "focus_request", "mirror_info", "surface_map_info"),
         reply=("flatten", "set_focus"),
         request=("hold_mirror", "measure", "predict_error", "set_signals", "store_recipes"),
@@ -120,7 +120,7 @@ _DECLARED = (
         "dm_console_*",
         "console",
         subscribe=(
-            *("/diagnostics", "/rosout", "actuator_state", "calibration", "capabilities"),
+            *("/diagnostics", "/rosout", "actuator_estimate", "actuator_state", "calibration", "capabilities"),
             *("mirror_info", "surface_map", "surface_map_info", "zernike"),
         ),
         request=_OPERATION,
