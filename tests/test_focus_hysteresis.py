@@ -73,7 +73,7 @@ def test_unknown_history_is_told_and_cured_by_a_degauss(
     monkeypatch.setenv("ROS_HOME", str(tmp_path))
     file = record_file("~/.ros/focus_controller", mirror_info().serial)
     assert file is not None
-    write_record(file, CreepRecord(time.time() - 1.0, CREEP_TIMES, np.zeros((37, 15)), np.zeros(15)))
+    write_record(file, CreepRecord(time.time() - 1.0, CREEP_TIMES, np.zeros((37, 15)), np.zeros(15), np.zeros((37, 0))))
     bench = make(observer, start, law=STILL)
     health: list[DiagnosticArray] = observer.record(DiagnosticArray, "/diagnostics")
     before = bench.set_focus(dry_run=True, curvature=0.02).state

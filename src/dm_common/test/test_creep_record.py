@@ -26,6 +26,7 @@ from waiting import wait_until
 
 LAW = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES)
 DAY = 86_400.0
+AT_REST = CreepRecord(10.0, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)), np.zeros((3, 0)))
 
 
 def report(time: float, signal: float) -> Applied:
@@ -61,6 +62,23 @@ def test_the_next_start_knows_what_was_held_for_a_day(tmp_path: Path) -> None:
     assert blind.state.crept_sigma == pytest.approx(np.full(len(CREEP_TIMES), UNSEEN))
 
 
+def test_after_a_short_power_cut_loops_go_on_lagging_from_where_they_were(tmp_path: Path) -> None:
+    """Fast elements follow the signal too: within a second of no power they have not reached where it rests."""
+    file = tmp_path / "mirror.creep.npz"
+    law = replace(LAW, creep_spectrum=np.full(len(CREEP_TIMES), 1.5), lag_spectrum=np.full(7, -0.5))
+    followed = law.advance(law.move(law.demagnetised(3, 0.0), np.full(3, 0.5), 0.0), 600.0)
+    record = record_of(law, followed, 600.0)
+    assert record is not None
+    write_record(file, record)
+    for off, fast in ((1.0, 1e-3), (3600.0, 1e-6)):
+        there = law.advance(law.move(followed, np.full(3, -0.9), 600.0), 600.0 + off)
+        found = rested(law, np.full(3, -0.9), 600.0 + off, 0.0, read_record(file, 700.0))
+        assert found.lagged == pytest.approx(there.lagged, abs=fast)
+        assert law.effective(found) == pytest.approx(law.effective(there), abs=fast)
+    older = rested(law, np.full(3, -0.9), 601.0, 0.0, record._replace(lagged=np.zeros((3, 0))))
+    assert (older.lagged[:, -1] > 0.4).all()  # the loop's width off at most
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -71,8 +89,7 @@ def test_the_next_start_knows_what_was_held_for_a_day(tmp_path: Path) -> None:
 )
 def test_a_record_that_makes_no_sense_is_named(tmp_path: Path, change: dict[str, object], text: str) -> None:
     file = tmp_path / "mirror.creep.npz"
-    good = CreepRecord(10.0, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
-    write_record(file, good._replace(**change))  # type: ignore[arg-type]
+    write_record(file, AT_REST._replace(**change))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=text):
         read_record(file, 100.0)
 
@@ -87,15 +104,14 @@ def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:
 
 def test_a_disk_that_fails_leaves_the_record_that_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "mirror.creep.npz"
-    record = CreepRecord(10.0, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
-    write_record(file, record)
+    write_record(file, AT_REST)
 
     def fails(_handle: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fails)  # without it the power may take the old record and the new one
     with pytest.raises(OSError, match="No space left"):
-        write_record(file, record._replace(time=20.0))
+        write_record(file, AT_REST._replace(time=20.0))
     kept = read_record(file, 30.0)
     assert kept is not None and kept.time == 10.0
     assert list(tmp_path.iterdir()) == [file]
@@ -103,8 +119,8 @@ def test_a_disk_that_fails_leaves_the_record_that_was_there(tmp_path: Path, monk
 
 def test_a_record_of_another_law_or_mirror_is_not_used() -> None:
     elements = np.geomspace(1.0, 100.0, 5)
-    other = CreepRecord(0.0, elements, np.ones((3, 5)), np.zeros(5))
-    larger = CreepRecord(0.0, CREEP_TIMES, np.ones((4, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
+    other = CreepRecord(0.0, elements, np.ones((3, 5)), np.zeros(5), np.zeros((3, 0)))
+    larger = AT_REST._replace(time=0.0, crept=np.ones((4, len(CREEP_TIMES))))
     for record in (other, larger):
         assert (rested(LAW, np.zeros(3), 1.0, 0.0, record).crept == 0.0).all()
 
@@ -121,8 +137,7 @@ def test_another_mirror_begins_with_its_own_record_and_no_reports(tmp_path: Path
     observer.use(LAW, 0.0)
     failures: list[str] = []
     recorder = CreepRecorder(str(tmp_path), observer, failures.append)
-    held = CreepRecord(10.0, CREEP_TIMES, np.full((3, len(CREEP_TIMES)), 0.5), np.zeros(len(CREEP_TIMES)))
-    write_record(tmp_path / "a.creep.npz", held)
+    write_record(tmp_path / "a.creep.npz", AT_REST._replace(crept=AT_REST.crept + 0.5))
     (tmp_path / "c.creep.npz").write_bytes(b"torn")
     observer.observe(report(20.0, 0.0))  # reports may come before who the mirror is
     recorder.recall("a", 20.0)
@@ -156,7 +171,6 @@ def test_a_record_is_kept_for_the_mirror_or_said_not_to_be(tmp_path: Path) -> No
 
 def test_a_clock_that_does_not_run_yet_refuses_no_record(tmp_path: Path) -> None:
     file = tmp_path / "mirror.creep.npz"
-    record = CreepRecord(1e6, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)))
-    write_record(file, record)
+    write_record(file, AT_REST._replace(time=1e6))
     found = read_record(file, 0.0)
     assert found is not None and found.time == 1e6

@@ -387,7 +387,8 @@ def test_a_degauss_does_not_cure_old_creep() -> None:
 
 def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:
     bench = Bench()
-    rested = CreepRecord(bench.time - 1.0, LAW.creep_time, np.zeros((ACTUATORS, 15)), np.zeros(15))
+    still, none = np.zeros((ACTUATORS, 15)), np.zeros((ACTUATORS, 0))
+    rested = CreepRecord(bench.time - 1.0, LAW.creep_time, still, np.zeros(15), none)
     bench.controller.observer.recall(rested)
     bench.report()
     before = bench.ask(dry_run=True)

@@ -33,12 +33,15 @@ class CreepRecord(NamedTuple):
         creep_time: (J,) s, of the elements.
         crept: (N, J) effective signals that they have followed so far.
         crept_sigma: (J,) see :class:`~dm_common.hysteresis.model.HysteresisState`.
+        lagged: (N, L) signals that the first L of them have followed so far; where the law has more such elements,
+            and in records of older versions, it is taken to be as `crept`.
     """
 
     time: float
     creep_time: Floats
     crept: Floats
     crept_sigma: Floats
+    lagged: Floats
 
 
 def record_file(folder: str, serial: str) -> Path | None:
@@ -75,18 +78,20 @@ def read_record(file: Path, now: float) -> CreepRecord | None:
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
-            values = [np.asarray(stored[name], dtype=np.float64) for name in CreepRecord._fields]
+            names = [name if name in stored.files else "crept" for name in CreepRecord._fields]
+            values = [np.asarray(stored[name], dtype=np.float64) for name in names]
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{file}: {error}: what was held before is not known") from error
-    time, creep_time, crept, sigma = values
+    time, creep_time, crept, sigma, lagged = values
     whole = time.ndim == 0 and crept.ndim == 2 and crept.shape[1:] == creep_time.shape == sigma.shape
+    whole = whole and lagged.ndim == 2 and len(lagged) == len(crept)
     if not whole or not all(np.isfinite(value).all() for value in values):
         raise ValueError(f"{file}: its arrays do not fit together: what was held before is not known")
     if 0.0 < now < float(time):
         raise ValueError(f"{file}: written {float(time) - now:.0f} s from now: was the clock set back?")
-    return CreepRecord(float(time), creep_time, crept, sigma)
+    return CreepRecord(float(time), creep_time, crept, sigma, lagged)
 
 
 def rested(
@@ -99,15 +104,18 @@ def rested(
     """
     moved = law.move(law.demagnetised(len(signals), time, middle), signals, time)
     settled = np.repeat(moved.position[:, None], len(law.creep_time), axis=1)
+    lagged = np.repeat(signals[:, None], len(law.lag_time), axis=1)
     sigma = np.full(len(law.creep_time), UNSEEN)
     if record is None or record.time > time or not np.array_equal(record.creep_time, law.creep_time):
         held = np.repeat(law.crept[:, None], len(law.creep_time), axis=1)
-        record = CreepRecord(law.crept_at, law.creep_time, held, np.zeros(len(law.creep_time)))
+        record = CreepRecord(law.crept_at, law.creep_time, held, np.zeros(len(law.creep_time)), held)
     if record.crept.shape == settled.shape and time >= record.time:
         left = np.exp(-(time - record.time) / law.creep_time)
         settled += (record.crept - settled) * left
         sigma = np.hypot(sigma * (1.0 - left), record.crept_sigma * left)
-    lagged = np.repeat(signals[:, None], len(law.lag_time), axis=1)
+        lags = lagged.shape[1]
+        followed = record.lagged if record.lagged.shape[1] >= lags else record.crept
+        lagged += (followed[:, :lags] - lagged) * left[:lags]
     return replace(moved, crept=settled, crept_sigma=sigma, lagged=lagged)
 
 
@@ -116,7 +124,7 @@ def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -
     if state is None or not law.creep_rate:
         return None
     state = law.advance(state, now)
-    return CreepRecord(state.time, law.creep_time, state.crept, state.crept_sigma)
+    return CreepRecord(state.time, law.creep_time, state.crept, state.crept_sigma, state.lagged)
 
 
 class CreepRecorder:
