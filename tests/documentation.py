@@ -160,6 +160,7 @@ PARSED = {
     "./dm recipes": _LONG + "test_recipe_action.py runs the action",
     "./dm recipes --curvatures=-0.02,0,0.02": "needs a hysteresis plan first; test_recipe_action.py runs the action",
     "./dm recipes --conic=-1 --curvatures=-0.05:0.05:11": "needs a hysteresis plan first",
+    './dm recipes --zernike "coma sin=50" --zernike "astigmatism cos=200"': "needs a hysteresis plan first",
     "./dm report PDM30-37_virtual-1_20261121T112233Z --store ~/.ros/dm_bench/calibrations": "an example of an id",
     "./dm report path/to/calibration.h5 --out reports --json figures.json": "an example of a path",
     "./dm replay runs/monday": "in its own time; run with --rate 10",

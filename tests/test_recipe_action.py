@@ -86,7 +86,7 @@ def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: Sta
     assert result.maps == len(bench.measured)
     assert [step.step for step in feedback] == list(range(1, result.maps + 1))
     assert [step.curvature for step in feedback] == sorted(step.curvature for step in feedback)
-    assert {step.curvature for step in feedback} == {-0.01, 0.02}
+    assert {(step.curvature, step.recipes) for step in feedback} == {(-0.01, 0), (0.02, 1)}
     (request,) = store.requests
     assert request.calibration_id == "known"
     book = recipe_book_from(request.recipes)
@@ -156,6 +156,7 @@ def test_recipes_beyond_the_tolerance_are_stored_and_named(
         ({"curvatures": [0.0], "max_maps": 3}, ErrorCode.OUT_OF_RANGE, "max_maps = 3: must be int, 4 to 100"),
         ({"curvatures": [0.0], "tolerance": -1.0}, ErrorCode.OUT_OF_RANGE, "tolerance = -1.0: must be"),
         ({"curvatures": [0.0], "max_maps": 101}, ErrorCode.OUT_OF_RANGE, "max_maps = 101"),
+        ({"curvatures": [0.0], "zernike": [0.0, 1e-7]}, ErrorCode.INVALID_LENGTH, "zernike has 2 values"),
         ({"curvatures": [0.0], "conic_constant": float("inf")}, ErrorCode.NOT_FINITE, "conic_constant = inf"),
     ],
 )

@@ -11,6 +11,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_common.errors import Cancelled, Refusal
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import Recipe, RecipeError
 from dm_controller.converge.goals import UnreachableError, recipe_targets
 from dm_controller.converge.recipe_building import (
@@ -74,21 +75,25 @@ def test_what_was_built_makes_the_shape_again(stand: Stand) -> None:
     builder = RecipeBuilder(
         stand.loop, bench, lambda: bench.time, BuildOptions(), state=stand.state, on_step=steps.append
     )
-    targets = recipe_targets((0.04, -0.03, 0.0), 0.0, stand.loop, 2e-8)
+    terms = np.zeros((4, len(SPOKEN)))
+    terms[3, SPOKEN.index("astigmatism cos")] = 300e-9
+    targets = recipe_targets((0.04, -0.03, 0.0, 0.0), 0.0, terms.ravel().tolist(), stand.loop, 2e-8)
+    astigmatic = targets[2]
     for target in targets:
         builder.build(target)
     recipes = builder.recipes
-    assert [recipe.curvature for recipe in recipes] == [-0.03, 0.0, 0.04]
+    assert [recipe.curvature for recipe in recipes] == [-0.03, 0.0, 0.0, 0.04]
+    assert [any(recipe.zernike) for recipe in recipes] == [False, False, True, False]
     # The first needs a round to learn the defect by, the others begin with what it showed.
     assert recipes[0].maps <= 16
-    assert all(recipe.maps <= 8 for recipe in recipes[1:])
+    assert all(recipe.maps <= 8 for recipe in (recipes[1], recipes[3]))
     assert sum(recipe.maps for recipe in recipes) == builder.maps == len(steps)
     book = recipe_book(recipes, stand.loop, bench.config.degauss_steps, 1)
     corrections = Corrections(book, stand.loop)
     errors, state = [], builder.state
-    for curvature, waited in ((0.04, 0.0), (-0.03, 200.0), (0.0, 50.0), (0.04, 5.0), (-0.03, 0.0)):
+    targets = [FocusTarget(0.04), astigmatic, FocusTarget(-0.03), FocusTarget(0.0), astigmatic, FocusTarget(0.04)]
+    for target, waited in zip(targets, (0.0, 20.0, 200.0, 50.0, 0.0, 5.0), strict=True):
         bench.time += waited  # creep that the next degauss does not wipe
-        target = FocusTarget(curvature)
         error, state = stand.replay(target, corrections.find(target).effective, state)
         errors.append(error)
     assert np.median(errors) < WAVELENGTH / 1000.0
@@ -155,18 +160,20 @@ def test_cancelling_stops_between_two_maps() -> None:
 
 
 @pytest.mark.parametrize(
-    ("curvatures", "error", "words"),
+    ("curvatures", "zernike", "error", "words"),
     [
-        ((0.0, float("nan")), Refusal, "curvature = nan: must be a finite float"),
-        ((0.01, 0.02, 0.01), RecipeError, r"curvatures: \+0\.0100 1/m is there twice"),
-        ((0.0, 5.0), UnreachableError, r"curvature = \+5\.0000 1/m: the limits .* reachable: -0"),
+        ((0.0, float("nan")), (), Refusal, "curvature = nan: must be a finite float"),
+        ((0.01, 0.02, 0.01), (), RecipeError, r"curvatures: \+0\.0100 1/m is there twice"),
+        ((0.01, 0.01), 42 * (1e-8,), RecipeError, r"\+0\.0100 1/m with .*coma sin \+10 nm.* is there twice"),
+        ((0.0, 5.0), (), UnreachableError, r"curvature = \+5\.0000 1/m: the limits .* reachable: -0"),
+        ((0.0, 0.1), 20 * (0.0,), Refusal, "zernike has 20 values: must have 0 or 21 or 42"),
     ],
 )
-def test_bad_curvatures_are_refused_before_anything_moves(
-    curvatures: tuple[float, ...], error: type[Exception], words: str
+def test_bad_shapes_are_refused_before_anything_moves(
+    curvatures: tuple[float, ...], zernike: tuple[float, ...], error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words):
-        recipe_targets(curvatures, 0.0, LOOP, 2e-8)
+        recipe_targets(curvatures, 0.0, zernike, LOOP, 2e-8)
 
 
 def test_a_shape_that_only_the_law_denies_is_told(stand: Stand) -> None:
@@ -187,10 +194,3 @@ def test_bad_options_are_refused() -> None:
         BuildOptions(average=1)
     with pytest.raises(ValueError, match="maps_max = 15: must be at least 16"):
         BuildOptions(maps_max=15)
-
-
-def test_added_terms_have_no_recipe() -> None:
-    plant = LinearPlant(GAINS)
-    with pytest.raises(RecipeError, match="zernike"):
-        RecipeBuilder(LOOP, plant, lambda: plant.time).build(FocusTarget(0.0, 0.0, (1e-9,) * 21))
-    assert not plant.calls

@@ -1,11 +1,12 @@
-"""What `dm recipes` takes as curvatures."""
+"""What `dm recipes` takes as curvatures and added terms."""
 
 from __future__ import annotations
 
 import pytest
 import typer
 
-from dm_tools.verbs.recipes import curvatures_of
+from dm_common.optics.zernike import SPOKEN
+from dm_tools.verbs.recipes import curvatures_of, terms_of
 
 
 def test_a_list_or_a_range() -> None:
@@ -18,3 +19,16 @@ def test_a_list_or_a_range() -> None:
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(typer.BadParameter, match=f"curvatures = {text!r}"):
         curvatures_of(text)
+
+
+def test_added_terms_go_by_the_names_that_measure_prints() -> None:
+    terms = dict(zip(SPOKEN, terms_of("astigmatism cos=200, coma sin=-50"), strict=True))
+    assert {name: value for name, value in terms.items() if value} == pytest.approx(
+        {"astigmatism cos": 2e-7, "coma sin": -5e-8}
+    )
+
+
+@pytest.mark.parametrize("text", ["coma=5", "coma sin", "coma sin=x", ""])
+def test_terms_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(typer.BadParameter, match=f"zernike = {text!r}"):
+        terms_of(text)

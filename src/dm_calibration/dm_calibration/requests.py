@@ -5,6 +5,7 @@ from __future__ import annotations
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
 from dm_calibration.influence.fit import METHODS
 from dm_calibration.procedure.plan import PlanKind
+from dm_common.optics.zernike import TERMS
 from dm_common.values import Fields, real, reals, text, texts, whole
 
 _CONFIGURED = "as configured"
@@ -44,6 +45,7 @@ RECIPE = Fields(
     {
         "curvature": real(0.0),
         "conic_constant": real(0.0),
+        "zernike": reals([], sizes=(0, len(TERMS))),
         "effective": reals([]),
         "signals": reals([], -1.0, 1.0),
         "max_zernike": real(0.0, 0.0, 1.0, "m"),

@@ -194,11 +194,19 @@ def test_residuals_are_those_of_the_fit(calibration: Calibration) -> None:
 
 def test_hysteresis_and_recipes_are_shown(calibration: Calibration) -> None:
     hysteresis = HysteresisFit("Prandtl-Ishlinskii", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ("Chosen of four.",))
-    recipe = Recipe(0.02, -1.0, np.zeros(37), np.full(37, 0.1), 0.6e-9, 1.2e-9, 4)
+    astigmatism = (*4 * (0.0,), 2e-7, *16 * (0.0,))
+    recipe = Recipe(0.02, -1.0, np.zeros(37), np.full(37, 0.1), 0.6e-9, 1.2e-9, 4, astigmatism)
     whole = replace(calibration, hysteresis=hysteresis, recipes=RecipeBook((recipe,), 100, 0.8e-9, 10**18))
     made = [content.summary(whole), content_hysteresis.hysteresis(whole), content_hysteresis.recipes(whole)]
     text = one_html("", made)
-    for expected in ("11.1% of the span", "1.00% of a step per decade", "Chosen of four.", "<td>+0.0200</td>", "0.60"):
+    for expected in (
+        "11.1% of the span",
+        "1.00% of a step per decade",
+        "Chosen of four.",
+        "<td>+0.0200</td>",
+        "0.60",
+        "+200 nm",
+    ):
         assert expected in text
     assert text.count("<img ") == 3
     figures = figures_of(whole)

@@ -269,6 +269,7 @@ class DeformableMirrorClient(Connection):
         self,
         curvatures: Sequence[float],
         conic_constant: float = 0.0,
+        zernike: Sequence[float] = (),
         *,
         tolerance: float = 0.0,
         max_maps: int = 0,
@@ -276,13 +277,10 @@ class DeformableMirrorClient(Connection):
         timeout_s: float = 14400.0,
         **claim: Unpack[Claim],
     ) -> BuildRecipes.Result:
-        """Build a recipe for each curvature [1/m] on the bench, and store them with the calibration in use."""
+        """Build a recipe for each curvature [1/m] on the bench, with `zernike` [m] added; they are stored."""
+        shapes = {"curvatures": list(map(float, curvatures)), "zernike": list(map(float, zernike))}
         goal = BuildRecipes.Goal(
-            curvatures=[float(curvature) for curvature in curvatures],
-            conic_constant=float(conic_constant),
-            tolerance=float(tolerance),
-            max_maps=max_maps,
-            **claim,
+            **shapes, conic_constant=float(conic_constant), tolerance=float(tolerance), max_maps=max_maps, **claim
         )
         return self.run_action("build_recipes", goal, on_feedback, timeout_s)
 

@@ -228,6 +228,7 @@ def recipe_book_message(book: RecipeBook) -> RecipeBookMsg:
             max_zernike=recipe.max_zernike,
             rms=recipe.rms,
             maps=recipe.maps,
+            zernike=list(recipe.zernike),
         )
         for recipe in book.recipes
     ]
@@ -254,6 +255,7 @@ def recipe_book_from(message: RecipeBookMsg) -> RecipeBook:
             recipe.max_zernike,
             recipe.rms,
             recipe.maps,
+            tuple(recipe.zernike),
         )
         for recipe in message.recipes
     ]

@@ -7,10 +7,14 @@ later time and creep. On a mirror without an identified model they are the signa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dm_common.optics.zernike import SPOKEN
 
 Floats = NDArray[np.float64]
 
@@ -30,6 +34,7 @@ class Recipe:
         signals: (N,) the command when it was built.
         max_zernike, rms: m, re-measured: largest coefficient error beyond tilt, sag error.
         maps: taken to find it.
+        zernike: m, added sag, as requested; () = none.
     """
 
     curvature: float
@@ -39,6 +44,17 @@ class Recipe:
     max_zernike: float
     rms: float
     maps: int
+    zernike: tuple[float, ...] = ()
+
+    @property
+    def series(self) -> tuple[float, tuple[float, ...]]:
+        """What it has in common with shapes that differ in curvature alone: conic constant and added terms."""
+        return self.conic_constant, self.zernike if any(self.zernike) else ()
+
+    @property
+    def shape(self) -> tuple[float, tuple[float, ...], float]:
+        """What tells it from all others: its series, and its curvature."""
+        return *self.series, self.curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +62,7 @@ class RecipeBook:
     """Recipes of one calibration.
 
     Attributes:
-        recipes: by rising conic constant, then curvature.
+        recipes: by rising conic constant, added terms, curvature.
         degauss_steps: half-swings of the degauss that they begin with.
         interpolation_error: m, by how much the bound halfway between neighbours exceeds what was re-measured, when the
             last were built.
@@ -59,9 +75,9 @@ class RecipeBook:
     stamp_ns: int
 
     def __post_init__(self) -> None:
-        keys = [(recipe.conic_constant, recipe.curvature) for recipe in self.recipes]
-        if keys != sorted(set(keys)):
-            raise RecipeError("recipes: must rise in conic constant and curvature, each shape once")
+        shapes = [recipe.shape for recipe in self.recipes]
+        if shapes != sorted(set(shapes)):
+            raise RecipeError("recipes: must rise in conic constant, added terms and curvature, each shape once")
         if len({len(recipe.effective) for recipe in self.recipes}) > 1:
             raise RecipeError("recipes: are of mirrors with different numbers of actuators")
         for recipe in self.recipes:
@@ -83,13 +99,25 @@ class RecipeBook:
             RecipeError: made under another condition.
         """
         self.check_condition(newer.degauss_steps)
-        both = {(r.conic_constant, r.curvature): r for r in (*self.recipes, *newer.recipes)}
+        both = {recipe.shape: recipe for recipe in (*self.recipes, *newer.recipes)}
         return RecipeBook(
             tuple(both[key] for key in sorted(both)),
             newer.degauss_steps,
             newer.interpolation_error,
             newer.stamp_ns,
         )
+
+
+def terms_text(zernike: Sequence[float]) -> str:
+    """Added terms (m), for people: in nm, those that are not zero."""
+    terms = zip(SPOKEN, zernike, strict=True) if len(zernike) else ()
+    return ", ".join(f"{name} {1e9 * value:+.4g} nm" for name, value in terms if value)
+
+
+def shape_text(shape: Any) -> str:
+    """The shape of a recipe, a target or a message of these, for people."""
+    terms = terms_text(shape.zernike)
+    return f"{shape.curvature:+.4f} 1/m{' with ' * bool(terms)}{terms}"
 
 
 NO_RECIPES = RecipeBook((), 0, 0.0, 0)

@@ -134,6 +134,7 @@ BUILD_RECIPES = Fields(
     {
         "curvatures": reals([], sizes=range(1, 1001)),
         "conic_constant": real(0.0),
+        "zernike": reals([]),
         "tolerance": _TOLERANCE,
         "max_maps": whole(0, 4, 100, zero="as configured"),
     }

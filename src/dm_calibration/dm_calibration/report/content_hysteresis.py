@@ -8,6 +8,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.report import hysteresis_figures
 from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
+from dm_common.recipes import terms_text
 
 NM = 1e9
 
@@ -82,6 +83,7 @@ def recipes(calibration: Calibration) -> Section:
         (
             f"{recipe.curvature:+.4f}",
             f"{recipe.conic_constant:g}",
+            terms_text(recipe.zernike) or "-",
             f"{recipe.max_zernike * NM:.2f}",
             f"{recipe.rms * NM:.2f}",
             str(recipe.maps),
@@ -89,7 +91,7 @@ def recipes(calibration: Calibration) -> Section:
         )
         for recipe in book.recipes
     ]
-    header = ("curvature, 1/m", "conic", "largest coefficient, nm", "rms sag, nm", "maps", "signals")
+    header = ("curvature, 1/m", "conic", "added terms", "largest coefficient, nm", "rms sag, nm", "maps", "signals")
     return Section(
         title,
         [

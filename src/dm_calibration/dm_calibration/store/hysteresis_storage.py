@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,11 @@ import numpy as np
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.store.hdf5_image import Column
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.optics.zernike import TERMS
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook
 
-_RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe))
+#: Of each recipe; its added terms are kept as a table.
+_RECIPE_COLUMNS = tuple(field.name for field in fields(Recipe) if field.name != "zernike")
 
 
 def hysteresis_columns(hysteresis: HysteresisFit | None) -> dict[str, Column]:
@@ -61,6 +63,7 @@ def recipe_columns(book: RecipeBook) -> dict[str, Column]:
     columns: dict[str, Column] = {
         f"recipes/{name}": np.array([getattr(recipe, name) for recipe in book.recipes]) for name in _RECIPE_COLUMNS
     }
+    columns["recipes/zernike"] = np.array([recipe.zernike or len(TERMS) * (0.0,) for recipe in book.recipes])
     columns["recipes/degauss_steps"] = np.array(book.degauss_steps)
     columns["recipes/interpolation_error"] = np.array(book.interpolation_error)
     columns["recipes/stamp_ns"] = np.array(book.stamp_ns)
@@ -76,9 +79,10 @@ def recipes_from(columns: Mapping[str, Column]) -> RecipeBook:
     if "recipes/curvature" not in columns:
         return NO_RECIPES
     rows = [np.asarray(columns[f"recipes/{name}"]) for name in _RECIPE_COLUMNS]
+    zernike = np.asarray(columns.get("recipes/zernike", np.zeros((len(rows[0]), 0)))).tolist()
     recipes = tuple(
-        Recipe(*(value.astype(np.float64) if value.ndim else value.item() for value in row))
-        for row in zip(*rows, strict=True)
+        replace(Recipe(*(value.astype(np.float64) if value.ndim else value.item() for value in row)), zernike=terms)
+        for row, terms in zip(zip(*rows, strict=True), map(tuple, zernike), strict=True)
     )
     return RecipeBook(
         recipes,

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
-from dm_common.recipes import RecipeError
+import numpy as np
+
+from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
+from dm_common.optics.zernike import TERMS
+from dm_common.recipes import RecipeError, shape_text
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.recipes import SAME_CURVATURE
+from dm_controller.planning.recipes import SAME_SHAPE
 from dm_controller.planning.target import FocusTarget
 
 
@@ -19,23 +22,34 @@ class UnreachableError(RecipeError):
 
 
 def recipe_targets(
-    curvatures: Sequence[float], conic_constant: float, loop: Planner, error_max: float
+    curvatures: Sequence[float], conic_constant: float, zernike: Sequence[float], loop: Planner, error_max: float
 ) -> list[FocusTarget]:
     """The shapes to build recipes for, by rising curvature.
 
     Args:
+        zernike: m, added terms: none, one set for all, or one set after the other for each.
         error_max: largest coefficient error, m, that the model may leave.
 
     Raises:
-        RecipeError: a curvature asked for twice, naming it.
+        Refusal: `zernike` is of another length.
+        RecipeError: a shape asked for twice, naming it.
         UnreachableError: one out of reach.
         TargetError: no such surface exists over the aperture.
     """
-    ordered = sorted(float(curvature) for curvature in curvatures)
-    for one, next_one in pairwise(ordered):
-        if next_one - one <= SAME_CURVATURE:
-            raise RecipeError(f"curvatures: {one:+.4f} 1/m is there twice; each recipe once")
-    targets = [FocusTarget(curvature, conic_constant) for curvature in ordered]
+    sizes = sorted({0, len(TERMS), len(TERMS) * len(curvatures)})
+    if len(zernike) not in sizes:
+        allowed = " or ".join(map(str, sizes))
+        raise Refusal(ErrorCode.INVALID_LENGTH, f"zernike has {len(zernike)} values: must have {allowed}")
+    terms = np.reshape(zernike if len(zernike) else np.zeros(len(TERMS)), (-1, len(TERMS)))
+    each = np.broadcast_to(terms, (len(curvatures), len(TERMS))).tolist()
+    targets = [
+        FocusTarget(curvature, conic_constant, tuple(added) if any(added) else ())
+        for curvature, added in sorted(zip(map(float, curvatures), each, strict=True))
+    ]
+    radius = loop.mirror.model.aperture_radius
+    for one, other in pairwise(targets):
+        if one.deviation(other, radius) <= SAME_SHAPE:
+            raise RecipeError(f"curvatures: {shape_text(one)} is there twice; each recipe once")
     for target in targets:
         left = loop.mirror.command(target)[1]
         if left > error_max:

@@ -20,7 +20,7 @@ import numpy as np
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.measurement import Measurement
-from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
+from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
 from dm_controller.converge.defects import Defects, mean_of
 from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.planner import Planner
@@ -87,11 +87,13 @@ class BuildStep:
     Attributes:
         curvature: 1/m, of the recipe.
         maps: taken for it so far.
+        recipes: built before it.
         max_zernike, rms: m, of the mean of the round so far: largest coefficient error beyond tilt, sag error.
     """
 
     curvature: float
     maps: int
+    recipes: int
     max_zernike: float
     rms: float
 
@@ -158,13 +160,10 @@ class RecipeBuilder:
 
         Raises:
             TargetError: no such surface exists over the aperture.
-            RecipeError: added terms.
             UnreachableError: the limits deny the shape.
             Cancelled: `cancelled()` became true.
             Refusal, ValueError: the bench failed, or its maps are of another kind than the calibration's.
         """
-        if any(target.zernike):
-            raise RecipeError("zernike: recipes are of plain conics, without added terms")
         options = self._options
         aim, maps = self._solve(target, None), 0
         while True:
@@ -195,6 +194,7 @@ class RecipeBuilder:
             max_zernike=error.max_zernike,
             rms=rms_sag(error, self._loop.mirror.model),
             maps=maps,
+            zernike=taken.target.zernike,
         )
 
     def _error(self, taken: _Round) -> Shape:
@@ -250,7 +250,7 @@ class RecipeBuilder:
             if defects:
                 self._hold(aim)
             number = len(defects) + 1
-            measured = self._plant.measure(f"recipe {target.curvature:+.4f} 1/m {before + number}")
+            measured = self._plant.measure(f"recipe {shape_text(target)} {before + number}")
             self.maps += 1
             surface = measured_shape(measured.coefficients, measured.sag, model)
             # A map tells when it was taken; one that does not was taken now.
@@ -258,7 +258,8 @@ class RecipeBuilder:
             defects.append(surface - self._predicted(law.effective(law.advance(self.state, seen))))
             taken = _Round(target, signals, aim, mean_of(defects), number)
             error = self._error(taken)
-            self._on_step(BuildStep(target.curvature, before + number, error.max_zernike, rms_sag(error, model)))
+            maps, built = before + number, len(self._built)
+            self._on_step(BuildStep(target.curvature, maps, built, error.max_zernike, rms_sag(error, model)))
             sure = number >= MAPS_MIN and self._defects.spread(defects) <= SURE_SHARE * options.tolerance
             if sure or number == options.average:
                 break
@@ -287,7 +288,7 @@ def recipe_book(
     Raises:
         RecipeError: those were made under another condition.
     """
-    ordered = sorted(recipes, key=lambda recipe: (recipe.conic_constant, recipe.curvature))
+    ordered = sorted(recipes, key=lambda recipe: recipe.shape)
     book = RecipeBook(tuple(ordered), degauss_steps, 0.0, stamp_ns)
     whole = before.merged(book)
     between = Corrections(whole, loop).worst - max(recipe.max_zernike for recipe in whole.recipes)

@@ -20,6 +20,7 @@ from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
+from dm_common.recipes import shape_text
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_controller.converge.goals import ending, recipe_targets
@@ -75,7 +76,7 @@ class RecipeRun:
         options = self._options(goal)
         active = bench.host.active_calibration()
         planner, calibration = active.planner, active.calibration
-        targets = recipe_targets(goal.curvatures, goal.conic_constant, planner, options.reachable)
+        targets = recipe_targets(goal.curvatures, goal.conic_constant, goal.zernike, planner, options.reachable)
         steps = self._values["recipes.degauss_steps"]
         active.recipes.check_condition(steps)
         bench.check_ready()
@@ -87,7 +88,7 @@ class RecipeRun:
             return float(clock.now().nanoseconds * 1e-9)
 
         def report(step: BuildStep) -> None:
-            feedback.step, feedback.curvature = builder.maps, step.curvature
+            feedback.step, feedback.curvature, feedback.recipes = builder.maps, step.curvature, step.recipes
             feedback.residual_rms, feedback.max_zernike = step.rms, step.max_zernike
             handle.publish_feedback(feedback)
 
@@ -117,10 +118,10 @@ class RecipeRun:
             else:
                 code = stored if code == ErrorCode.OK else code
                 text = "; ".join(filter(None, (text, f"the recipes were not stored: {reason}")))
-        missed = [f"{r.curvature:+.4f}" for r in recipes if r.max_zernike > options.tolerance]
+        missed = [shape_text(r) for r in recipes if r.max_zernike > options.tolerance]
         if code == ErrorCode.OK and missed:
             code = ErrorCode.NOT_CONVERGED
-            text = f"not within the tolerance of {options.tolerance * 1e9:.2f} nm: {', '.join(missed)} 1/m"
+            text = f"not within the tolerance of {options.tolerance * 1e9:.2f} nm: {', '.join(missed)}"
         figures = (
             f"{result.recipes} of {len(targets)} recipes stored with calibration {calibration.id}, largest coefficient "
             f"error {result.max_zernike * 1e9:.2f} nm re-measured, {result.interpolation_error * 1e9:.2f} nm more "

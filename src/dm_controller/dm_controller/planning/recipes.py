@@ -12,21 +12,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.optics.zernike import PISTON_TILT
-from dm_common.recipes import Recipe, RecipeBook, RecipeError
+from dm_common.recipes import RecipeBook, RecipeError, shape_text, terms_text
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget
 
 Floats = NDArray[np.float64]
 
-#: Curvatures that differ less are the same shape, 1/m: over a radius of 11 mm that is 3 pm of defocus.
-SAME_CURVATURE = 1e-7
-#: The same for conic constants.
-SAME_CONIC = 1e-9
+#: Surfaces whose coefficients differ less are the same shape, m.
+SAME_SHAPE = 3e-12
 #: Distance of effective signals, rms over actuators, at which corrections are alike to 1/e. A sphere of 0.05 1/m and
 #: mid range are about 0.5 apart.
 REACH = 1.0
@@ -99,7 +98,8 @@ class Corrections:
         if not book.recipes:
             raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
         self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
-        self._own = np.array([planner.mirror.command(target_of(recipe))[0] for recipe in recipes])
+        self._shapes = [FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike) for recipe in recipes]
+        self._own = np.array([planner.mirror.command(shape)[0] for shape in self._shapes])
         self._corrections = np.array([recipe.effective for recipe in recipes]) - self._own
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
         self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
@@ -124,19 +124,18 @@ class Corrections:
 
     def find(self, target: FocusTarget) -> FoundRecipe:
         """What makes `target`. Raises RecipeError when it is beyond all curvatures there are, or no recipe is near."""
-        for recipe in self._recipes:
-            if _same(recipe, target):
+        radius = self._mirror.model.aperture_radius
+        for recipe, shape in zip(self._recipes, self._shapes, strict=True):
+            if shape.deviation(target, radius) <= SAME_SHAPE:
                 return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0), False)
         curvatures = [recipe.curvature for recipe in self._recipes]
-        if not min(curvatures) - SAME_CURVATURE <= target.curvature <= max(curvatures) + SAME_CURVATURE:
-            raise RecipeError(
-                f"curvature = {target.curvature:+.4f} 1/m: nothing is extrapolated; there are {self._there()}"
-            )
+        if not min(curvatures) <= target.curvature <= max(curvatures):
+            raise RecipeError(f"curvature = {shape_text(target)}: nothing is extrapolated; there are {self._there()}")
         own = self._mirror.command(target)[0]
         weights, left = self._kriging.at(own)
         if left > LEFT_MAX:
             raise RecipeError(
-                f"curvature = {target.curvature:+.4f} 1/m: no recipe is near this shape; there are {self._there()}"
+                f"curvature = {shape_text(target)}: no recipe is near this shape; there are {self._there()}"
             )
         near = np.abs(weights) >= SLIGHT * np.abs(weights).max()
         error = self._bound(float(self._measured[near].max()), left)
@@ -148,28 +147,15 @@ class Corrections:
         lefts = [
             self._kriging.at(0.5 * (own + following))[1]
             for own, following, a, b in zip(self._own, self._own[1:], self._recipes, self._recipes[1:], strict=False)
-            if abs(a.conic_constant - b.conic_constant) <= SAME_CONIC
+            if a.series == b.series
         ]
         return self._bound(float(self._measured.max()), max(lefts, default=0.0))
 
     def _there(self) -> str:
         """The recipes there are, in words."""
-        conics = sorted({recipe.conic_constant for recipe in self._recipes})
-        ranges = {c: [r.curvature for r in self._recipes if r.conic_constant == c] for c in conics}
+        ranges = groupby(self._recipes, lambda recipe: recipe.series)
         return ", ".join(
-            f"{len(of)} from {min(of):+.4f} to {max(of):+.4f} 1/m with conic_constant = {conic:g}"
-            for conic, of in ranges.items()
+            f"{len(of)} from {of[0]:+.4f} to {of[-1]:+.4f} 1/m with conic_constant = {conic:g}"
+            f"{', ' * bool(terms)}{terms_text(terms)}"
+            for (conic, terms), of in ((series, [recipe.curvature for recipe in those]) for series, those in ranges)
         )
-
-
-def target_of(recipe: Recipe) -> FocusTarget:
-    """The shape of a recipe."""
-    return FocusTarget(recipe.curvature, recipe.conic_constant)
-
-
-def _same(recipe: Recipe, target: FocusTarget) -> bool:
-    return (
-        abs(recipe.curvature - target.curvature) <= SAME_CURVATURE
-        and abs(recipe.conic_constant - target.conic_constant) <= SAME_CONIC
-        and not any(target.zernike)
-    )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
 from dm_common.optics.conic import conic_coefficients, conic_sag
-from dm_common.optics.zernike import TERMS, basis
+from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_common.values import Fields, real, reals, whole
 
 
@@ -78,6 +78,11 @@ class FocusTarget:
         if self.zernike:
             result = result + basis(x, y) @ np.asarray(self.zernike)
         return result
+
+    def deviation(self, other: FocusTarget, radius: float) -> float:
+        """Largest difference of their coefficients beyond tilt, m, over an aperture of `radius` [m]."""
+        difference = self.coefficients(radius) - other.coefficients(radius)
+        return float(np.abs(difference[PISTON_TILT:]).max())
 
     def denied(self, error: float, allowed: float, reachable: tuple[float, float]) -> str:
         """That limits deny it, as a sentence.

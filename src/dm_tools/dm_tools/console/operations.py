@@ -110,11 +110,9 @@ async def estimate(session: Session, goal: Calibrate.Goal) -> str:
 
 async def build_recipes(session: Session, curvatures: list[float]) -> str:
     """Condition the mirror, then converge, for every curvature (1/m); stored with the calibration in use."""
-    order = sorted(curvatures)
 
     def show(feedback: Any) -> None:
-        done = sum(curvature < feedback.curvature - 1e-9 for curvature in order)
-        session.progress.step, session.progress.steps = done, len(order)
+        session.progress.step, session.progress.steps = feedback.recipes, len(curvatures)
         session.progress.text = recipe_step(feedback)
 
     result = await session.ros.run("build_recipes", BuildRecipes.Goal(curvatures=curvatures), show)

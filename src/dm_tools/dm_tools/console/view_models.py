@@ -13,6 +13,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
+from dm_common.recipes import terms_text
 
 Floats = NDArray[np.float64]
 
@@ -254,13 +255,14 @@ def evenly(first: float | None, last: float | None, number: float | None) -> lis
 
 
 def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:
-    """Recipes of a dm_msgs/Calibration: curvature, conic constant, re-measured errors in nm, maps."""
+    """Recipes of a dm_msgs/Calibration: curvature, conic constant, added terms, re-measured errors in nm, maps."""
     if calibration is None or not calibration.id:
         return []
     return [
         (
             f"{recipe.curvature:+.4f}",
             f"{recipe.conic_constant:g}",
+            terms_text(recipe.zernike) or "-",
             f"{recipe.max_zernike * NM:.2f}",
             f"{recipe.rms * NM:.2f}",
             str(recipe.maps),

@@ -41,22 +41,38 @@ def curvatures_of(text: str) -> list[float]:
     return [round(first + k * step, 12) for k in range(number)]
 
 
-def _build(client: Any, curvatures: list[float], conic: float, **options: Any) -> Any:
+def terms_of(text: str) -> list[float]:
+    """Added terms, m, from a text such as "astigmatism cos=200, coma sin=-50", in nm; names as of `dm measure`.
+
+    Raises:
+        typer.BadParameter: naming what is no term, or no number.
+    """
+    from dm_common.optics.zernike import SPOKEN
+
+    terms = dict.fromkeys(SPOKEN, 0.0)
+    for part in text.split(","):
+        name, _, value = (each.strip() for each in part.partition("="))
+        if name not in terms:
+            raise typer.BadParameter(f"zernike = {text!r}: must be like 'coma sin=-50'; terms: {', '.join(SPOKEN)}")
+        try:
+            terms[name] = 1e-9 * float(value)
+        except ValueError as error:
+            raise typer.BadParameter(f"zernike = {text!r}: {value!r} is not a number of nm") from error
+    return list(terms.values())
+
+
+def _build(client: Any, curvatures: list[float], conic: float, zernike: list[float], **options: Any) -> Any:
     """Build with a progress bar; `options` as of `build_recipes` of the client. Returns the action's result."""
-    order = {curvature: place for place, curvature in enumerate(sorted(curvatures))}
+    from dm_tools.long_actions import recipe_step
+
     with progress_bar() as progress:
-        task = progress.add_task("recipes", total=len(order))
+        task = progress.add_task("recipes", total=len(curvatures))
 
         def show(feedback: Any) -> None:
-            progress.update(
-                task,
-                completed=order.get(feedback.curvature, 0),
-                description=f"recipe {feedback.curvature:+.4f} 1/m: map {feedback.step}, largest coefficient error "
-                f"{nanometres(feedback.max_zernike):.2f} nm",
-            )
+            progress.update(task, completed=feedback.recipes, description=f"recipe {recipe_step(feedback)}")
 
-        result = client.build_recipes(curvatures, conic, on_feedback=show, **options)
-        progress.update(task, completed=len(order), description="recipes: done")
+        result = client.build_recipes(curvatures, conic, zernike, on_feedback=show, **options)
+        progress.update(task, completed=len(curvatures), description="recipes: done")
     return result
 
 
@@ -68,6 +84,7 @@ def _figures(book: Any) -> dict[str, Any]:
             {
                 "curvature": recipe.curvature,
                 "conic_constant": recipe.conic_constant,
+                "zernike_nm": [nanometres(term) for term in recipe.zernike],
                 "max_zernike_nm": nanometres(recipe.max_zernike),
                 "rms_nm": nanometres(recipe.rms),
                 "maps": recipe.maps,
@@ -79,9 +96,14 @@ def _figures(book: Any) -> dict[str, Any]:
 
 def recipes(
     curvatures: Annotated[
-        str, typer.Option(help=f"Curvatures [1/m]: -0.02,0,0.02 or first:last:number; empty = {DEFAULT}.")
+        str,
+        typer.Option(help=f"Curvatures [1/m]: -0.02,0,0.02 or first:last:number; empty = {DEFAULT}, 0 with --zernike."),
     ] = "",
     conic: Annotated[float, typer.Option(help="Conic constant of all: 0 = sphere, -1 = paraboloid.")] = 0.0,
+    zernike: Annotated[
+        list[str] | None,
+        typer.Option(help="Added terms [nm]: 'astigmatism cos=200,coma sin=-50'; again for each further shape."),
+    ] = None,
     tolerance: Annotated[float, typer.Option(help="Largest coefficient error [nm]; 0 = configured.")] = 0.0,
     max_maps: Annotated[int, typer.Option(min=0, max=100, help="Maps per recipe; 0 = configured.")] = 0,
     show: Annotated[bool, typer.Option("--list", help="Only list the recipes of the calibration in use.")] = False,
@@ -89,21 +111,28 @@ def recipes(
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
-    """Build recipes on the bench: degauss, go, measure, correct, for each curvature; stored with the calibration.
+    """Build recipes on the bench: degauss, go, measure, correct, for each shape; stored with the calibration.
 
     Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps the recipes that are whole and leaves the mirror
     at mid range.
     """
-    wanted = curvatures_of(curvatures or DEFAULT)
+    from dm_common.recipes import shape_text
+
+    shapes = [terms_of(text) for text in zernike or ()] or [[]]
+    wanted = curvatures_of(curvatures or ("0" if zernike else DEFAULT))
+    terms = [term for _ in wanted for shape in shapes for term in shape]
+    wanted = [curvature for curvature in wanted for _ in shapes]
     with running_suite(namespace) as client, naming_holder(client):
         if not show:
-            result = _build(client, wanted, conic, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over)
+            result = _build(
+                client, wanted, conic, terms, tolerance=tolerance * 1e-9, max_maps=max_maps, take_over=take_over
+            )
             console.print(result.message)
             client.wait(lambda: len(client.latest("calibration").recipes.recipes) >= result.recipes)
         calibration = client.latest("calibration")
     for recipe in calibration.recipes.recipes:
         console.print(
-            f"{recipe.curvature:+.4f} 1/m, conic constant {recipe.conic_constant:g}: largest coefficient error "
+            f"{shape_text(recipe)}, conic constant {recipe.conic_constant:g}: largest coefficient error "
             f"{nanometres(recipe.max_zernike):.2f} nm, {nanometres(recipe.rms):.1f} nm rms, {recipe.maps} maps"
         )
     if not calibration.recipes.recipes:

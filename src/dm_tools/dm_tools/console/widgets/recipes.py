@@ -16,7 +16,7 @@ from dm_tools.console.widgets.components import ActionButton, DecimalField, Line
 
 #: Range of [1], section 3.2, 1/m, and the number of its curvatures.
 FIRST, LAST, NUMBER = -0.05, 0.05, 11
-HEADER = ("1/m", "conic", "largest coefficient, nm", "rms, nm", "maps")
+HEADER = ("1/m", "conic", "added terms", "largest coefficient, nm", "rms, nm", "maps")
 
 
 class RecipesCard:
