@@ -103,6 +103,7 @@ def unexplained(text: str) -> set[str]:
 
 #: Blocks that are nothing to type, by their first line.
 TEXTS = {
+    "file, reference, part, degrees": "table of maps of flats; test_instrument_errors.py reads one",
     "header | one word per channel | check sum | terminator": "layout of a frame",
     (
         "poke check the maps show the mirror mirrored left to right, "
@@ -145,6 +146,8 @@ PARSED = {
     "./dm demo --config src/dm_bringup/config/membrane_37.yaml": _LONG + "test_membrane_mirror.py runs its parts",
     "./dm calibrate --boresight": "needs a camera; test_boresight_command.py runs what it does, test_held_tilt.py how",
     "./dm exec python examples/camera_focus.py": "test_autofocus_node.py runs it",
+    "./dm instrument retrace tilt*.dat": "test_instrument_errors.py runs it on maps of the virtual bench",
+    "./dm instrument grid marks.csv any.dat": "test_instrument_errors.py runs it on maps of the virtual bench",
     "./dm measure --reference-sphere -1.5": "no sphere stands there; test_ingest.py checks what it finds",
     "./dm check --without 5": "that actuator is well; test_drift_updates.py checks such updates",
     "./dm test": "would run this test again",

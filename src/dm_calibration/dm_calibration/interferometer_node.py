@@ -26,7 +26,7 @@ from std_msgs.msg import Header
 from dm_calibration.acquisition import interferometer_messages as messages
 from dm_calibration.acquisition.acquisition import Acquisition, measured_ns
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings, too_large
-from dm_calibration.acquisition.reference_surface import reference_name
+from dm_calibration.acquisition.reference_surface import corrections
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
 from dm_calibration.interferometer_parameters import PARAMETERS, configure, ingest_settings
 from dm_calibration.map_files import MapFileError, SurfaceMap
@@ -101,8 +101,9 @@ class InterferometerNode(ManagedNode):
     def activate(self) -> None:
         assert self._acquisition is not None
         self._acquisition.start()
-        less = f", less {reference_name(self._reference)}" if self._reference is not None else ""
-        self.get_logger().info(f"active; maps from {self._acquisition.source}{less}")
+        settings = self._settings()
+        less = corrections(settings.reference, settings.retrace, settings.distortion)
+        self.get_logger().info(f"active; maps from {self._acquisition.source}{less and f', less {less}'}")
 
     def deactivate(self) -> None:
         self.make_safe()

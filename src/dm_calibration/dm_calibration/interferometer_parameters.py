@@ -13,8 +13,9 @@ from dm_calibration.acquisition.acquisition import AcquisitionSettings
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap
+from dm_calibration.optics.instrument import RETRACE_SIZE
 from dm_calibration.optics.orientation import Orientation
-from dm_common.ros.parameters import AUTOSTART, Parameter, real, switch, text, texts
+from dm_common.ros.parameters import AUTOSTART, Parameter, real, reals, switch, text, texts
 
 PARAMETERS = (
     AUTOSTART,
@@ -61,6 +62,13 @@ PARAMETERS = (
     ),
     Parameter("aperture.centre_y", real(0.0, -1.0, 1.0, "m"), "The same, y up.", live=True),
     Parameter(
+        "aperture.follow",
+        switch(False),
+        "Count that from the centre of the valid region, found anew in each map, where that ends at the rim of the "
+        "mirror or of a mask on it.",
+        live=True,
+    ),
+    Parameter(
         "aperture.minimum_valid_fraction",
         real(0.7, 0.0, 1.0),
         "Smallest share of valid pixels inside the aperture; maps with fewer are refused.",
@@ -93,6 +101,16 @@ PARAMETERS = (
         text(""),
         "Map file of the instrument's own error, as it shows it (before orientation.*), which is subtracted from every "
         "map; empty = nothing is.",
+    ),
+    Parameter(
+        "retrace",
+        reals([], -1.0, 1.0),
+        "Error of the instrument that goes with tilt, 36 numbers, as `./dm instrument retrace` finds it; empty = none.",
+    ),
+    Parameter(
+        "distortion",
+        real(0.0, -0.1, 0.1),
+        "Radial distortion at the edge of the map, as a share, as `./dm instrument grid` finds it.",
     ),
     Parameter(
         "instrument_error",
@@ -131,9 +149,11 @@ def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMa
         ValueError: values that contradict each other, a folder of an unknown user, or no map to refer to.
     """
     topic = values["zernike_topic"]
-    if topic and (values["watch_folder"] or values["trigger_command"] or values["reference_surface"]):
-        others = "watch_folder, trigger_command and reference_surface"
-        raise ValueError(f"zernike_topic = {topic!r}: {others} must be empty beside it")
+    others = ("watch_folder", "trigger_command", "reference_surface", "retrace", "distortion")
+    if topic and any(values[name] for name in others):
+        raise ValueError(f"zernike_topic = {topic!r}: {', '.join(others)} must be empty or 0 beside it")
+    if len(values["retrace"]) not in (0, RETRACE_SIZE):
+        raise ValueError(f"retrace: {len(values['retrace'])} numbers, must be {RETRACE_SIZE} or none")
     if topic.strip("/") == "zernike":
         raise ValueError(f"zernike_topic = {topic!r}: is what this node itself publishes")
     try:
@@ -160,8 +180,11 @@ def ingest_settings(
         aperture_radius=values["aperture.radius"],
         mirror_radius=mirror_radius,
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
+        aperture_follow=values["aperture.follow"],
         minimum_valid_fraction=values["aperture.minimum_valid_fraction"],
         reference=reference,
+        retrace=tuple(values["retrace"]),
+        distortion=values["distortion"],
         instrument_error=values["instrument_error"],
         scale_error=values["scale_error"],
         remove_piston_tilt=values["remove_piston_tilt"],

@@ -28,6 +28,7 @@ VERBS = {
     "degauss": "dm_tools.verbs.focus",
     "measure": "dm_tools.verbs.measure",
     "check": "dm_tools.verbs.measure",
+    "instrument": "dm_tools.verbs.measure",
     "report": "dm_tools.verbs.report",
     "recipes": "dm_tools.verbs.recipes",
     "console": "dm_tools.verbs.console",

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.acquisition.reference_surface import MapRejectedError, absolute_sag, reference_name
+from dm_calibration.acquisition.reference_surface import MapRejectedError, absolute_sag, corrections
 from dm_calibration.map_files import SurfaceMap, read_map
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError, configured_aperture, find_aperture
+from dm_calibration.optics.instrument import undistorted, without_retrace
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
 from dm_calibration.optics.phase_steps import PhaseStepError, mend_phase_steps
@@ -40,8 +41,10 @@ class IngestSettings:
         aperture_radius: m; 0 = find the aperture from the valid pixels.
         mirror_radius: m; no aperture_radius is larger. 0 = not known.
         aperture_centre: (x, y) in m from the oriented map's centre, used with aperture_radius.
+        aperture_follow: from the centre of the valid region, found anew in each map, instead.
         minimum_valid_fraction: valid pixels / pixels inside the aperture.
         reference: the instrument's own error, subtracted from every map before it is turned; None = not known.
+        retrace, distortion: of the instrument, taken off then; see :mod:`~dm_calibration.optics.instrument`. () = none.
         instrument_error, scale_error: as of :class:`~dm_common.measurement.Measurement`.
         remove_piston_tilt: subtract the map's plane from the map that is handed on; the fit keeps piston and tilt.
     """
@@ -54,8 +57,11 @@ class IngestSettings:
     aperture_radius: float = 0.0
     mirror_radius: float = 0.0
     aperture_centre: tuple[float, float] = (0.0, 0.0)
+    aperture_follow: bool = False
     minimum_valid_fraction: float = 0.7
     reference: SurfaceMap | None = None
+    retrace: tuple[float, ...] = ()
+    distortion: float = 0.0
     instrument_error: float = 0.0
     scale_error: float = 0.0
     remove_piston_tilt: bool = False
@@ -120,6 +126,10 @@ class Ingest:
         if settings.reference is not None:
             sag = absolute_sag(source, settings.reference, settings.pitch, settings.wavelength_tolerance)
             subtracted = True
+        if settings.retrace:
+            sag = without_retrace(sag, settings.retrace)
+        if settings.distortion:
+            sag = undistorted(sag, settings.distortion)
         sag = settings.orientation.apply(sag)
         surface = replace(source, sag=sag, pitch=pitch)
         aperture = self._aperture(surface.valid, pitch, settings)
@@ -151,7 +161,7 @@ class Ingest:
             radius=aperture.radius_px * (pitch or 0.0),
             wavelength=source.wavelength,
             system_error_subtracted=-1 if subtracted is None else int(subtracted),
-            reference_surface=reference_name(settings.reference),
+            reference_surface=corrections(settings.reference, settings.retrace, settings.distortion),
             instrument_error=settings.instrument_error,
             scale_error=settings.scale_error,
             file=source.file,
@@ -177,4 +187,15 @@ class Ingest:
                 f"aperture.radius = {settings.aperture_radius:g} m, but the file does not tell its lateral resolution: "
                 "set the parameter pitch, or aperture.radius to 0"
             )
-        return configured_aperture(valid.shape, pitch, settings.aperture_radius, *settings.aperture_centre)
+        wanted = configured_aperture(valid.shape, pitch, settings.aperture_radius, *settings.aperture_centre)
+        if not settings.aperture_follow:
+            return wanted
+        seen = find_aperture(valid)
+        if seen.radius_px < wanted.radius_px:
+            raise MapRejectedError(
+                f"aperture.follow: the valid region has a radius of {seen.radius_px * pitch:g} m, must be at least "
+                f"aperture.radius = {settings.aperture_radius:g} m"
+            )
+        height, width = valid.shape
+        shift_x, shift_y = seen.centre_x_px - 0.5 * (width - 1), seen.centre_y_px - 0.5 * (height - 1)
+        return replace(wanted, centre_x_px=wanted.centre_x_px + shift_x, centre_y_px=wanted.centre_y_px + shift_y)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +40,14 @@ def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float
     return reference
 
 
-def reference_name(reference: SurfaceMap | None) -> str:
-    """What is kept of a reference surface with the maps that it was subtracted from; "" = none was."""
-    return f"{Path(reference.file).name}, SHA-256 {reference.sha256}" if reference is not None else ""
+def corrections(reference: SurfaceMap | None, retrace: Sequence[float] = (), distortion: float = 0.0) -> str:
+    """What is kept with maps of the errors of the instrument that were taken off them; "" = none were."""
+    parts = [f"{Path(reference.file).name}, SHA-256 {reference.sha256}"] if reference is not None else []
+    if retrace:
+        parts.append(f"retrace error of {max(map(abs, retrace)) * 1e3:.4g} nm per um of tilt")
+    if distortion:
+        parts.append(f"distortion of {distortion:.4%}")
+    return "; ".join(parts)
 
 
 def absolute_sag(

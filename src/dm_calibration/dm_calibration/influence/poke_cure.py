@@ -62,6 +62,7 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
         elif np.isfinite(centre):
             changes["interferometer"] |= {
                 "aperture.radius": mirror.working_radius,
+                "aperture.follow": False,  # this centre counts from that of the map
                 "aperture.centre_x": round(centre.real, 6),
                 "aperture.centre_y": round(centre.imag, 6),
             }

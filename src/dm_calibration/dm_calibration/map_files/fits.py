@@ -1,4 +1,4 @@
-"""Maps in FITS files: the primary image, its heights in the unit that BUNIT tells (docs/map-files.md)."""
+"""Maps in FITS files: the primary image, its heights in the unit that BUNIT tells (docs/map-files.md), and writing."""
 
 from __future__ import annotations
 
@@ -71,11 +71,31 @@ def parse_fits(content: bytes, unit: str | None) -> SurfaceMap:
         sag=sag,
         wavelength=check_wavelength(wavelength) if wavelength else 0.0,
         pitch=_pitch(header),
+        origin=(int(_real(header, "MAPCOL", 0.0)), int(_real(header, "MAPROW", 0.0))),
         format="fits",
         instrument=str(header.get("INSTRUME", "")),
         part_name=str(header.get("OBJECT", "")),
         time_stamp=_time(str(header.get("DATE-OBS", ""))),
     )
+
+
+def fits_bytes(surface: SurfaceMap, instrument: str) -> bytes:
+    """`surface` as a FITS file in m that :func:`parse_fits` reads back."""
+    height, width = surface.sag.shape
+    cards: dict[str, Any] = {
+        "SIMPLE": "T",
+        "BITPIX": -64,
+        "NAXIS": 2,
+        "NAXIS1": width,
+        "NAXIS2": height,
+        "BUNIT": "'m       '",
+    }
+    cards |= {"WAVELEN": f"{surface.wavelength:.9E}", "PUPLSCAL": f"{surface.pitch or 0.0:.9E}"}
+    cards |= {"MAPCOL": surface.origin[0], "MAPROW": surface.origin[1], "INSTRUME": f"'{instrument:8}'"}
+    lines = [f"{name:8}= {value:>20}".ljust(CARD) for name, value in cards.items()]
+    header = "".join([*lines, "END".ljust(CARD)]).encode()
+    data = surface.sag[::-1].astype(">f8").tobytes()
+    return header.ljust(-(-len(header) // BLOCK) * BLOCK) + data.ljust(-(-len(data) // BLOCK) * BLOCK, b"\0")
 
 
 def _header(content: bytes) -> tuple[Header, int]:

@@ -48,6 +48,10 @@ class Aperture:
         inside: NDArray[np.bool_] = x**2 <= self.radius_px**2 - y[:, None] ** 2
         return inside
 
+    def places(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.complex128]:
+        """x + iy of pixels, y up, in units of the radius."""
+        return np.asarray((columns - self.centre_x_px + 1j * (self.centre_y_px - rows)) / self.radius_px)
+
     def pixels(self) -> int:
         """Number of pixel centres inside or on the circle, counted also where the circle leaves the map."""
         rows = np.arange(

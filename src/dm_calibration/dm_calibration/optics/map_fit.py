@@ -196,9 +196,14 @@ class MapFitter:
 
     def _evaluate(self, coefficients: Array) -> Array:
         """Sag of these coefficients on the square around the aperture."""
-        in_products = np.zeros((MAX_ORDER + 1, MAX_ORDER + 1))
-        in_products[_B, _A] = coefficients @ _zernike_from_products()
-        return self._thin_y @ in_products @ self._thin_x.T
+        return self._thin_y @ in_products(coefficients) @ self._thin_x.T
+
+
+def in_products(coefficients: Array) -> Array:
+    """(6, 6) coefficients of P_b(y) P_a(x) of the surface with Zernike coefficients (21,)."""
+    products = np.zeros((MAX_ORDER + 1, MAX_ORDER + 1))
+    products[_B, _A] = coefficients @ _zernike_from_products()
+    return products
 
 
 def _span(centre: float, radius: float, size: int) -> slice:

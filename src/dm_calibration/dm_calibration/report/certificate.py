@@ -129,7 +129,7 @@ def certificate(calibration: Calibration, names: Mapping[str, str], checks: Sequ
         ("range of curvatures", reach if np.isfinite(low) else "flat is out of reach"),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move"),
         ("repeatable, absolute", two_fold(promise(calibration), calibration, farthest)),
-        ("reference surface", calibration.reference_surface or "none was subtracted"),
+        ("instrument's errors taken off", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),
         ("valid until", f"{utc(round(until * 1e9))}, longer when ./dm check agrees"),
         ("operator", names.get("operator") or "not given (./dm report --operator)"),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from dm_simulation.mirror import zernike
 from dm_simulation.mirror.membrane import Membrane
@@ -20,6 +21,8 @@ from dm_simulation.mirror.plate import Plate
 from dm_simulation.mirror.zernike import Array
 
 WAVELENGTH = 632.8e-9
+#: Spread of the amplitude of vibration from map to map, of its logarithm.
+VIBRATION_SPREAD = 0.8
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,11 @@ class InterferometerConfig:
         low_order_noise: rms over the field of all Zernike terms of orders 2-5 together, drawn anew for every map, m.
         piston_spread, tilt_spread: standard deviations of piston and of the edge sag of each tilt, per map, m.
         instrument_error: rms of what the instrument adds to every map, orders 2-12 over the field, seeded, m.
+        retrace: rms of what it adds for each m that the edge stands off by tilt, orders 2-5, seeded, for x and for y.
+        distortion: places at the edge of the field are seen further from its centre by this share, others by its cube.
+        vibration: median amplitude of ripples at twice the frequency of the fringes, which differs from map to map, m.
+        phase_steps: mean number of discs per map that stand a whole fringe off.
+        mask_diameter: of a mask on the mirror, beyond which nothing is seen, m; 0 = there is none.
         specks: mean number of dropped single pixels per map.
         blobs: number of dropped discs per map, of 3 to 16 pixels radius (scaled with the camera).
         mount_angle, mount_mirrored, mount_x, mount_y, mount_scale: how the mirror stands in the field: its own frame is
@@ -51,6 +59,11 @@ class InterferometerConfig:
     piston_spread: float = 200e-9
     tilt_spread: float = 300e-9
     instrument_error: float = 0.0
+    retrace: float = 0.0
+    distortion: float = 0.0
+    vibration: float = 0.0
+    phase_steps: float = 0.0
+    mask_diameter: float = 0.0
     specks: int = 400
     blobs: int = 6
     mount_angle: float = 0.0
@@ -97,8 +110,19 @@ class Interferometer:
 
         # Pixel centres in units of the field radius; row 0 is the top, y points up.
         centres = (2 * np.arange(config.pixels) + 1) / config.pixels - 1
-        self.aperture: NDArray[np.bool_] = np.add.outer(centres**2, centres**2) <= 1
+        squares = np.add.outer(centres**2, centres**2)
+        self.aperture: NDArray[np.bool_] = squares <= 1
         self._outside = ~self.aperture
+        self._centres = centres
+        # seen = true (1 + distortion true^2) in units of the field radius; `share` is true / seen.
+        share = np.ones_like(squares)
+        for _ in range(5):
+            share = 1.0 / (1.0 + config.distortion * squares * share**2)
+        true_y, true_x = -centres[:, None] * share, centres * share
+        self._true_pixels = 0.5 * config.pixels * (np.array((-true_y, true_x)) + 1.0) - 0.5  # row, column
+        if config.mask_diameter:
+            x, y = self._on_mirror(true_x * self._field_radius, true_y * self._field_radius)
+            self._outside |= np.hypot(x, y) > config.mask_diameter / 2
         self._columns = chebyshev.chebvander(centres, degree)
         self._rows = self._columns[::-1].copy()
 
@@ -116,7 +140,7 @@ class Interferometer:
         self._low_orders = interpolate(zernike.evaluate(x, y, zernike.terms_to_order(5)))
         terms = zernike.terms_to_order(12)[3:]
 
-        def drawn(x: Array, y: Array, size: float) -> Array:
+        def drawn(x: Array, y: Array, size: float, terms: tuple[zernike.Term, ...] = terms) -> Array:
             amplitudes = figure_rng.standard_normal(len(terms)) / np.array([term.n for term in terms]) ** 1.5
             shape = interpolate((zernike.evaluate(x, y, terms) @ amplitudes)[..., None])[0]
             inside = self._evaluate(shape)[self.aperture]
@@ -124,6 +148,13 @@ class Interferometer:
 
         self._figure = drawn(metres_x / plate.radius, metres_y / plate.radius, config.figure_rms)
         self._error = drawn(x, y, config.instrument_error)
+        self._retrace = np.array([drawn(x, y, config.retrace, zernike.terms_to_order(5)[3:]) for _ in range(2)])
+        # Sag at the edge by tilt, as a sum over coefficients of products: mean of f x over that of x^2.
+        inside = np.where(x**2 + y**2 <= 1, 1.0, 0.0)
+        products = chebyshev.chebvander(nodes, degree)
+        self._tilts = np.array(
+            [products.T @ (inside * along) @ products / (inside * along**2).sum() for along in (x, y)]
+        )
 
     def _on_mirror(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Places of the field (m) in the frame of the mirror as it is mounted."""
@@ -180,10 +211,21 @@ class Interferometer:
         low[0] = config.piston_spread * rng.standard_normal()
         low[1:3] = config.tilt_spread / 2 * rng.standard_normal(2)  # an orthonormal tilt is 2 at the edge
         low[3:] = config.low_order_noise / np.sqrt(len(low) - 3) * rng.standard_normal(len(low) - 3)
-        sag = self._evaluate(self.surface(displacement) + self._error + np.tensordot(low, self._low_orders, 1))
+        seen = self.surface(displacement) + self._error + np.tensordot(low, self._low_orders, 1)
+        seen += np.tensordot(np.tensordot(self._tilts, seen, 2), self._retrace, 1)
+        sag = self._evaluate(seen)
+        if config.distortion:
+            sag = map_coordinates(sag, self._true_pixels, order=3, mode="nearest")
+        if config.vibration:
+            amplitude = config.vibration * rng.lognormal(0.0, VIBRATION_SPREAD)
+            sag += amplitude * np.sin(8.0 * np.pi / config.wavelength * sag + rng.uniform(0.0, 2.0 * np.pi))
         noise = rng.standard_normal(sag.shape, dtype=np.float32)
         noise *= np.float32(config.pixel_noise)
         sag += noise
+        for _ in range(rng.poisson(config.phase_steps) if config.phase_steps else 0):
+            x, y, radius = *rng.uniform(-0.5, 0.5, 2), rng.uniform(0.1, 0.3)
+            disc = np.add.outer((self._centres - y) ** 2, (self._centres - x) ** 2) <= radius**2
+            sag[disc] += rng.choice((-0.5, 0.5)) * config.wavelength
         sag[self._outside] = np.nan
         self._drop_out(sag)
         return self._camera(sag)

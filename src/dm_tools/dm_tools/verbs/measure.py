@@ -1,7 +1,14 @@
-"""`dm measure`: take one map. `dm check`: compare one with the calibration in use, and let it improve it."""
+"""`dm measure`: take one map. `dm check`: compare one with the calibration in use, and let it improve it.
+`dm instrument`: find from files what the interferometer itself adds to every map."""
 
 from __future__ import annotations
 
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -78,6 +85,122 @@ def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> 
     if info.instrument_error > 0.0:
         console.print(f"    scale_error: {1e9 * info.instrument_error * share:.6f}")
     return pitch
+
+
+class Procedure(StrEnum):
+    """What `dm instrument` finds."""
+
+    FLATS = "flats"
+    RETRACE = "retrace"
+    GRID = "grid"
+
+
+def instrument(
+    procedure: Annotated[
+        Procedure,
+        typer.Argument(
+            help="flats: the reference surface, from a table of maps of flats (file, reference, part, degrees). "
+            "retrace: what goes with tilt, from maps of one shape under different tilts. grid: lateral scale and "
+            "distortion, from a table of marks (column, row, x, y; m) and a map with the same zoom."
+        ),
+    ],
+    files: Annotated[list[Path], typer.Argument(help="Tables (CSV with these headings), map files.")],
+    write: Annotated[Path | None, typer.Option(metavar="FILE.fits", help="Where the reference surface goes.")] = None,
+    xyz_unit: Annotated[str, typer.Option(help="Unit of .xyz files, and of FITS files without one.")] = "",
+    json: JsonOption = None,
+) -> None:
+    """Find the errors of the interferometer itself from files, as parameters to paste. Needs no nodes."""
+    from dm_calibration.map_files import MapFileError, read_map
+
+    def read(path: Path) -> Any:
+        return read_map(path, xyz_unit=xyz_unit or None)
+
+    if (write is not None) != (procedure is Procedure.FLATS):
+        raise typer.BadParameter("--write FILE.fits: flats need it, the others leave no file")
+    try:
+        if procedure is Procedure.FLATS:
+            assert write is not None
+            found = _flats(files[0], write, read)
+        elif procedure is Procedure.RETRACE:
+            found = _retrace([read(file).sag for file in files])
+        elif len(files) == 2:
+            found = _grid(files[0], read(files[1]).sag.shape)
+        else:
+            raise ValueError(f"{len(files)} files: must be the table of marks and one map")
+    except (MapFileError, ValueError, OSError) as error:
+        raise typer.BadParameter(str(error)) from error
+    console.print("/**/interferometer:\n  ros__parameters:", soft_wrap=True)
+    for name, value in found.items():
+        console.print(f"    {name}: {value}", soft_wrap=True, markup=False, highlight=False)
+    write_json(json, {"instrument": found})
+    next_step("put the parameters into the parameter file; `instrument_error` is the bound on what is left")
+
+
+def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
+    """Write the error of the flat that is the first reference in `table`."""
+    from dm_calibration.map_files.fits import fits_bytes
+    from dm_calibration.optics.flats import FlatTest, reference_from_flats
+    from dm_common.atomic_write import write_whole
+
+    rows = _table(table, "file", "reference", "part", "degrees")
+    tests = [
+        FlatTest(read(table.parent / file), one, other, math.radians(float(degrees)))
+        for file, one, other, degrees in rows
+    ]
+    found = reference_from_flats(tests)
+    write_whole(target, fits_bytes(replace(tests[0].surface, sag=found.sag), "dm instrument flats"))
+    console.print(
+        f"{target}: the flat {tests[0].reference}, from {len(tests)} maps, which disagree by "
+        f"{nanometres(found.left):.2f} nm rms",
+        soft_wrap=True,
+    )
+    if found.open_orders:
+        orders = ", ".join(map(str, found.open_orders))
+        console.print(
+            f"not told by these maps, and left out: angular orders {orders} (0 = what is the same all round); exchange "
+            "the flats, or turn one by an angle of no simple share of a turn",
+            soft_wrap=True,
+        )
+    known = not found.open_orders and math.isfinite(found.sigma)
+    return {"reference_surface": str(target.absolute())} | ({"instrument_error": 2.0 * found.sigma} if known else {})
+
+
+def _retrace(maps: list[Any]) -> dict[str, Any]:
+    from dm_calibration.optics.instrument import find_retrace
+
+    found, before, left = find_retrace(maps)
+    console.print(
+        f"coefficients differ by up to {nanometres(before):.2f} nm between these maps, by {nanometres(left):.2f} nm "
+        "without the retrace error"
+    )
+    return {"retrace": [round(float(value), 9) for value in found]}
+
+
+def _grid(table: Path, shape: tuple[int, int]) -> dict[str, Any]:
+    from dm_calibration.optics.instrument import lateral_scale
+
+    marks = [[float(value) for value in row] for row in _table(table, "column", "row", "x", "y")]
+    found = lateral_scale(marks, shape)
+    console.print(
+        f"distortion {found.distortion:+.3%} +- {found.distortion_error:.3%} at the edge; the marks are "
+        f"{found.left * 1e6:.2f} um from where that puts them, rms",
+        soft_wrap=True,
+    )
+    return {
+        "pitch": round(found.pitch, 12),
+        "distortion": round(found.distortion, 7),
+        "scale_error": round(found.scale_error, 7),
+    }
+
+
+def _table(path: Path, *names: str) -> list[list[str]]:
+    """The rows of a CSV file with these headings, in any order; `degrees` may be missing and is 0 then."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file, skipinitialspace=True))
+    missing = [name for name in names if name != "degrees" and (not rows or rows[0].get(name) is None)]
+    if missing:
+        raise ValueError(f"{path}: has no column {', '.join(missing)}; the first line must name {', '.join(names)}")
+    return [[(row.get(name) or "0").strip() for name in names] for row in rows]
 
 
 def check(

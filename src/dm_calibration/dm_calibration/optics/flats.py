@@ -1,0 +1,120 @@
+"""The error of an instrument from maps of flats against each other: three-flat test, rotation test, or any mixture.
+
+A map shows the flat in the instrument (as it is seen from behind) plus the part in front of it, which is a mirror image
+of itself in the instrument and may be turned. In Zernike terms, Re(c (x + iy)^m P), a turn by a multiplies the complex
+coefficient c of the part by exp(-ima), and the mirror image is (-1)^m times its conjugate. So for each angular order m
+the maps are one small set of linear equations for the flats; what they leave open is told, and left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dm_calibration.map_files import SurfaceMap
+from dm_calibration.optics.aperture import find_aperture
+
+Floats = NDArray[np.float64]
+
+#: Highest radial order of the flats' errors that is found.
+ORDER = 12
+#: Pixels that the terms are fitted to, about.
+FITTED = 20_000
+#: Directions of the equations weaker than this are left open by the maps: turns that are almost alike.
+DETERMINED = 0.1
+
+
+@dataclass(frozen=True)
+class FlatTest:
+    """A map of the flat `part`, turned counter-clockwise by `turn` rad as the camera sees it, against `reference`."""
+
+    surface: SurfaceMap
+    reference: str
+    part: str
+    turn: float = 0.0
+
+
+@dataclass(frozen=True)
+class FlatError:
+    """The error of the flat that is the reference of the first test.
+
+    Attributes:
+        sag: (height, width) m, as the instrument shows it; NaN outside the aperture.
+        sigma: m, of its worst-known coefficient; NaN where the maps do not check each other.
+        left: m rms, what the maps say beyond it and the other flats, up to the order.
+        open_orders: angular orders that the maps do not tell, and which are left out.
+    """
+
+    sag: Floats
+    sigma: float
+    left: float
+    open_orders: tuple[int, ...]
+
+
+def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
+    """Separate the instrument's flat from the parts.
+
+    Raises:
+        ValueError: no tests, maps of different sizes, or maps in which every angular order is left open.
+    """
+    if len({test.surface.sag.shape for test in tests}) != 1:
+        raise ValueError(f"{len(tests)} maps: must be some, all of one size in pixels")
+    shared = np.logical_and.reduce([test.surface.valid for test in tests])
+    aperture = find_aperture(shared)
+    disc = aperture.disc(shared.shape)
+    every = max(int(disc.sum()) // FITTED, 1)
+    fitted = tuple(index[::every] for index in np.nonzero(shared & disc))
+    orders = [(n, m) for n in range(ORDER + 1) for m in range(n % 2, n + 1, 2)]
+    turning = [m > 0 for _, m in orders]
+    place = aperture.places(*fitted)
+    values = np.column_stack([_term(place, n, m) for n, m in orders])
+    design = np.hstack((values.real, -values.imag[:, turning]))
+    heights = np.array([test.surface.sag[fitted] for test in tests]).T
+    measured = np.linalg.lstsq(design, heights, rcond=None)[0]
+    seen = np.zeros((len(orders), 2, len(tests)))
+    seen[:, 0], seen[turning, 1] = measured[: len(orders)], measured[len(orders) :]
+    flats = list(dict.fromkeys(name for test in tests for name in (test.reference, test.part)))
+    sag, everywhere = np.where(disc, 0.0, np.nan), aperture.places(*np.nonzero(disc))
+    squares, freedom, worst, open_orders = 0.0, 0, 0.0, set[int]()
+    for (n, m), coefficients in zip(orders, seen, strict=True):
+        if n < 2:  # piston and tilt are those of the mounts
+            continue
+        matrix = _equations(tests, flats, m)
+        inverse = np.linalg.pinv(matrix, rcond=DETERMINED)
+        told = np.isclose(np.diag(inverse @ matrix), 1.0)[: 2 if m else 1]
+        solution = inverse @ coefficients.T.ravel()
+        squares += float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
+        freedom += (2 if m else 1) * len(tests) - int(np.linalg.matrix_rank(matrix, rtol=DETERMINED))
+        worst = max(worst, *np.linalg.norm(inverse[: len(told)], axis=1)[told], 0.0)
+        if not told.all():
+            open_orders.add(m)
+        known = complex(*np.where(told, solution[: len(told)], 0.0))
+        sag[disc] += np.real(known * _term(everywhere, n, m))
+    if len(open_orders) == ORDER + 1:
+        raise ValueError(f"{len(tests)} maps of {', '.join(flats)} tell no flat from another: exchange or turn them")
+    sigma = np.sqrt(squares / freedom) if freedom else np.nan
+    left = np.sqrt(squares / len(tests))
+    return FlatError(sag, float(worst * sigma), float(left), tuple(sorted(open_orders)))
+
+
+def _term(place: NDArray[np.complex128], n: int, m: int) -> NDArray[np.complex128]:
+    """The Zernike term of radial order n and angular order m, 1 at the edge: its real part is the cosine."""
+    from scipy.special import eval_jacobi
+
+    return np.asarray(eval_jacobi((n - m) // 2, 0, m, 2.0 * np.abs(place) ** 2 - 1.0) * place**m)
+
+
+def _equations(tests: Sequence[FlatTest], flats: Sequence[str], m: int) -> Floats:
+    """(2 T, 2 F): real and imaginary coefficient of each map, from those of each flat as seen in the instrument."""
+    matrix = np.zeros((2 * len(tests), 2 * len(flats)))
+    for number, test in enumerate(tests):
+        at, part = slice(2 * number, 2 * number + 2), 2 * flats.index(test.part)
+        reference = 2 * flats.index(test.reference)
+        matrix[at, reference : reference + 2] += np.eye(2)
+        cosine, sine = np.cos(m * test.turn), np.sin(m * test.turn)
+        turned = np.array([[cosine, sine], [-sine, cosine]]) @ np.diag((1.0, -1.0))
+        matrix[at, part : part + 2] += (-1) ** m * turned
+    return matrix if m else matrix * np.tile((1.0, 0.0), len(flats))  # nothing turns: no sines

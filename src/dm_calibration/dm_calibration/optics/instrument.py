@@ -1,0 +1,152 @@
+"""Errors of the instrument that change from map to map or place to place: retrace error and radial distortion.
+
+Both are taken off a map as the camera shows it, in coordinates of the camera: from the centre of the map, y up, in
+units of half its longer side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import ArrayLike, NDArray
+
+from dm_calibration.optics.map_fit import MapFitter, in_products
+from dm_common.optics.piston_tilt import fit_plane
+from dm_common.optics.zernike import MAX_ORDER, PISTON_TILT, TERMS
+
+Floats = NDArray[np.float64]
+
+#: Numbers of a retrace error: the terms beyond tilt for a tilt in x, then in y.
+RETRACE_SIZE = 2 * (len(TERMS) - PISTON_TILT)
+#: Tilts that retrace error is found from must differ by this much in each direction, m at the edge.
+TILT_MIN = 1e-7
+#: Fewest maps, and fewest points of a grid, that leave something to judge the result by.
+MAPS_MIN, POINTS_MIN = 5, 8
+
+
+def _axes(shape: tuple[int, ...]) -> tuple[Floats, Floats, float]:
+    """x of the columns and y of the rows, and the pixels of half the longer side."""
+    half = 0.5 * max(shape)
+    y, x = (np.asarray(np.arange(size) - 0.5 * (size - 1), dtype=np.float64) / half for size in shape)
+    return x, -y, half
+
+
+def _tilt(sag: Floats) -> Floats:
+    """(2,) m that the edge of the camera stands off by tilt, in x and y."""
+    _, in_columns, in_rows = fit_plane(sag)
+    return np.array((in_columns, -in_rows)) * 0.5 * max(sag.shape)
+
+
+def without_retrace(sag: Floats, retrace: ArrayLike) -> Floats:
+    """(height, width) m, less the error that goes with the tilt of this map.
+
+    Args:
+        retrace: (36,) coefficients of the 18 terms beyond tilt for each m of edge sag by tilt in x, then in y.
+    """
+    x, y, _ = _axes(sag.shape)
+    added = np.zeros(len(TERMS))
+    added[PISTON_TILT:] = _tilt(sag) @ np.asarray(retrace).reshape(2, -1)
+    polynomial = in_products(added)
+    return np.asarray(sag - legendre.legvander(y, MAX_ORDER) @ polynomial @ legendre.legvander(x, MAX_ORDER).T)
+
+
+def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
+    """Retrace error from maps (height, width), m, of one shape under different tilts.
+
+    Returns:
+        The (36,) numbers of :func:`without_retrace`, and by how much a coefficient of these maps is off their mean at
+        most, m: as they are, and without the retrace error.
+
+    Raises:
+        ValueError: too few maps, maps of different sizes, or tilts that do not differ in both directions.
+    """
+    if len(maps) < MAPS_MIN or len({sag.shape for sag in maps}) > 1:
+        sizes = sorted({"{1} x {0}".format(*sag.shape) for sag in maps})
+        raise ValueError(f"{len(maps)} maps of {', '.join(sizes)} pixels: must be {MAPS_MIN} or more of one size")
+    height, width = maps[0].shape
+    circle = 0.5 * (width - 1), 0.5 * (height - 1), 0.5 * max(height, width)
+    fits = [MapFitter(np.isfinite(sag), *circle).fit(sag).coefficients for sag in maps]
+    terms = np.array(fits)[:, PISTON_TILT:]
+    tilt = np.array([_tilt(sag) for sag in maps])
+    spread = np.linalg.svd(tilt - tilt.mean(axis=0), compute_uv=False)[-1]
+    if spread < TILT_MIN:
+        raise ValueError(
+            f"the tilts differ by {spread * 1e9:.0f} nm in one direction: must be {TILT_MIN * 1e9:.0f} nm at the edge "
+            "or more; tilt in x and in y, by some fringes"
+        )
+    design = np.column_stack((np.ones(len(maps)), tilt))
+    solution = np.linalg.lstsq(design, terms, rcond=None)[0]
+    before = np.abs(terms - terms.mean(axis=0)).max()
+    return solution[1:].ravel(), float(before), float(np.abs(terms - design @ solution).max())
+
+
+def undistorted(sag: Floats, distortion: float) -> Floats:
+    """(height, width) with everything where it is: what lies at the edge was seen further out by the share `distortion`
+    of its distance to the centre, other places by its square times that. Linear between pixels, NaN where any is."""
+    from scipy import ndimage  # here: most benches need no correction
+
+    x, y, half = _axes(sag.shape)
+    stretch = 1.0 + distortion * np.add.outer(y**2, x**2)
+    rows = 0.5 * (sag.shape[0] - 1) - y[:, None] * stretch * half
+    columns = 0.5 * (sag.shape[1] - 1) + x * stretch * half
+    moved = ndimage.map_coordinates(sag, (rows, columns), order=1, cval=np.nan)
+    return np.asarray(moved, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class LateralScale:
+    """What a grid says of an instrument: m per pixel at the centre of the map, radial distortion as a share at its
+    edge, 95 % bounds on the relative error of the first and on that of the other, and rms distance left, m."""
+
+    pitch: float
+    distortion: float
+    scale_error: float
+    distortion_error: float
+    left: float
+
+
+def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
+    """Lateral scale and distortion from a grid of marks.
+
+    Args:
+        marks: (G, 4) column and row at which each is seen, pixels, and its true x and y, m.
+        shape: (height, width) of the maps.
+
+    Raises:
+        ValueError: too few marks, or all on one line.
+    """
+    half = 0.5 * max(shape)
+    column, row, x, y = np.asarray(marks, dtype=np.float64).reshape(-1, 4).T
+    seen = np.asarray((column - 0.5 * (shape[1] - 1) + 1j * (0.5 * (shape[0] - 1) - row)) / half, dtype=np.complex128)
+    if len(seen) < POINTS_MIN or np.linalg.matrix_rank(np.column_stack((np.ones(len(x)), x, y)), 1e-9) < 3:
+        raise ValueError(f"{len(seen)} marks: must be {POINTS_MIN} or more, and not all on one line")
+    fits = [_similarity(seen, place) for place in (x + 1j * y, -x + 1j * y)]  # the camera may show a mirror image
+    values, covariance, left = min(fits, key=lambda fit: fit[2])
+    size = float(np.hypot(values[0], values[1]))
+    along = values[:2] / size
+    bounds = 2.0 * np.sqrt((along @ covariance[:2, :2] @ along / size**2, covariance[4, 4]))
+    return LateralScale(size / half, float(values[4]), float(bounds[0]), float(bounds[1]), left)
+
+
+def _similarity(seen: NDArray[np.complex128], place: NDArray[np.complex128]) -> tuple[Floats, Floats, float]:
+    """(5,) scale as a complex number, shift and distortion that take `place` to what is seen, their covariance, and the
+    rms distance left."""
+    from scipy.optimize import least_squares
+
+    size = np.abs(place - place.mean()).max()
+
+    def apart(values: Floats) -> Floats:
+        true = seen.copy()
+        for _ in range(5):
+            true = seen / (1.0 + values[4] * np.abs(true) ** 2)
+        left = (complex(*values[:2]) * true + complex(*values[2:4])) * size - place
+        return np.concatenate((left.real, left.imag))
+
+    found = least_squares(apart, (1.0, 0.0, 0.0, 0.0, 0.0))
+    variance = 2.0 * found.cost / (2 * len(seen) - 5)
+    unit = np.array((size, size, size, size, 1.0))
+    covariance = variance * np.linalg.inv(found.jac.T @ found.jac) * np.outer(unit, unit)
+    return found.x * unit, covariance, float(np.sqrt(2.0 * found.cost / len(seen)))

@@ -1,0 +1,121 @@
+"""Errors of the instrument: flats told from each other, retrace error, distortion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dm_calibration.map_files import SurfaceMap
+from dm_calibration.optics.flats import FlatTest, reference_from_flats
+from dm_calibration.optics.instrument import find_retrace, lateral_scale, undistorted, without_retrace
+from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
+
+SIZE = 120
+X, Y = np.meshgrid(*((np.arange(SIZE) - 0.5 * (SIZE - 1)) * step / (0.5 * SIZE) for step in (1.0, -1.0)))
+DISC = np.hypot(X, Y) <= 0.97
+RNG = np.random.default_rng(5)
+FLATS = {name: RNG.normal(0.0, 10e-9, len(TERMS)) * (np.arange(len(TERMS)) >= PISTON_TILT) for name in "ABC"}
+
+
+def against(reference: str, part: str, degrees: float = 0.0) -> FlatTest:
+    """A map with piston and tilt of its own, noise and dropouts."""
+    turn = np.radians(degrees)
+    own_x, own_y = np.cos(turn) * X + np.sin(turn) * Y, np.cos(turn) * Y - np.sin(turn) * X
+    behind = basis(-own_x, own_y) @ FLATS[part]  # flats are told as they are seen in the instrument, from behind
+    sag = basis(X, Y) @ FLATS[reference] + behind + basis(X, Y)[..., :3] @ RNG.normal(0.0, 1e-7, 3)
+    sag += RNG.normal(0.0, 0.3e-9, sag.shape)
+    seen = DISC & (RNG.random(sag.shape) > 0.01)
+    return FlatTest(SurfaceMap(np.where(seen, sag, np.nan), 632.8e-9, None, "array"), reference, part, turn)
+
+
+def error_of(tests: list[FlatTest]) -> tuple[float, float, tuple[int, ...]]:
+    """Largest error in a coefficient beyond tilt, the bound given on it, and the angular orders left open."""
+    found = reference_from_flats(tests)
+    left = (found.sag - basis(X, Y) @ FLATS[tests[0].reference])[DISC & np.isfinite(found.sag)]
+    inside = DISC & np.isfinite(found.sag)
+    coefficients = np.linalg.lstsq(basis(X[inside], Y[inside]), left, rcond=None)[0]
+    return float(np.abs(coefficients[PISTON_TILT:]).max()), 2.0 * found.sigma, found.open_orders
+
+
+def test_three_flats_of_which_one_was_turned() -> None:
+    tests = [against("A", "B"), against("A", "B", 37.0), against("A", "C"), against("B", "C"), against("B", "C", 90.0)]
+    error, bound, left_open = error_of(tests)
+    assert (left_open, error < bound < 0.5e-9) == ((), True)
+
+
+def test_three_flats_without_a_turn_leave_the_odd_part_open() -> None:
+    error, _, left_open = error_of([against("A", "B"), against("A", "C"), against("B", "C")])
+    assert set(left_open) == set(range(1, 13)) and error > 3e-9
+
+
+def test_one_part_that_is_turned_tells_all_but_the_symmetric_part() -> None:
+    error, _, left_open = error_of([against("A", "B", degrees) for degrees in (0.0, 50.0, 100.0, 170.0, 260.0)])
+    assert left_open == (0,)
+    symmetric = [k for k, term in enumerate(TERMS) if term.m == 0]
+    assert error == pytest.approx(np.abs(FLATS["A"][symmetric][1:]).max(), abs=0.5e-9)
+
+
+@pytest.mark.parametrize("tests", [[], [against("A", "B")], [against("A", "B"), against("A", "B")]])
+def test_maps_that_tell_nothing_are_refused(tests: list[FlatTest]) -> None:
+    with pytest.raises(ValueError, match=r"maps: must be some|tell no flat from another"):
+        reference_from_flats(tests)
+
+
+def tilted(retrace: np.ndarray, tilts: list[tuple[float, float]]) -> list[np.ndarray]:
+    shape = np.r_[np.zeros(3), RNG.normal(0.0, 20e-9, 18)]
+    maps = []
+    for tilt in tilts:
+        coefficients = shape + np.r_[0.0, tilt, tilt @ retrace.reshape(2, -1)]
+        maps.append(np.where(DISC, basis(X, Y) @ coefficients + RNG.normal(0.0, 0.5e-9, X.shape), np.nan))
+    return maps
+
+
+def test_retrace_error_is_found_from_tilted_maps_and_taken_off() -> None:
+    retrace = RNG.normal(0.0, 2e-3, 36)
+    tilts = [(x * 1e-6, y * 1e-6) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    found, before, left = find_retrace(tilted(retrace, tilts))
+    assert np.abs(found - retrace).max() < 2e-4 and left < 0.5e-9 < 3e-9 < before
+    flat, steep = tilted(retrace, [(0.0, 0.0), (2e-6, -1e-6)])
+    apart = (without_retrace(steep, found) - flat)[DISC]
+    assert np.abs(np.linalg.lstsq(basis(X[DISC], Y[DISC]), apart, rcond=None)[0][PISTON_TILT:]).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("tilts", "text"),
+    [([(0.0, 0.0)] * 4, "4 maps of 120 x 120 pixels: must be 5 or more"), ([(1e-6, 0.0), (0.0, 0.0)] * 3, "tilt in x")],
+)
+def test_tilts_that_do_not_tell_are_refused(tilts: list[tuple[float, float]], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        find_retrace(tilted(np.zeros(36), tilts))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("distortion", [-0.01, 0.0, 0.004])
+def test_scale_and_distortion_from_a_grid(mirrored: bool, distortion: float) -> None:
+    pitch, half = 23.3e-6, 0.5 * SIZE
+    true = np.array([complex(x, y) for x in np.linspace(-0.9, 0.9, 9) for y in np.linspace(-0.9, 0.9, 9)])
+    seen = true * (1.0 + distortion * np.abs(true) ** 2) * half + RNG.normal(0.0, 0.03, (81, 2)) @ (1.0, 1j)
+    place = true * np.exp(0.3j) * half * pitch + (0.01 + 0.02j)
+    x = -place.real if mirrored else place.real
+    marks = np.column_stack((0.5 * (SIZE - 1) + seen.real, 0.5 * (SIZE - 1) - seen.imag, x, place.imag))
+    found = lateral_scale(marks, (SIZE, SIZE))
+    assert abs(found.pitch / pitch - 1.0) < 1.5 * found.scale_error < 1e-3
+    assert abs(found.distortion - distortion) < 1.5 * found.distortion_error < 1e-3
+    assert found.left == pytest.approx(0.03 * np.sqrt(2.0) * pitch, rel=0.3)
+
+
+def test_marks_on_a_line_are_refused() -> None:
+    with pytest.raises(ValueError, match="9 marks: must be 8 or more, and not all on one line"):
+        lateral_scale(np.arange(9.0)[:, None] * np.ones(4), (SIZE, SIZE))
+
+
+def test_undistorted_is_where_it_is() -> None:
+    distortion = 0.01
+    share = np.ones_like(X)
+    for _ in range(6):
+        share = 1.0 / (1.0 + distortion * (X**2 + Y**2) * share**2)
+    seen = basis(X * share, Y * share)[..., 3] * 1e-6
+    there = undistorted(seen, distortion)
+    good = np.isfinite(there)
+    assert good.mean() > 0.95
+    assert np.abs(there - basis(X, Y)[..., 3] * 1e-6)[good].max() < 1e-9

@@ -1,0 +1,126 @@
+"""Maps of a simulated instrument with errors of its own, found by `./dm instrument` and taken off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
+from dm_calibration.acquisition.reference_surface import load_reference
+from dm_calibration.map_files import SurfaceMap
+from dm_calibration.optics.orientation import Orientation
+from dm_common.optics.zernike import PISTON_TILT
+from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
+from dm_simulation.electronics.server import OFF, PortsConfig
+from dm_simulation.interferometer.interferometer import InterferometerConfig
+from dm_tools.cli import make_app
+
+PIXELS, FIELD = 200, 0.022
+SETTINGS = IngestSettings(aperture_radius=0.0095, pitch=FIELD / PIXELS)
+
+
+@contextmanager
+def bench(folder: Path, **instrument: Any) -> Iterator[VirtualBench]:
+    config = BenchConfig(
+        seed=3,
+        interferometer=InterferometerConfig(pixels=PIXELS, field_diameter=FIELD, **instrument),
+        ports=PortsConfig(OFF, OFF, OFF),
+        files=FilesConfig(folder, format="dat"),
+        trigger_port=OFF,
+    )
+    running = VirtualBench(config)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+def run(*arguments: object) -> dict[str, Any]:
+    """The parameters that `./dm instrument` prints."""
+    import yaml
+
+    result = CliRunner().invoke(make_app(), ["instrument", *map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    text = result.stdout[result.stdout.index("/**/") :].partition("next:")[0]
+    return dict(yaml.safe_load(text)["/**/interferometer"]["ros__parameters"])
+
+
+def error(file: Path, truth: NDArray[np.float64], settings: IngestSettings) -> float:
+    """Largest error of a coefficient beyond tilt, m."""
+    ingest, plain = Ingest(), replace(SETTINGS, orientation=settings.orientation)
+    wanted = ingest.measure(SurfaceMap(truth, 632.8e-9, None, "array"), plain)[1]
+    found = ingest.read(file, settings)[1]
+    return float(np.abs(found.coefficients - wanted.coefficients)[PISTON_TILT:].max())
+
+
+@pytest.mark.parametrize("turned", [{}, {"rotate_deg": 90, "flip_x": True}])
+def test_results_are_absolute_with_the_reference_that_the_bench_leaves(turned: dict[str, Any], tmp_path: Path) -> None:
+    with bench(tmp_path, instrument_error=30e-9, **turned) as simulated:
+        file, truth = simulated.measure(), simulated.interferometer.true_sag(simulated.displacement())
+    settings = replace(SETTINGS, orientation=Orientation(rotate_deg=90.0))
+    reference = load_reference(str(tmp_path / "reference" / "flat.datx"), "", 0.0, 0.0)
+    assert error(file, truth, replace(settings, reference=reference)) < 1e-9 < 8e-9 < error(file, truth, settings)
+
+
+def test_retrace_error_from_the_tilts_that_maps_happen_to_have(tmp_path: Path) -> None:
+    with bench(tmp_path, retrace=0.01, tilt_spread=2e-6) as simulated:
+        files = [simulated.measure() for _ in range(13)]
+        truth = simulated.interferometer.true_sag(simulated.displacement())
+    found = run("retrace", *files[:-1])
+    settings = replace(SETTINGS, retrace=tuple(found["retrace"]))
+    # What is left is the tilt of the figure itself, which all maps share.
+    assert error(files[-1], truth, settings) < 1.5e-9 < 6e-9 < error(files[-1], truth, SETTINGS)
+
+
+def test_distortion_from_a_grid_of_marks(tmp_path: Path) -> None:
+    distortion = 0.004
+    quiet = {"pixel_noise": 0.0, "low_order_noise": 0.0, "specks": 0, "blobs": 0}
+    with bench(tmp_path, distortion=distortion, figure_rms=300e-9, **quiet) as simulated:
+        file, truth = simulated.measure(), simulated.interferometer.true_sag(simulated.displacement())
+    table = tmp_path / "grid.csv"
+    true = [complex(x, y) / 5 for x in range(-4, 5) for y in range(-4, 5)]
+    rows = ["column, row, x, y"]
+    for place in true:
+        seen = place * (1.0 + distortion * abs(place) ** 2) * PIXELS / 2
+        middle, metres = 0.5 * (PIXELS - 1), place * FIELD / 2
+        rows.append(f"{middle + seen.real:.2f}, {middle - seen.imag:.2f}, {metres.real:.6f}, {metres.imag:.6f}")
+    table.write_text("\n".join(rows))
+    found = run("grid", table, file)
+    assert found["pitch"] == pytest.approx(FIELD / PIXELS, rel=2e-4)
+    settings = replace(SETTINGS, distortion=found["distortion"])
+    assert error(file, truth, settings) < 0.3e-9 < 1e-9 < error(file, truth, SETTINGS)
+
+
+def test_the_reference_that_flats_give_is_one_that_the_interferometer_takes(tmp_path: Path) -> None:
+    with bench(tmp_path, instrument_error=30e-9) as simulated:
+        rows = ["file,reference,part,degrees", *(f"{simulated.measure()},A,B," for _ in range(2))]
+        file = simulated.measure()
+    # The bench cannot turn its mirror: a table that turns nothing is refused, one that says it was turned is believed.
+    table, target = tmp_path / "flats.csv", tmp_path / "flat.fits"
+    table.write_text("\n".join(rows))
+    refused = CliRunner().invoke(make_app(), ["instrument", "flats", str(table), "--write", str(target)])
+    assert refused.exit_code == 2 and "tell no flat from another" in " ".join(refused.output.split())
+    table.write_text("\n".join([*rows[:2], rows[2] + "77"]))
+    assert run("flats", table, "--write", target)["reference_surface"] == str(target)
+    reference = load_reference(str(target), "", 632.8e-9, 1e-12)
+    assert Ingest().read(file, replace(SETTINGS, reference=reference))[1].reference_surface.startswith("flat.fits, SHA")
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.41e-3, -0.73e-3), (-1.5e-3, 0.2e-3)])
+def test_an_aperture_that_follows_the_mirror_is_registered_to_a_tenth_of_a_pixel(
+    x: float, y: float, tmp_path: Path
+) -> None:
+    with bench(tmp_path, mask_diameter=0.0185, mount_x=x, mount_y=y) as simulated:
+        file = simulated.measure()
+    settings = replace(SETTINGS, aperture_radius=0.0088, aperture_follow=True)
+    column, row = Ingest().read(file, settings)[1].centre
+    pitch, middle = FIELD / PIXELS, 0.5 * (PIXELS - 1)
+    assert (column, row) == pytest.approx((middle + x / pitch, middle - y / pitch), abs=0.1)
