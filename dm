@@ -44,6 +44,7 @@ On the bench
   check      compare promise and map, and let the map improve the calibration
   flatten    as flat as the mirror can;  degauss  remove the hysteresis;  measure  take one map
   report     a page and a PDF of one calibration, to keep
+  instrument  errors of the interferometer itself, from map files of flats, tilts or marks
   recipes    build conditioned recipes for a list of curvatures on the interferometer
   record     write what the nodes say to an MCAP file;  replay  plays it back
   console    a web page of the bench, on the loopback

@@ -105,12 +105,12 @@ PARAMETERS = (
     Parameter(
         "retrace",
         reals([], -1.0, 1.0),
-        "Error of the instrument that goes with tilt, 36 numbers, as `./dm instrument retrace` finds it; empty = none.",
+        "Error that goes with tilt, 36 numbers, as `./dm instrument retrace FILES` finds them; empty = none.",
     ),
     Parameter(
         "distortion",
         real(0.0, -0.1, 0.1),
-        "Radial distortion at the edge of the map, as a share, as `./dm instrument grid` finds it.",
+        "Radial distortion at the edge of the map, as a share, as `./dm instrument grid MARKS.csv MAP` finds it.",
     ),
     Parameter(
         "instrument_error",
@@ -151,7 +151,7 @@ def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMa
     topic = values["zernike_topic"]
     others = ("watch_folder", "trigger_command", "reference_surface", "retrace", "distortion")
     if topic and any(values[name] for name in others):
-        raise ValueError(f"zernike_topic = {topic!r}: {', '.join(others)} must be empty or 0 beside it")
+        raise ValueError(f"zernike_topic = {topic!r}: {', '.join(others)} must be empty beside it")
     if len(values["retrace"]) not in (0, RETRACE_SIZE):
         raise ValueError(f"retrace: {len(values['retrace'])} numbers, must be {RETRACE_SIZE} or none")
     if topic.strip("/") == "zernike":

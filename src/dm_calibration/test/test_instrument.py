@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.flats import FlatTest, reference_from_flats
 from dm_calibration.optics.instrument import find_retrace, lateral_scale, undistorted, without_retrace
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
@@ -25,7 +24,7 @@ def against(reference: str, part: str, degrees: float = 0.0) -> FlatTest:
     sag = basis(X, Y) @ FLATS[reference] + behind + basis(X, Y)[..., :3] @ RNG.normal(0.0, 1e-7, 3)
     sag += RNG.normal(0.0, 0.3e-9, sag.shape)
     seen = DISC & (RNG.random(sag.shape) > 0.01)
-    return FlatTest(SurfaceMap(np.where(seen, sag, np.nan), 632.8e-9, None, "array"), reference, part, turn)
+    return FlatTest(np.where(seen, sag, np.nan), reference, part, turn)
 
 
 def error_of(tests: list[FlatTest]) -> tuple[float, float, tuple[int, ...]]:

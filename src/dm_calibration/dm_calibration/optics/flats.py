@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.aperture import find_aperture
 
 Floats = NDArray[np.float64]
@@ -29,9 +28,16 @@ DETERMINED = 0.1
 
 @dataclass(frozen=True)
 class FlatTest:
-    """A map of the flat `part`, turned counter-clockwise by `turn` rad as the camera sees it, against `reference`."""
+    """A map of two flats.
 
-    surface: SurfaceMap
+    Attributes:
+        sag: (height, width) m.
+        reference: name of the flat in the instrument.
+        part: name of the one in front of it.
+        turn: of the part, counter-clockwise as the camera sees it, rad.
+    """
+
+    sag: Floats
     reference: str
     part: str
     turn: float = 0.0
@@ -60,9 +66,9 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
     Raises:
         ValueError: no tests, maps of different sizes, or maps in which every angular order is left open.
     """
-    if len({test.surface.sag.shape for test in tests}) != 1:
+    if len({test.sag.shape for test in tests}) != 1:
         raise ValueError(f"{len(tests)} maps: must be some, all of one size in pixels")
-    shared = np.logical_and.reduce([test.surface.valid for test in tests])
+    shared = np.logical_and.reduce([np.isfinite(test.sag) for test in tests])
     aperture = find_aperture(shared)
     disc = aperture.disc(shared.shape)
     every = max(int(disc.sum()) // FITTED, 1)
@@ -72,7 +78,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
     place = aperture.places(*fitted)
     values = np.column_stack([_term(place, n, m) for n, m in orders])
     design = np.hstack((values.real, -values.imag[:, turning]))
-    heights = np.array([test.surface.sag[fitted] for test in tests]).T
+    heights = np.array([test.sag[fitted] for test in tests]).T
     measured = np.linalg.lstsq(design, heights, rcond=None)[0]
     seen = np.zeros((len(orders), 2, len(tests)))
     seen[:, 0], seen[turning, 1] = measured[: len(orders)], measured[len(orders) :]

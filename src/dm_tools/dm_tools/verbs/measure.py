@@ -143,12 +143,13 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
     from dm_common.atomic_write import write_whole
 
     rows = _table(table, "file", "reference", "part", "degrees")
+    surfaces = [read(table.parent / row[0]) for row in rows]
     tests = [
-        FlatTest(read(table.parent / file), one, other, math.radians(float(degrees)))
-        for file, one, other, degrees in rows
+        FlatTest(surface.sag, reference, part, math.radians(float(degrees)))
+        for surface, (_, reference, part, degrees) in zip(surfaces, rows, strict=True)
     ]
     found = reference_from_flats(tests)
-    write_whole(target, fits_bytes(replace(tests[0].surface, sag=found.sag), "dm instrument flats"))
+    write_whole(target, fits_bytes(replace(surfaces[0], sag=found.sag), "dm instrument flats"))
     console.print(
         f"{target}: the flat {tests[0].reference}, from {len(tests)} maps, which disagree by "
         f"{nanometres(found.left):.2f} nm rms",
