@@ -13,6 +13,7 @@ import json
 import os
 import runpy
 import shutil
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -370,8 +371,14 @@ def main(arguments: list[str]) -> int:
             say(f"./dm exec: no command named {rest[0]!r} in the environment")
             return 127
         os.execve(target, rest, environment)
+    # A Ctrl-C waits until the command can answer it (`dm_tools.cli.run`), instead of ending in a traceback.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     return os.execve(str(PYTHON), [str(PYTHON), "-m", "dm_tools", command, *rest], environment)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except KeyboardInterrupt:
+        say("./dm: interrupted")
+        sys.exit(130)

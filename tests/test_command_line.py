@@ -7,7 +7,9 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
+import sys
 import threading
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -28,7 +30,7 @@ from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
-from dm_tools.verbs.up import end
+from dm_tools.verbs.up import end, only_suite
 from test_console_external_goals import EXECUTING, FakeNode, Goal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -210,6 +212,27 @@ def test_its_nodes_run_as_those_of_launch_files(monkeypatch: pytest.MonkeyPatch)
         cli.run(["--version"], "dm")
     assert Path(os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
     assert os.environ["OPENBLAS_NUM_THREADS"] == "2", "what the user has set stays"
+
+
+def test_a_suite_that_is_started_twice_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_HOME", str(tmp_path))
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    with only_suite("left"), only_suite("right"):
+        with pytest.raises(RuntimeError, match=rf"domain 7, namespace /left \(.*{os.getpid()}.*Ctrl-C where"):
+            with only_suite("left"):
+                pass
+    with only_suite("left"):
+        pass
+
+
+def test_a_command_that_is_interrupted_at_once_says_so() -> None:
+    """As `./dm` starts it: the signal waits until the command can answer it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    started = subprocess.Popen([sys.executable, "-m", "dm_tools", "up"], stderr=subprocess.PIPE, text=True)
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    started.send_signal(signal.SIGINT)
+    said = started.communicate(timeout=60)[1]
+    assert (started.returncode, said) == (130, "error: interrupted\n")
 
 
 def test_up_ends_those_who_wait_before_the_process_does() -> None:

@@ -151,6 +151,9 @@ class Suite:
         with contextlib.ExitStack() as stack:
             mode = "ab" if name in self._restarts else "wb"
             output = None if self._echo else stack.enter_context(self.log(name).open(mode))
+            # A node takes signals once it can end in order (`run_node`), not while it still imports.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+            stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
             # Their own process group: Ctrl-C on the terminal is passed on by us, in order, not to all at once.
             return subprocess.Popen(
                 [sys.executable, "-m", MODULES[name], *arguments],
@@ -207,7 +210,8 @@ class Suite:
 
     def _raise_ended(self, name: str) -> NoReturn:
         status = self._processes[name].returncode
-        tail = "" if self._echo else "\n" + "\n".join(self.log(name).read_text(errors="replace").splitlines()[-8:])
+        lines = [] if self._echo else self.log(name).read_text(errors="replace").splitlines()[-8:]
+        tail = "; the reason stands above" if self._echo else "".join(f"\n{line}" for line in lines)
         raise RuntimeError(f"the node {name} ended with status {status}{tail}")
 
     def stop(self, timeout_s: float = 15.0) -> None:

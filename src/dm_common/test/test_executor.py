@@ -57,6 +57,18 @@ def test_a_node_is_made_safe_on_signals_even_when_hit_twice(domain: int, tmp_pat
     assert process.returncode == 0
 
 
+def test_a_signal_that_comes_before_the_node_is_made_ends_it_in_order(domain: int, tmp_path: Path) -> None:
+    """As `dm_bringup.suite` starts it: the signal waits until then."""
+    script = tmp_path / "careful.py"
+    script.write_text(NODE_SCRIPT)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60) == ("", "")
+    assert process.returncode == 0
+
+
 @pytest.fixture
 def watcher(domain: int) -> Iterator[Node]:
     """A participant of its own, which sees of others what DDS tells it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -144,11 +145,13 @@ def run(words: list[str], name: str) -> None:
     """
     _set_environment()
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # `./dm` keeps it back while modules are imported
         app(words, prog_name=name)
     except (RuntimeError, OSError, ValueError) as error:  # DeformableMirrorError and ConfigError among them
         fail(str(error))
         sys.exit(NOT_RUNNING if isinstance(error, NotRunningError) else REFUSED)
     except KeyboardInterrupt:
+        fail("interrupted")
         sys.exit(INTERRUPTED)
 
 

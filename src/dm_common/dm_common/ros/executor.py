@@ -38,6 +38,8 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+#: Signals that end a node in order.
+STOPPING = (signal.SIGINT, signal.SIGTERM)
 #: Longest time the loop sleeps without an event; only bounds the reaction to a shutdown from another thread.
 WAKE_PERIOD_S = 1.0
 #: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
@@ -108,7 +110,7 @@ class StopOnSignals:
         self._reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOPPING:
             signal.signal(number, self._on_signal)
 
     def _on_signal(self, _number: int, _frame: object) -> None:
@@ -183,13 +185,14 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
     """
     # Until the executor takes the signals over, SIGTERM must end the process by the same path as Ctrl-C, and so must
     # SIGINT, which a shell's background job begins with ignoring.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in STOPPING:
         signal.signal(number, signal.default_int_handler)
-    remove_orphaned_segments()  # of nodes that were killed, the predecessor of this one for instance
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     node: Node | None = None
     executor: Executor | None = None
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)  # whoever started this may have kept them back until now
+        remove_orphaned_segments()  # of nodes that were killed, the predecessor of this one for instance
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
         executor = make_executor(node)
         signals = StopOnSignals()
@@ -205,7 +208,7 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
     except KeyboardInterrupt:
         return 0
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in STOPPING:
             signal.signal(number, signal.SIG_IGN)
         if node is not None:
             make_safe = getattr(node, "make_safe", None)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import fcntl
 import os
 import signal
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -66,18 +67,20 @@ def up(
 
     A node that dies is started again, after a pause that grows while it dies again.
     """
+    # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
+    # because a shell starts commands in the background with SIGINT ignored.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda _number, _frame: stop.set())
     from dm_bringup.suite import Suite
     from dm_tools.doctor.bench import effective
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""], camera)
-    stop = threading.Event()
     watchers = [threading.Thread(target=say_when_ready, args=(name, stop), daemon=True) for name in mirrors]
-    # A flag instead of an exception: nodes that are just being started must be stopped too. Set here in any case,
-    # because a shell starts commands in the background with SIGINT ignored.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda _number, _frame: stop.set())
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
+        for name in mirrors:
+            stack.enter_context(only_suite(name))
         stack.callback(end, watchers, stop)  # the last of all: the mirrors are safe first
         folder = logs if logs is not None else Path(temporary)
         suites = [
@@ -95,12 +98,38 @@ def up(
                     f"it keeps its last {bench['output_limit'] / 1e6:.0f} MB of maps in {bench['output_folder']}"
                 )
         console.print("Ctrl-C stops them and makes every mirror safe")
-        for watcher in watchers:
+        for watcher in watchers if not stop.is_set() else ():
             watcher.start()
         while not stop.wait(0.2):
             for suite in suites:
                 suite.revive(lambda text: console.print(f"[yellow]{text}[/]"))
         console.print("\nstopping")
+
+
+@contextlib.contextmanager
+def only_suite(namespace: str) -> Iterator[None]:
+    """Keep the place of the suite in this ROS domain and namespace.
+
+    Raises:
+        RuntimeError: another `dm up` keeps it.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    folder = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f"dm_up.{domain}.{namespace.replace('/', '.')}").open("a+") as place:
+        try:
+            fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            place.seek(0)
+            raise RuntimeError(
+                f"a suite runs already in the ROS domain {domain}, namespace /{namespace} ({place.read()}): "
+                "./dm status says how it is; Ctrl-C where it was started ends it. For several mirrors at once give one "
+                "./dm up several --namespace"
+            ) from None
+        place.truncate(0)
+        place.write(f"./dm up, process {os.getpid()}, since {time.strftime('%H:%M:%S')}")
+        place.flush()
+        yield
 
 
 def end(watchers: Sequence[threading.Thread], stop: threading.Event) -> None:
