@@ -12,6 +12,7 @@ from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorState, ErrorCode, MirrorInfo, SurfaceMapInfo, SurfaceSamples, ZernikeCoefficients
 from dm_msgs.srv import HoldMirror, Measure, SetSignals
 
+from described_mirror import mirror_info_of
 from dm_common.errors import Refusal
 from dm_common.mirror import Mirror
 from dm_common.ros import qos
@@ -60,14 +61,8 @@ class StandIn:
         self.publish_state()
 
     def publish_info(self, mirror: Mirror) -> None:
-        message = MirrorInfo(name=mirror.name, serial=mirror.serial, actuators=mirror.actuators)
+        message = mirror_info_of(mirror)
         message.header.frame_id = "mirror"
-        message.actuator_x, message.actuator_y = doubles(mirror.x), doubles(mirror.y)
-        message.neighbour_a = array("I", mirror.limits.pairs[:, 0].astype(np.uint32).tobytes())
-        message.neighbour_b = array("I", mirror.limits.pairs[:, 1].astype(np.uint32).tobytes())
-        message.working_aperture_diameter = 2.0 * mirror.working_radius
-        message.signal_min, message.signal_max = mirror.limits.low, mirror.limits.high
-        message.neighbour_difference_max = mirror.limits.neighbour_difference
         self.info.publish(message)
 
     def publish_state(self, driver_state: int | None = None) -> None:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES
-from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
-from support import NodeProcess
+from dm_calibration import calibrator
+from dm_calibration.procedure import forecast
+from support import NodeProcess, only_common_laws
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -24,15 +23,12 @@ def _own_ros_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def common_laws() -> Iterator[None]:
-    """Calibrations in this process try no laws of each actuator by itself, which take half the time.
-
-    For simulations whose actuators are alike; tests of laws try them all.
-    """
-    common = partial(fit_hysteresis, candidates=[candidate for candidate in CANDIDATES if not candidate.own])
+def common_laws(request: pytest.FixtureRequest) -> Iterator[None]:
+    """As :func:`support.only_common_laws`, while the module is tested; it may name laws as TRIED_LAWS."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("calibrator", "procedure.forecast"):
-            patch.setattr(f"dm_calibration.{module}.fit_hysteresis", common)
+        for module in (calibrator, forecast):
+            patch.setattr(module, "fit_hysteresis", module.fit_hysteresis)  # put back at the end
+        only_common_laws(getattr(request.module, "TRIED_LAWS", ()))
         yield
 
 

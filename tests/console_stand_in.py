@@ -11,9 +11,12 @@ from dm_msgs.msg import ActuatorEstimate, ActuatorState, Calibration, Capabiliti
 from dm_msgs.srv import ListCalibrations, SetFocus, SetSignals
 from numpy.typing import NDArray
 
+from described_mirror import mirror_info_of
 from dm_common.geometry import neighbour_pairs
 from dm_common.hysteresis.observer import HysteresisObserver
+from dm_common.limits import Limits
 from dm_common.messages import applied_from, estimate_message
+from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
@@ -74,20 +77,7 @@ class StandIn:
 
 
 def mirror_info(x: NDArray[np.float64], y: NDArray[np.float64], radius: float = RADIUS) -> MirrorInfo:
-    a, b = neighbour_pairs(x, y).T
-    return MirrorInfo(
-        name="MIRROR",
-        serial="7",
-        actuators=x.size,
-        actuator_x=array("d", x),
-        actuator_y=array("d", y),
-        neighbour_a=array("I", a.tolist()),
-        neighbour_b=array("I", b.tolist()),
-        working_aperture_diameter=2 * radius,
-        signal_min=-1.0,
-        signal_max=1.0,
-        neighbour_difference_max=2.0,
-    )
+    return mirror_info_of(Mirror("MIRROR", "7", x, y, radius, Limits(pairs=neighbour_pairs(x, y))))
 
 
 def calibration(actuators: int, radius: float = RADIUS) -> Calibration:

@@ -23,6 +23,7 @@ from dm_msgs.msg import (
 from dm_msgs.srv import SetFocus
 from numpy.typing import NDArray
 
+from described_mirror import mirror_info_of
 from dm_common.errors import ErrorCode
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
@@ -39,23 +40,7 @@ REPORT_PERIOD = 0.5
 
 
 def mirror_info(serial: str = "T-1") -> MirrorInfo:
-    x, y = hexagon()
-    pairs = make_mirror().limits.pairs
-    return MirrorInfo(
-        name="PDM30-37",
-        serial=serial,
-        actuators=37,
-        actuator_x=list(x),
-        actuator_y=list(y),
-        neighbour_a=[int(a) for a, _b in pairs],
-        neighbour_b=[int(b) for _a, b in pairs],
-        full_aperture_diameter=0.03,
-        working_aperture_diameter=2 * RADIUS,
-        signal_min=-1.0,
-        signal_max=1.0,
-        neighbour_difference_max=2.0,
-        slew_rate_max=SLEW_RATE,
-    )
+    return mirror_info_of(make_mirror(serial=serial), full_aperture_diameter=0.03, slew_rate_max=SLEW_RATE)
 
 
 def calibration(serial: str = "T-1", radius: float = RADIUS, **fields: Any) -> Calibration:

@@ -4,31 +4,65 @@ from __future__ import annotations
 
 import signal
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
+from dm_calibration import calibrator
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
+from dm_calibration.procedure import forecast
 from dm_tools.demo.demo_bench import bench_config
-from fault_injection.rigs.forked_node import ForkedNode
+from fault_injection.rigs.forked_node import ForkedNode, ForkedSuite
 from ros_fixtures import Observer
 from waiting import wait_until
 
-__all__ = ["NodeProcess", "Observer", "bench_figures", "fast_bench", "wait_until"]
+__all__ = [
+    "CommonLawsSuite",
+    "NodeProcess",
+    "Observer",
+    "bench_figures",
+    "fast_bench",
+    "only_common_laws",
+    "wait_until",
+]
 
 
 def fast_bench(folder: Path, seed: int, source: Path | None = None) -> dict[str, dict[str, Any]]:
-    """Configuration of a bench with ideal actuators, twenty times as fast as real ones.
+    """Configuration of a bench with ideal actuators, twenty times as fast as real ones, and with a smaller camera.
 
-    Such actuators care for no time between two ticks of the clock; what a report says is tested elsewhere.
+    Such actuators care for no time between two ticks of the clock, each of which wakes every node; what a report says
+    is tested elsewhere.
     """
     config = bench_config(folder, "off", 0.0, seed, 20.0, source)
-    config["virtual_bench"]["clock.period"] = 0.005
+    config["virtual_bench"] |= {"clock.period": 0.01, "interferometer.pixels": 472}
     config["calibration"]["write_report"] = False
     return config
+
+
+def only_common_laws(names: Collection[str] = ()) -> None:
+    """Calibrations in this process try no laws of each actuator by itself, which take most of the time.
+
+    For simulations whose actuators are alike; tests of laws try them all.
+
+    Args:
+        names: of the laws that are tried; none = all that actuators share.
+    """
+    laws = [law for law in CANDIDATES if (law.name in names if names else not law.own)]
+    common = partial(fit_hysteresis, candidates=laws)
+    calibrator.fit_hysteresis = forecast.fit_hysteresis = common
+
+
+class CommonLawsSuite(ForkedSuite):
+    """Its calibration node tries common laws alone."""
+
+    prepare = MappingProxyType({"calibration": only_common_laws})
 
 
 def bench_figures(node: Node, timeout_s: float = 60.0) -> dict[str, str]:

@@ -52,7 +52,7 @@ TRIES, PAUSE_S = 4, 5.0
 
 
 def short_run() -> dict[str, Any]:
-    return run(["fit", "read", "solve"], Effort(rounds=12, quick=True), {})
+    return run(["fit", "read", "solve"], Effort(rounds=6, quick=True), {})
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,9 @@ from studies.comparison.random_requests import Requests
 from studies.verbs.compare import compare as command
 from studies.verbs.compare_mirrors import figures_of, row_of, show
 
+#: Tried by `common_laws`: that of the mirror that is judged among them.
+TRIED_LAWS = ("linear", "Preisach")
+
 
 def test_a_seed_is_always_the_same_mirror_and_seeds_differ() -> None:
     assert draw_mirror(7) == draw_mirror(7)

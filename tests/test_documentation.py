@@ -282,7 +282,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         (folder / name).symlink_to(ROOT / name)
     home = folder / "home"
     config = bench_config(folder / "bench", "drawn_preisach", 0.01, 1, 20.0)  # the shipped mirror in fast time
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.005}
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
     config["calibration"] |= {"calibration_folder": "~/.ros/dm_calibrations", "load_on_start": "newest"}
     home.mkdir()
     save_config(config, folder / "my_bench.yaml")

@@ -16,6 +16,8 @@ from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
+#: Tried by `common_laws`: that of the simulation among them.
+TRIED_LAWS = ("linear", "Duhem")
 SIMULATION = SimulationConfig(law="bouc_wen", seed=8, pixels=120, degauss_steps=50)
 
 

@@ -18,6 +18,8 @@ from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
+#: Tried by `common_laws`: that of the simulation among them.
+TRIED_LAWS = ("linear", "Preisach")
 NIGHTS = 100
 ASTIGMATISM = 4
 

@@ -31,6 +31,8 @@ from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig,
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 
 WAVELENGTH = 632.8e-9
+#: Tried by `common_laws`: that of the simulation among them.
+TRIED_LAWS = ("linear", "Preisach")
 
 
 class Stand:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from array import array
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rclpy.serialization import deserialize_message, serialize_message
 
+from described_mirror import mirror_info_of
 from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
@@ -53,28 +53,11 @@ def write_bag(folder: Path, messages: list[tuple[str, Any]], parameters: dict[st
     return BagReader(folder)
 
 
-def mirror_message(run: RecordedRun) -> MirrorInfo:
-    mirror = run.mirror
-    return MirrorInfo(
-        name=mirror.name,
-        serial=mirror.serial,
-        actuators=mirror.actuators,
-        actuator_x=doubles(mirror.x),
-        actuator_y=doubles(mirror.y),
-        neighbour_a=array("I", mirror.limits.pairs[:, 0].tolist()),
-        neighbour_b=array("I", mirror.limits.pairs[:, 1].tolist()),
-        working_aperture_diameter=2.0 * mirror.working_radius,
-        signal_min=mirror.limits.low,
-        signal_max=mirror.limits.high,
-        neighbour_difference_max=mirror.limits.neighbour_difference,
-    )
-
-
 def session_messages(run: RecordedRun) -> list[tuple[str, Any]]:
     """The topics of a run as the nodes publish them: feedback, then moves and maps in the order of their stamps."""
     rest = doubles(run.mirror.rest)
     messages: list[tuple[str, Any]] = [
-        ("/mirror_info", mirror_message(run)),
+        ("/mirror_info", mirror_info_of(run.mirror)),
         ("/actuator_state", ActuatorState(requested=rest, applied=rest, turns=7, degausses=2)),
     ]
     for step, label in sorted(run.labels.items()):

@@ -17,6 +17,7 @@ from dm_msgs.srv import FitInfluenceFunction, FitRegression, LoadCalibration, Pr
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 
+from described_mirror import mirror_info_of
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
@@ -86,12 +87,8 @@ def node(start: Callable[..., NodeProcess], observer: Observer, tmp_path: Path) 
     for calibration in unfit():
         store.save(calibration)
     process = start("dm_calibration", "calibration", {"calibration_folder": str(store.folder), "write_report": False})
-    message = MirrorInfo(name=MIRROR.name, serial=MIRROR.serial, actuators=MIRROR.actuators)
-    message.actuator_x, message.actuator_y = doubles(MIRROR.x), doubles(MIRROR.y)
-    message.working_aperture_diameter = 2.0 * RADIUS
-    message.signal_min, message.signal_max, message.neighbour_difference_max = -1.0, 1.0, 2.0
     publisher = observer.node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED)
-    publisher.publish(message)
+    publisher.publish(mirror_info_of(MIRROR))
     return process
 
 

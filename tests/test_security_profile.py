@@ -33,7 +33,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DeformableMirror
     """All nodes, a client and a console."""
     folder = tmp_path_factory.mktemp("bench")
     config = bench_config(folder, "off", 0.0, 1, speed=20.0)
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.005}
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
     config["virtual_bench"]["camera.rate"] = 1.0
     config["autofocus"] = {"use_sim_time": True}
     with (

@@ -37,7 +37,8 @@ def test(
     root = Path(os.environ.get("DM_ROOT", Path.cwd()))
     chosen = any(not argument.startswith("-") for argument in context.args)
     steps = {}
-    if lint or (lint is None and not fast and not chosen):
+    lint = not fast and not chosen if lint is None else lint
+    if lint:
         steps["ruff check"] = ["ruff", "check", "."]
         steps["ruff format"] = ["ruff", "format", "--check", "."]
         steps["mypy"] = ["mypy"]
@@ -45,7 +46,10 @@ def test(
     steps["pytest"] = ["pytest", "-n", str(workers), *SCHEDULE, *(["-m", FAST] if fast else []), *context.args]
     environment = _environment(root)
     results: dict[str, dict[str, float | int]] = {}
+    compiling = _compile(root, environment) if lint else None
     for name, command in steps.items():
+        if name == "pytest" and compiling is not None:
+            compiling.wait()
         console.rule(name)
         started = time.monotonic()
         status = subprocess.run([sys.executable, "-m", *command], cwd=root, env=environment, check=False).returncode
@@ -56,6 +60,12 @@ def test(
     if failed:
         console.print(f"[bold red]failed:[/] {', '.join(failed)}")
         raise typer.Exit(1)
+
+
+def _compile(root: Path, environment: dict[str, str]) -> subprocess.Popen[bytes]:
+    """Collect all tests beside the lint: in a fresh checkout else every worker compiles them, and what they import."""
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q"]
+    return subprocess.Popen(command, cwd=root, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def _environment(root: Path) -> dict[str, str]:

@@ -15,9 +15,10 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from dm_bringup.nodes import MODULES
@@ -35,13 +36,20 @@ class ForkedNode:
         arguments: of its command line.
         log: file that its output is added to.
         environment: variables beside those of this process.
+        prepare: called there before the node begins; None = nothing is.
     """
 
     def __init__(
-        self, module: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str] | None = None
+        self,
+        module: str,
+        arguments: Sequence[str],
+        log: Path,
+        environment: Mapping[str, str] | None = None,
+        prepare: Callable[[], None] | None = None,
     ) -> None:
         self.args = ["python", "-m", module, *arguments]
-        job = (module, [module, *arguments], str(log), {**os.environ, **(environment or {})}, str(Path.cwd()))
+        own = {**os.environ, **(environment or {})}
+        job = (module, [module, *arguments], str(log), own, str(Path.cwd()), prepare)
         # A daemon ends with this process, whatever becomes of a test.
         self._process = _CONTEXT.Process(target=_run, args=job, daemon=True)
         self._process.start()
@@ -86,10 +94,16 @@ Process = subprocess.Popen[bytes] | ForkedNode
 
 
 class ForkedSuite(Suite):
-    """The nodes named in a configuration, forked off the server."""
+    """The nodes named in a configuration, forked off the server.
+
+    Attributes:
+        prepare: functions that are called in the process of a node before it begins, by the node's name.
+    """
+
+    prepare: Mapping[str, Callable[[], None]] = MappingProxyType({})
 
     def _process(self, name: str, arguments: list[str]) -> Any:
-        return ForkedNode(MODULES[name], arguments, self.log(name), self._environment)
+        return ForkedNode(MODULES[name], arguments, self.log(name), self._environment, self.prepare.get(name))
 
 
 def _end_with_the_tests() -> None:
@@ -100,7 +114,14 @@ def _end_with_the_tests() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _run(module: str, arguments: list[str], log: str, environment: dict[str, str], folder: str) -> None:
+def _run(
+    module: str,
+    arguments: list[str],
+    log: str,
+    environment: dict[str, str],
+    folder: str,
+    prepare: Callable[[], None] | None,
+) -> None:
     """What the forked process does."""
     threading.Thread(target=_end_with_the_tests, daemon=True).start()
     os.setsid()
@@ -111,6 +132,8 @@ def _run(module: str, arguments: list[str], log: str, environment: dict[str, str
         for number in (1, 2):
             os.dup2(output.fileno(), number)
     sys.argv = arguments
+    if prepare is not None:
+        prepare()
     try:
         status = importlib.import_module(module).main()
     finally:

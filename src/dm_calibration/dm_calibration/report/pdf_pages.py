@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
+from reportlab import rl_config
 from reportlab.lib.colors import HexColor
 from reportlab.lib.enums import TA_LEFT, TA_RIGHT
 from reportlab.lib.pagesizes import A4
@@ -67,6 +68,7 @@ class Room(NamedTuple):
 def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     """All sections as a PDF: text, tables and pictures one below the other, title and page number at the foot."""
     _register_fonts()
+    rl_config.useA85 = 0  # pictures as bytes: as text they are a quarter larger, and take time to be made so
     stream = io.BytesIO()
     # Invariant: without a date, the same run gives the same file.
     margins = dict.fromkeys(("leftMargin", "rightMargin", "topMargin", "bottomMargin"), MARGIN)
