@@ -231,8 +231,9 @@ def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     started = subprocess.Popen([sys.executable, "-m", "dm_tools", "up"], stderr=subprocess.PIPE, text=True)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
     started.send_signal(signal.SIGINT)
-    said = started.communicate(timeout=60)[1]
-    assert (started.returncode, said) == (130, "error: interrupted\n")
+    said = started.communicate(timeout=300)[1]
+    assert (started.returncode, "Traceback" in said) == (130, False), said
+    assert said.endswith("error: interrupted\n")
 
 
 def test_up_ends_those_who_wait_before_the_process_does() -> None:

@@ -21,11 +21,12 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.report import content, content_hysteresis
-from dm_calibration.report.certificate import certificate, curvatures, doubts, keep_people, next_calibration, people
+from dm_calibration.report.certificate import certificate, curvatures, doubts, keep_people, people
+from dm_calibration.report.checks import next_calibration
+from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
 from dm_calibration.report.figures import on_disc
 from dm_calibration.report.html_page import one_html
-from dm_calibration.report.hysteresis_figures import loop_opening, step_response
 from dm_calibration.report.page import figures_of, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
@@ -104,13 +105,13 @@ def test_the_page_names_what_was_dropped_and_every_limitation(page: str, calibra
 
 
 def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) -> None:
-    first = page[page.index("<h2>Certificate") : page.index("<h2>Summary")]
+    first = page[page.index("<h2>Certificate") : page.index("<h2>Every actuator")]
     assert "approximate: hysteresis was not identified" in first and "<img " in first
     assert f"{calibration.fit.held_out_max_zernike * 1e9:.2f} nm" in first and "95 % bound" in first
     assert "2023-12-14" in first, "valid for thirty days"
     low, high = curvatures(calibration)
     assert -0.2 < low < -0.05 and 0.05 < high < 0.2 and f"{low:+.3f} to {high:+.3f} 1/m" in first
-    assert '<th scope="col">SHA' not in page[: page.index("<h2>Appendix: files")]
+    assert '<th scope="col">SHA' not in page[: page.index("<h2>Files")]
 
 
 def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibration, tmp_path: Path) -> None:
@@ -175,8 +176,11 @@ def test_headings_stay_with_what_is_below_them(lines: int, monkeypatch: pytest.M
     recorded_draw(Paragraph, lambda paragraph: paragraph.text)
     recorded_draw(LongTable, lambda _table: "rows")
     table = Table("Its table", ("item", "value"), [(f"row {k}", str(k)) for k in range(12)])
-    pdf_pages("", [Section("Filler", ["filler"] * lines), Section("The heading", ["Some words."], [table])])
-    assert pages["The heading"] == pages["Its table"] == pages["rows"] <= 3
+    sheets = [Section("Sheet", ["much"] * (40 + lines), sheet=True), Section("Other sheet", ["little"], sheet=True)]
+    pdf_pages("", [*sheets, Section("Filler", ["filler"] * lines), Section("The heading", ["Some words."], [table])])
+    assert (pages["Sheet"], pages["much"], pages["Other sheet"]) == (1, 1, 2), "as much as there is: it fits on a page"
+    assert pages["Filler"] == 3
+    assert pages["The heading"] == pages["Its table"] == pages["rows"] <= 5
 
 
 def test_every_map_has_a_row(page: str, calibration: Calibration) -> None:

@@ -1,5 +1,5 @@
-"""The first pages of the report: what the calibration promises, of which mirror, until when, and who says so; and what
-checks have shown since: what drifts, how fast, and when to calibrate next."""
+"""The two pages of the report that one hangs up: what the calibration promises, until when, and who says so; and a
+picture of every actuator."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from scipy.stats import theilslopes
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.calibration_parameters import PARAMETERS
 from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
 from dm_calibration.influence.surfaces import solve_shape
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report import figures
-from dm_calibration.report.content import NM, length, utc
-from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Picture, Section, Table
+from dm_calibration.report.checks import DEFAULTS, next_calibration
+from dm_calibration.report.content import length, promise, utc
+from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
 from dm_common.figures import two_fold
 from dm_common.geometry import neighbour_pairs
@@ -32,12 +30,6 @@ from dm_common.optics.zernike import PISTON_TILT
 PEOPLE = Path("~/.ros/dm_report.json")
 #: A curvature is in the range while no coefficient is further off than this, m; it is found to this, 1/m.
 TOLERANCE, STEP = 20e-9, 1e-4
-DAY_S = 86400.0
-#: Fewest checks, and least time between the first and the last, that show a trend.
-TREND_MIN, TREND_SPAN_S = 5, DAY_S
-#: Checks in the table: the last ones.
-SHOWN = 20
-DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 
 
 def people(file: Path = PEOPLE) -> dict[str, str]:
@@ -57,12 +49,6 @@ def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
     """
     if names:
         write_whole(file.expanduser(), json.dumps(people(file) | dict(names)).encode())
-
-
-def promise(calibration: Calibration) -> float:
-    """m, 95 % bound on the largest coefficient error of an open-loop move, from maps that had no part in the fit."""
-    found = calibration.hysteresis
-    return float(found.held_out_max_zernike if found is not None else calibration.fit.held_out_max_zernike)
 
 
 def doubts(calibration: Calibration) -> list[str]:
@@ -146,78 +132,17 @@ def certificate(calibration: Calibration, names: Mapping[str, str], checks: Sequ
         "Responses with their standard errors, and where the actuators stand; dashed: calibrated aperture.",
         figures.response_figure(calibration),
     )
-    return Section("Certificate", [sentence], [Table("Certificate", ("item", "value"), rows, textual=True)], [picture])
+    table = Table("Certificate", ("item", "value"), rows, textual=True)
+    return Section("Certificate", [sentence], [table], [picture], sheet=True)
 
 
-def next_calibration(checks: Sequence[Check], promised: float, created_s: float) -> tuple[float, str]:
-    """When to calibrate next, s since the epoch, and why.
-
-    The trend is the median of all slopes between two checks; it counts where its 90 % interval is above zero.
-
-    Args:
-        checks: oldest first.
-        promised: 95 % bound on the largest coefficient error, m.
-        created_s: when the calibration was made.
-    """
-    agreed = [check.time for check in checks if check.accepted]
-    stale = max([created_s, *agreed]) + DEFAULTS["updates.stale_after"]
-    if len(checks) < TREND_MIN or checks[-1].time - checks[0].time < TREND_SPAN_S:
-        return stale, "too few checks to see a trend; a check that agrees puts it off"
-    time, error = (np.array([getattr(check, name) for check in checks]) for name in ("time", "max_zernike"))
-    slope, level, low, _high = theilslopes(error, time - time[0], 0.9)
-    per_month = f"{30 * DAY_S * slope * NM:+.2f} nm in 30 days"
-    if low <= 0.0:
-        return stale, f"no growth of the error beyond chance ({per_month}); a check that agrees puts it off"
-    reached = float(time[0] + max(promised - level, 0.0) / slope)
-    return min(stale, max(reached, float(time[-1]))), f"the error grows by {per_month} and reaches the promise then"
-
-
-def checks_section(calibration: Calibration, checks: Sequence[Check]) -> Section:
-    """Table, chart and a sentence on each question.
-
-    Args:
-        checks: at least one, oldest first.
-    """
-    last, created, promised = checks[-1], calibration.created_ns * 1e-9, promise(calibration)
-    days = max(last.time - created, 1.0) / DAY_S
-    when, reason = next_calibration(checks, promised, created)
-    outside = sum(check.max_zernike > promised for check in checks)
-    sentences = [
-        f"{len(checks)} maps were compared with this calibration, the last one {utc(round(last.time * 1e9))}; "
-        f"{sum(not check.accepted for check in checks)} disagreed, {outside} showed more than the promise of "
-        f"{length(promised, calibration.wavelength)}: one in twenty may.",
-        f"In {days:.1f} days gains have changed by up to {last.gain_drift:.2%} (actuator {last.actuator}), the figure "
-        f"by {last.offset_drift * NM:.2f} nm rms; the calibration in use follows.",
-        f"Calibrate next by {utc(round(when * 1e9))}: {reason}.",
-    ]
-    rows = [
-        (
-            utc(round(check.time * 1e9)),
-            "yes" if check.accepted else "no",
-            f"{check.max_zernike * NM:.2f}",
-            f"{check.surprise:.1f}",
-            f"{check.gain_drift:.2%} ({check.actuator})",
-            f"{check.offset_drift * NM:.2f}",
-        )
-        for check in checks[-SHOWN:]
-    ]
-    header = ("map", "agreed", "largest coefficient, nm", "surprise", "gains (actuator)", "figure, nm rms")
+def every_actuator(calibration: Calibration) -> Section:
+    """A picture of each actuator."""
     picture = Picture(
-        "checks", "Checks since the calibration; dashed: what it promises.", _chart(checks, promised, created)
+        "influence", "Influence functions of all actuators on one scale.", figures.influence_sheet(calibration)
     )
-    return Section("Checks since then", sentences, [Table("The last checks", header, rows)], [picture])
-
-
-def _chart(checks: Sequence[Check], promised: float, created: float) -> Figure:
-    figure = Figure(figsize=(7.5, 3.2), layout="constrained")
-    axes = figure.subplots()
-    days = np.array([(check.time - created) / DAY_S for check in checks])
-    agreed = np.array([bool(check.accepted) for check in checks])
-    error = np.array([check.max_zernike for check in checks]) * NM
-    axes.plot(days[agreed], error[agreed], "o", color=BLUE, label="largest coefficient error")
-    axes.plot(days[~agreed], error[~agreed], "x", color=VERMILION, label="the same, map disagreed")
-    axes.plot(days, [check.offset_drift * NM for check in checks], color=ORANGE, label="change of the figure, rms")
-    axes.axhline(promised * NM, color=GREY, linestyle="--")
-    axes.set(xlabel="days since the calibration", ylabel="nm", ylim=(0.0, None))
-    axes.legend(fontsize="small")
-    return figure
+    text = (
+        f"Sag per unit {'effective ' if calibration.hysteresis is not None else ''}signal of each actuator, piston and "
+        "tilt removed. Small circle: the actuator; cross: it stands outside the calibrated aperture, in that direction."
+    )
+    return Section("Every actuator", [text], pictures=[picture], sheet=True)

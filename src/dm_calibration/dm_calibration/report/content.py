@@ -33,6 +33,12 @@ def length(metres: float, wavelength: float) -> str:
     return f"{metres * NM:.2f} nm{share}"
 
 
+def promise(calibration: Calibration) -> float:
+    """m, 95 % bound on the largest coefficient error of an open-loop move, from maps that had no part in the fit."""
+    found = calibration.hysteresis
+    return float(found.held_out_max_zernike if found is not None else calibration.fit.held_out_max_zernike)
+
+
 def _counted(number: int, one: str, many: str) -> str:
     """A number with its noun."""
     return f"{number or 'No'} {one if number <= 1 else many}"
@@ -161,7 +167,7 @@ def every_map(calibration: Calibration) -> Section:
         for i, label in enumerate(maps.label)
     ]
     return Section(
-        "Appendix: every map",
+        "Every map",
         [
             "Residual: rms sag that the fit leaves. Beyond 21 terms: what the Zernike terms leave of the map itself, "
             "print-through and noise."
@@ -191,7 +197,7 @@ def files(calibration: Calibration, file: str, sha256: str) -> Section:
     ]
     folders = sorted({str(PurePath(name).parent) for name in maps.file if name})
     return Section(
-        "Appendix: files",
+        "Files",
         [
             *([f"This report was made of {file}, SHA-256 {sha256}."] if file else []),
             *([f"Map files lay in {', '.join(folders)}."] if folders else ["The maps came without files."]),

@@ -32,21 +32,14 @@ def influence(calibration: Calibration) -> Section:
         )
         for k in range(fit.actuators)
     ]
-    effective = "effective signal" if calibration.hysteresis is not None else "signal"
     return Section(
         "Influence functions",
         [
-            f"Sag per unit {effective} of each actuator, piston and tilt removed, interpolated between the "
-            f"{fit.points.x.size} sampling points. Small circle: the actuator; cross: it stands outside the calibrated "
-            "aperture, in that direction. The response is the rms of such a map. An actuator is weak or dead when its "
-            "response is small beside its ring's median or not well above its standard error.",
+            f"The maps of the second page are interpolated between the {fit.points.x.size} sampling points. The "
+            "response is the rms of such a map. An actuator is weak or dead when its response is small beside its "
+            "ring's median or not well above its standard error.",
         ],
         [Table("Actuators", ("actuator", "x, mm", "y, mm", "ring", "response, nm", "± nm", "grade"), rows)],
-        [
-            Picture(
-                "influence", "Influence functions of all actuators on one scale.", figures.influence_sheet(calibration)
-            ),
-        ],
     )
 
 

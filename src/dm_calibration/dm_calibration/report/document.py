@@ -54,9 +54,10 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A heading with paragraphs, then tables, then pictures."""
+    """A heading with paragraphs, then tables, then pictures; a `sheet` is a page by itself on paper, and fits on it."""
 
     title: str
     paragraphs: Sequence[str]
     tables: Sequence[Table] = ()
     pictures: Sequence[Picture] = ()
+    sheet: bool = False

@@ -11,10 +11,10 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.check_log import SUFFIX, read_checks
-from dm_calibration.report import certificate, content, content_fit, content_hysteresis
+from dm_calibration.report import certificate, checks, content, content_fit, content_hysteresis
+from dm_calibration.report.content_hysteresis import loop_opening
 from dm_calibration.report.document import Section
 from dm_calibration.report.html_page import one_html
-from dm_calibration.report.hysteresis_figures import loop_opening
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
 from dm_common.atomic_write import write_whole
@@ -34,11 +34,13 @@ def sections(calibration: Calibration, file: Path | None = None) -> list[Section
         OSError: `file` cannot be read.
     """
     left = residuals(calibration)
-    checks = read_checks(file.with_name(f"{calibration.id}{SUFFIX}")) if file is not None else []
+    log = read_checks(file.with_name(f"{calibration.id}{SUFFIX}")) if file is not None else []
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
     return [
-        certificate.certificate(calibration, certificate.people(), checks),
-        *([certificate.checks_section(calibration, checks)] if checks else []),
+        certificate.certificate(calibration, certificate.people(), log),
+        certificate.every_actuator(calibration),
+        Section("Appendix", ["What the two pages before rest on."]),
+        *([checks.checks_section(calibration, log)] if log else []),
         content.summary(calibration),
         content.provenance(calibration),
         content.cautions(calibration),

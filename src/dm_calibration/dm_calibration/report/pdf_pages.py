@@ -22,8 +22,9 @@ from reportlab.platypus import (
     CondPageBreak,
     Flowable,
     Image,
-    KeepTogether,
+    KeepInFrame,
     LongTable,
+    PageBreak,
     Paragraph,
     SimpleDocTemplate,
     Spacer,
@@ -54,6 +55,7 @@ HEADING = ParagraphStyle(
     "heading", fontName=BOLD, fontSize=12, leading=15, spaceBefore=12, spaceAfter=6, keepWithNext=1
 )
 BODY = ParagraphStyle("body", fontName=REGULAR, fontSize=9, leading=12.5, spaceAfter=6)
+LEAD = ParagraphStyle("lead", fontName=REGULAR, fontSize=12, leading=16, spaceAfter=9)
 CAPTION = ParagraphStyle("caption", fontName=REGULAR, fontSize=8, leading=10.5, spaceAfter=8, textColor=FOOT)
 TABLE_TITLE = ParagraphStyle("table", fontName=BOLD, fontSize=8.5, leading=11, spaceBefore=6, spaceAfter=3)
 
@@ -73,10 +75,18 @@ def pdf_pages(title: str, sections: Sequence[Section]) -> bytes:
     # Invariant: without a date, the same run gives the same file.
     margins = dict.fromkeys(("leftMargin", "rightMargin", "topMargin", "bottomMargin"), MARGIN)
     document = SimpleDocTemplate(stream, pagesize=A4, title=title, invariant=1, **margins)
-    story: list[Flowable] = [_paragraph(title, TITLE)]
+    story: list[Flowable] = []
     for section in sections:
-        text = [_paragraph(section.title, HEADING), *(_paragraph(text, BODY) for text in section.paragraphs)]
+        style = LEAD if section.sheet else BODY
+        text = [_paragraph(section.title, HEADING), *(_paragraph(text, style) for text in section.paragraphs)]
         shown = [_table(table) for table in section.tables] + [_picture(picture) for picture in section.pictures]
+        if section.sheet:
+            heading = [] if story else [_paragraph(title, TITLE)]
+            parts = [*heading, *text, *(each for _room, flowables in shown for each in flowables)]
+            story += [KeepInFrame(WIDTH, PAGE, parts, mode="shrink"), PageBreak()]
+            continue
+        if not story:
+            text.insert(0, _paragraph(title, TITLE))
         # A heading and its text stay with the first table or picture below them, as far as a page has room for all.
         heights = [each.wrap(WIDTH, HEIGHT)[1] + each.style.spaceBefore + each.style.spaceAfter for each in text]
         story.append(CondPageBreak(min(sum(heights) + (shown[0][0] if shown else 0.0), PAGE)))
@@ -103,7 +113,7 @@ def _picture(picture: Picture) -> Room:
     scale = min(WIDTH / width, HEIGHT / height)
     image = Image(io.BytesIO(picture.png), width * scale, height * scale)
     caption = _paragraph(picture.caption, CAPTION)
-    return Room(height * scale + caption.wrap(WIDTH, HEIGHT)[1], [KeepTogether([image, caption])])
+    return Room(height * scale + caption.wrap(WIDTH, HEIGHT)[1], [image, caption])
 
 
 def _table(table: Table) -> Room:
@@ -157,6 +167,8 @@ def _column_widths(table: Table) -> list[float]:
         widths = [max(pair) for pair in zip(longest, narrow, strict=True)]
     if sum(widths) > WIDTH:
         widths = [min(width, COLUMN_MAX * WIDTH) for width in widths]
+        if table.textual:  # its last column says most, and may be broken
+            widths[-1] = max(widths[-1], WIDTH - sum(widths[:-1]))
     return widths
 
 
