@@ -21,7 +21,9 @@ Floats = NDArray[np.float64]
 RELAYS = 40_000
 #: Half a stroke, m, and the noise of a response, m.
 HALF_STROKE, NOISE = 4e-6, 2e-10
-COMMON = tuple(candidate for candidate in CANDIDATES if not candidate.own)
+#: That of the actuators, of all in common and of each by itself, and none: the choice among all is tested elsewhere.
+LAWS = tuple(law for law in CANDIDATES if law.name in ("linear", "Preisach", "Preisach, each actuator its own"))
+COMMON = tuple(law for law in LAWS if not law.own)
 
 
 class Relays:
@@ -74,7 +76,7 @@ def held_out_rms(found: Identification) -> float:
 @pytest.mark.parametrize("seed", [11, 12])
 def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(seed: int) -> None:
     run, check = relay_run(0.2, seed)
-    found, common = identify(run, check), identify(run, check, COMMON)
+    found, common = identify(run, check, LAWS), identify(run, check, COMMON)
     assert found.fit.candidate.own
     assert found.fit.law.actuators == 7
     assert slope_min(found.fit.law) > 0.1
@@ -83,9 +85,9 @@ def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(se
 
 def test_actuators_that_are_alike_lose_nothing() -> None:
     run, check = relay_run(0.0, 13)
-    assert held_out_rms(identify(run, check)) < 1.1 * held_out_rms(identify(run, check, COMMON))
+    assert held_out_rms(identify(run, check, LAWS)) < 1.1 * held_out_rms(identify(run, check, COMMON))
 
 
 def test_laws_span_the_same_in_a_full_cycle() -> None:
     run, check = relay_run(0.2, 14, 120)
-    assert span(identify(run, check).fit.law) == pytest.approx(np.full(7, 2.0), rel=1e-9)
+    assert span(identify(run, check, LAWS).fit.law) == pytest.approx(np.full(7, 2.0), rel=1e-9)
