@@ -26,12 +26,15 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
 from dm_common.messages import doubles, time_message
 from dm_common.ros import qos
-from dm_tools.recording.bag import METADATA_FILE, BagError, BagReader, BagWriter, Topic
+from dm_tools.recording.bag import METADATA_FILE, BagWriter, Topic
+from dm_tools.recording.bag_reader import BagError, BagReader
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 from dm_tools.recording.player import play, replayed
 from dm_tools.recording.recorder import Recorder
 from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate
+from dm_tools.verbs.replay import _again
 from recorded_bench import recorded
+from rosbag2_files import write_rosbag2
 from rosbag2_metadata import read_metadata
 from support import Observer, wait_until
 
@@ -116,6 +119,37 @@ def test_a_calibration_made_again_is_the_same_to_the_last_bit(run_and_bag: tuple
     assert np.array(live.influence_sag).tobytes() == again.fit.influence_sag.tobytes()
 
 
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_recording_of_rosbag2_gives_the_same_calibration(
+    run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path, storage: str
+) -> None:
+    _run, live, ours = run_and_bag
+    folder = tmp_path / "theirs"
+    write_rosbag2(folder, list(ours.read()), storage)
+    theirs = BagReader(folder)
+    assert theirs.counts == ours.counts and theirs.messages == ours.messages
+    assert theirs.duration_s == ours.duration_s and theirs.topics.keys() == ours.topics.keys()
+    assert theirs.topics["/zernike"].qos == [RELIABLE]
+    assert [message.data for message in theirs.read(["/zernike"])] == [m.data for m in ours.read(["/zernike"])]
+    session = read_session(theirs)
+    assert "does not hold the parameters" in session.remarks[0]  # which rosbag2 does not ask for
+    session.parameters["poke_amplitude"] = 0.4
+    assert differences(recalibrate(session, "again", 2), live) == []
+    (folder / "theirs_1.mcap").unlink(missing_ok=True)
+    (folder / "theirs_1.db3").unlink(missing_ok=True)
+    with pytest.raises(BagError, match="theirs_1"):
+        BagReader(folder)
+
+
+def test_a_recording_without_hidden_topics_says_how_to_make_one(
+    run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
+) -> None:
+    messages = [message for message in run_and_bag[2].read() if "/_" not in message.topic.name]
+    write_rosbag2(tmp_path / "theirs", messages, "mcap")
+    with pytest.raises(RecordingError, match="--include-hidden-topics"):
+        read_session(BagReader(tmp_path / "theirs"))
+
+
 def test_a_difference_of_one_bit_is_found(run_and_bag: tuple[RecordedRun, Any, BagReader]) -> None:
     _run, live, bag = run_and_bag
     again = recalibrate(read_session(bag), "again", 2)
@@ -138,6 +172,16 @@ def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any
     assert "the same as live to the last bit" in done.stdout
     told = json.loads(figures.read_text())
     assert told["identical"] is True and Path(told["file"]).is_file()
+
+
+def test_the_command_takes_parameters_that_a_recording_of_rosbag2_does_not_hold(
+    run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
+) -> None:
+    write_rosbag2(tmp_path / "theirs", list(run_and_bag[2].read()), "mcap")
+    config = tmp_path / "bench.yaml"
+    config.write_text("/**/calibration: {ros__parameters: {poke_amplitude: 0.4}}\n")
+    figures = _again(BagReader(tmp_path / "theirs"), 0, "", None, config)
+    assert figures["identical"] is True
 
 
 def test_a_recording_without_a_run_is_told(tmp_path: Path) -> None:

@@ -7,15 +7,13 @@ service that publishers offered in each channel's metadata. Knows no node.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import yaml
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
@@ -23,16 +21,13 @@ from dm_common.atomic_write import write_whole
 
 SUFFIX = ".mcap"
 METADATA_FILE = "metadata.yaml"
+INFORMATION = "rosbag2_bagfile_information"
 #: Version of rosbag2's metadata in ROS 2 Jazzy: quality of service as words.
 METADATA_VERSION = 9
 #: MCAP metadata record that rosbag2 looks for, and ours with the nodes' parameters.
 ROSBAG_RECORD, PARAMETERS_RECORD = "rosbag2", "node_parameters"
 #: Key in a channel's metadata.
 QOS_KEY, HASH_KEY = "offered_qos_profiles", "topic_type_hash"
-
-
-class BagError(ValueError):
-    """The recording cannot be read; the message says which and why."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +45,6 @@ class Topic:
     type_name: str
     qos: Sequence[Mapping[str, Any]]
     type_hash: str = ""
-
-
-@dataclass(frozen=True)
-class Message:
-    """One recorded message: serialised as CDR, received at `log_time`, published at `publish_time`, ns."""
-
-    topic: Topic
-    data: bytes
-    log_time: int
-    publish_time: int
 
 
 class BagWriter:
@@ -131,7 +116,7 @@ class BagWriter:
         self._writer.add_metadata(ROSBAG_RECORD, {"serialized_metadata": text})
         self._writer.finish()
         self._stream.close()
-        whole = yaml.safe_dump({"rosbag2_bagfile_information": self._metadata()}, sort_keys=False)
+        whole = yaml.safe_dump({INFORMATION: self._metadata()}, sort_keys=False)
         write_whole(self.folder / METADATA_FILE, whole.encode())
 
     def __enter__(self) -> BagWriter:
@@ -182,58 +167,3 @@ class BagWriter:
 
 def _copy(profile: Mapping[str, Any]) -> dict[str, Any]:
     return {key: dict(value) if isinstance(value, Mapping) else value for key, value in profile.items()}
-
-
-class BagReader:
-    """Reads a recording: a folder, or one MCAP file."""
-
-    def __init__(self, path: Path) -> None:
-        """
-        Raises:
-            BagError: no MCAP file there, or none that can be read.
-        """
-        files = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
-        if len(files) != 1 or not files[0].is_file():
-            raise BagError(f"{path}: {len(files) if path.is_dir() else 'no'} MCAP files; must be one")
-        self.file = files[0]
-        try:
-            with self.file.open("rb") as stream:
-                reader = make_reader(stream)
-                self.profile = reader.get_header().profile
-                summary = reader.get_summary()
-                self._metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-        except (McapError, OSError, UnicodeDecodeError) as error:
-            raise BagError(f"{self.file}: cannot be read: {error}") from error
-        if summary is None or summary.statistics is None:
-            raise BagError(f"{self.file}: has no summary: the recording was not finished")
-        self.messages = summary.statistics.message_count
-        self.duration_s = 1e-9 * (summary.statistics.message_end_time - summary.statistics.message_start_time)
-        self.topics: dict[str, Topic] = {}
-        self.counts: dict[str, int] = {}
-        self._by_channel: dict[int, Topic] = {}
-        for number, channel in summary.channels.items():
-            qos = yaml.safe_load(channel.metadata.get(QOS_KEY, "")) or []
-            topic = Topic(
-                channel.topic, summary.schemas[channel.schema_id].name, qos, channel.metadata.get(HASH_KEY, "")
-            )
-            self.topics[topic.name] = self._by_channel[number] = topic
-            self.counts[topic.name] = summary.statistics.channel_message_counts.get(number, 0)
-
-    @property
-    def parameters(self) -> dict[str, dict[str, Any]]:
-        """Parameters of the nodes when the recording began, by node name; empty when it has none."""
-        return {node: json.loads(text) for node, text in self._metadata.get(PARAMETERS_RECORD, {}).items()}
-
-    def read(self, names: Sequence[str] | None = None) -> Iterator[Message]:
-        """Messages in the order received; `names` = only of these topics.
-
-        Raises:
-            BagError: the file is damaged.
-        """
-        try:
-            with self.file.open("rb") as stream:
-                for _schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages(names):
-                    topic = self._by_channel[channel.id]
-                    yield Message(topic, message.data, message.log_time, message.publish_time)
-        except (McapError, OSError) as error:
-            raise BagError(f"{self.file}: cannot be read: {error}") from error

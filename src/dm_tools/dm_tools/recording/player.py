@@ -10,7 +10,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from dm_tools.recording.bag import BagReader, Topic
+from dm_tools.recording.bag import Topic
+from dm_tools.recording.bag_reader import BagReader
 from dm_tools.recording.interfaces import message_class
 
 #: Topics that would move a real mirror; published only when asked for.

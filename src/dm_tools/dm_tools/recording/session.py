@@ -23,7 +23,7 @@ from dm_common.measurement import Measurement
 from dm_common.messages import measurement_from, mirror_from, stamp_ns
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints
-from dm_tools.recording.bag import BagReader, Message
+from dm_tools.recording.bag_reader import BagReader, Message
 from dm_tools.recording.interfaces import message_class
 
 #: Topics that a calibration is made again from; the last part of their names.
@@ -97,7 +97,8 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
     missing = [name for name in TOPICS if prefix + name not in bag.topics]
     if missing:
-        raise RecordingError(f"{bag.file}: no topic {', '.join(prefix + name for name in missing)}: record them all")
+        text = f"{bag.file}: no topic {', '.join(prefix + name for name in missing)}: record them all"
+        raise RecordingError(text + " (`ros2 bag record` with --include-hidden-topics)" * (FEEDBACK in missing))
     received: dict[str, list[tuple[int, Any]]] = {name: [] for name in TOPICS}
     for message in bag.read([prefix + name for name in TOPICS]):
         received[message.topic.name.removeprefix(prefix)].append((message.log_time, _decode(message)))

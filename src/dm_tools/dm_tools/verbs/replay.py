@@ -25,16 +25,20 @@ def replay(
     store: Annotated[
         Path | None, typer.Option(help="With --recalibrate: folder to store the calibration made again in.")
     ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="With --recalibrate: parameter file of the nodes, for a recording that does not hold them."),
+    ] = None,
     namespace: NamespaceOption = "",
     json: JsonOption = None,
 ) -> None:
     """Publish a recording's topics with their own timing, or make its calibration again, to the last bit."""
-    from dm_tools.recording.bag import BagReader
+    from dm_tools.recording.bag_reader import BagReader
     from dm_tools.recording.player import play, replayed
 
     bag = BagReader(recording)
     if recalibrate:
-        write_json(json, _again(bag, run, namespace, store))
+        write_json(json, _again(bag, run, namespace, store, config))
         return
     names = replayed(list(bag.topics), [name.strip() for name in topics.split(",") if name.strip()], commands)
     console.print(f"{bag.messages} messages of {bag.duration_s:.1f} s; publishing {', '.join(sorted(names))}")
@@ -45,12 +49,15 @@ def replay(
     write_json(json, {"recording": str(bag.file), "messages": count, "topics": sorted(names)})
 
 
-def _again(bag: Any, run: int, namespace: str, store: Path | None) -> dict[str, Any]:
+def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path | None) -> dict[str, Any]:
     """Make the calibration again; returns its figures."""
+    from dm_bringup.suite import load_config
     from dm_calibration.store.calibration_store import CalibrationStore
     from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate
 
     session = read_session(bag, run, namespace)
+    if config is not None:
+        session.parameters.update(load_config(config).get("calibration", {}))
     now, mirror = time.time_ns(), session.run.mirror
     folder = CalibrationStore(store if store is not None else Path("runs/replayed"))
     calibration = recalibrate(session, folder.new_id(mirror.name, mirror.serial, now), now)
