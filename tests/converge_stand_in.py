@@ -42,7 +42,7 @@ class Host(Node, LoopHost):
         return FocusTarget(wanted.curvature, wanted.conic_constant, tuple(wanted.zernike))
 
     def active_calibration(self) -> ActiveCalibration:
-        return active_calibration(self.calibration, mirror_info(), 0.01)
+        return active_calibration(self.calibration, mirror_info())
 
     def hysteresis(self) -> HysteresisState | None:
         return None

@@ -230,7 +230,7 @@ def test_a_focus_stack_gives_a_sharp_image_and_its_distances(
             assert np.isfinite(seen).mean() > 0.9
             assert np.nanmedian(seen) == pytest.approx(distance, rel=0.02)
         assert (result.distance_near, result.distance_far) == (pytest.approx(7, rel=0.05), pytest.approx(20, rel=0.05))
-        assert result.images == len(set(item.curvature for item in scene.requests)) - 1, "one image at each focus"
+        assert result.images == len({item.curvature for item in scene.requests}) - 1, "one image at each focus"
         assert scene.requests[-1].curvature == 0.004, "back where it was"
         wait_until(lambda: infos, what="camera_info")
         assert (infos[-1].header.stamp, infos[-1].header.frame_id) == (result.stamp, "camera")

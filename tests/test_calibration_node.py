@@ -18,13 +18,18 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import FitInfluenceFunction, ListCalibrations, LoadCalibration
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.parameter import Parameter
 
 from calibration_stand_in import StandIn, doubles
+from dm_calibration.calibration_node import CalibrationNode
+from dm_calibration.calibrator import Provenance, calibrate
+from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import ErrorCode
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, hexagon, make_mirror
+from recorded_bench import recorded
 from support import NodeProcess, Observer, wait_until
 
 RINGS = 2
@@ -238,7 +243,7 @@ def test_failures_are_told_and_leave_things_as_they_were(
 
     run(pokes(poke_amplitude=float("nan")), ErrorCode.NOT_FINITE, "poke_amplitude = nan: must be float, 0.01 to 1")
     run(pokes(settle_time=-1.0), ErrorCode.OUT_OF_RANGE, "settle_time = -1.0")
-    run(Calibrate.Goal(plan=9), ErrorCode.OUT_OF_RANGE, "plan = 9: must be 0 (FULL), 1 (POKES)")
+    run(Calibrate.Goal(plan="all"), ErrorCode.UNKNOWN_NAME, "plan = 'all': must be one of empty, full, pokes")
     unknown = Calibrate.Goal(plan=Calibrate.Goal.PLAN_SURFACES, surfaces=["p60"])
     run(unknown, ErrorCode.UNKNOWN_NAME, "surface 'p60' is unknown; did you mean")
     all_pokes = {f"poke{mark}{k:02d}" for mark in "+-" for k in range(1, 20)}
@@ -308,3 +313,33 @@ def test_ended_in_the_middle_the_mirror_still_goes_back(
     assert process.stop(number) == 0
     assert (bench.signals == 0.0).all(), process.output
     assert "Traceback" not in process.output, process.output
+
+
+def test_another_folder_or_name_takes_effect_with_the_next_activation(observer: Observer, tmp_path: Path) -> None:
+    run, outcome = recorded(PlanKind.POKES, PlanOptions())
+    folders = {"first": ("a", "b"), "other": ("c",)}
+    for name, identifiers in folders.items():
+        for created, identifier in enumerate(identifiers):
+            made = calibrate(outcome, mirror=run.mirror, provenance=Provenance(identifier, created + 1))
+            CalibrationStore(tmp_path / name).save(made)
+    node = CalibrationNode()
+    manager = node._manager
+
+    def activate(in_use: str, **changes: str) -> None:
+        if node.active:
+            node.trigger_deactivate()
+        results = node.set_parameters([Parameter(name, value=value) for name, value in changes.items()])
+        assert all(result.successful for result in results)
+        node.trigger_activate()
+        wait_until(lambda: manager.in_use is not None and manager.in_use.id == in_use)
+
+    manager.set_mirror(run.mirror)
+    node.trigger_configure()
+    activate("b", calibration_folder=str(tmp_path / "first"), load_on_start="newest")
+    activate("a", load_on_start="a")
+    activate("a")  # nothing changed: what is in use stays
+    activate("c", calibration_folder=str(tmp_path / "other"), load_on_start="newest")
+    activate("c", load_on_start="")
+    node.trigger_shutdown()
+    assert manager.in_use is None
+    node.destroy_node()

@@ -28,6 +28,7 @@ from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
+from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
 from dm_tools.verbs.up import end, only_suite
@@ -47,6 +48,14 @@ def parsed(verb: str, *words: str) -> dict[str, Any]:
     group: Any = typer.main.get_command(cli.app)
     params: dict[str, Any] = group.commands[verb].make_context(verb, list(words)).params
     return params
+
+
+def test_a_console_without_nicegui_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For which rosdep has no key."""
+    monkeypatch.delitem(sys.modules, "dm_tools.console.page", raising=False)
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    with pytest.raises(RuntimeError, match="pip install nicegui"):
+        console()
 
 
 @pytest.mark.parametrize("words", [("-0.02",), ("-0.02", "--dry-run"), ("--conic", "-1", "-2e-2"), ("--", "-.02")])

@@ -64,6 +64,7 @@ def test_it_converges_and_tells_its_steps(observer: Observer, host: Host, bench:
     assert np.abs(true[3:]).max() == pytest.approx(result.max_zernike, rel=1e-6)
     assert [step.step for step in feedback] == list(range(1, result.maps + 1))
     assert feedback[0].max_zernike > feedback[-1].max_zernike
+    assert {step.curvature for step in feedback} == {0.02}
 
 
 def test_the_map_limit_ends_it_with_the_best_command(observer: Observer, host: Host, bench: StandIn) -> None:

@@ -85,7 +85,7 @@ def test_dry_run_and_refusals_move_nothing(bench: Bench) -> None:
     assert two_terms.error_code == ErrorCode.INVALID_LENGTH
     recipe = bench.set_focus(curvature=0.0, mode=FocusRequest.MODE_CONDITIONED)
     assert recipe.error_code == ErrorCode.NOT_SUPPORTED
-    assert bench.set_focus(curvature=0.0, mode=77).error_code == ErrorCode.OUT_OF_RANGE
+    assert bench.set_focus(curvature=0.0, mode="77").error_code == ErrorCode.UNKNOWN_NAME
     old = FocusRequest(curvature=0.01)
     old.header.stamp = Time(seconds=1000).to_msg()
     stale = bench.observer.call(SetFocus, "set_focus", SetFocus.Request(request=old))

@@ -316,7 +316,7 @@ def broken(**fields: Any) -> Any:
 )
 def test_a_hysteresis_that_makes_no_sense_is_refused(message: Any, field: str) -> None:
     with pytest.raises(Refusal) as refused:
-        active_calibration(message, mirror_info(), 0.01)
+        active_calibration(message, mirror_info())
     assert refused.value.error_code == ErrorCode.CALIBRATION_UNREADABLE
     assert field in str(refused.value)
 

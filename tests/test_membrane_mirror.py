@@ -135,7 +135,7 @@ def calibration(chain: Chain) -> Calibration:
 
 @pytest.fixture(scope="module")
 def active(chain: Chain, calibration: Calibration) -> ActiveCalibration:
-    return active_calibration(calibration_message(calibration, None, "mirror", WAVELENGTH / 20), chain.info, 0.02)
+    return active_calibration(calibration_message(calibration, None, "mirror", WAVELENGTH / 20), chain.info)
 
 
 def test_equal_signals_are_equal_pulls(chain: Chain) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib.metadata
 import os
 import re
 import runpy
@@ -107,6 +108,61 @@ def test_packages_declare_what_they_import(package: str) -> None:
         used |= {name.split(".")[0] for name in imported(path)}
     used -= {package, *WITHOUT_KEY, *sys.stdlib_module_names}
     assert {KEYS.get(name, name) for name in used} <= declared
+
+
+def test_package_files_are_valid_and_agree_on_version_and_contact() -> None:
+    """As the build farm reads them; `setup.py` takes both from there."""
+    package = pytest.importorskip("catkin_pkg.package")
+    warnings: list[str] = []
+    known = [package.parse_package(str(path), warnings=warnings) for path in SOURCE.glob("*/package.xml")]
+    assert len(known) == 10 and not warnings
+    people = {(each.version, who.name, who.email) for each in known for who in (*each.maintainers, *each.authors)}
+    assert len(people) == 1 and {tuple(each.licenses) for each in known} == {("Apache-2.0",)}
+    for path in SOURCE.glob("*/setup.py"):
+        assert "@" not in path.read_text() and "version=package" in path.read_text(), path
+    (distribution,) = importlib.metadata.distributions(name="dm_driver", path=[str(ROOT / "build" / "dm_driver")])
+    assert distribution.metadata["Maintainer-email"] == known[0].maintainers[0].email
+
+
+#: What messages of others hold.
+STANDARD = {
+    "std_msgs/Header": ["stamp", "sec", "nanosec", "frame_id"],
+    "builtin_interfaces/Time": ["sec", "nanosec"],
+}
+
+
+def expanded(name: str, nested: bool = False) -> list[str]:
+    """An interface as `ros2 interface show` shows it: nested messages in place of their names, without comments."""
+    lines = []
+    for line in (SOURCE / "dm_msgs" / name).read_text().splitlines():
+        if nested and not line.partition("#")[0]:
+            continue
+        lines.append(line.partition("#")[0] if nested else line)
+        kind = line.partition(" ")[0].partition("[")[0]
+        lines += STANDARD.get(kind, [])
+        if (SOURCE / "dm_msgs" / "msg" / f"{kind}.msg").is_file():
+            lines += ["\t" + each for each in expanded(f"msg/{kind}.msg", True)]
+    return lines
+
+
+#: What nobody types: a calibration, which is published with all its tables.
+LONG = {"Calibration.msg"}
+
+
+@pytest.mark.parametrize(
+    "path", sorted((SOURCE / "dm_msgs").glob("*/*.[msa]*")), ids=lambda path: path.relative_to(SOURCE).as_posix()
+)
+def test_an_interface_is_shown_on_one_screen(path: Path) -> None:
+    lines = expanded(path.relative_to(SOURCE / "dm_msgs").as_posix())
+    assert len(lines) <= 66 or path.name in LONG, len(lines)
+    assert max(map(len, lines)) <= 150
+
+
+def test_requests_ask_for_names_where_there_are_some() -> None:
+    """Numbers stand for names in what is published only, where a person need not type them."""
+    for path in [*(SOURCE / "dm_msgs").glob("srv/*"), *(SOURCE / "dm_msgs").glob("action/*")]:
+        request = "\n".join(expanded(path.relative_to(SOURCE / "dm_msgs").as_posix())).partition("\n---")[0]
+        assert "uint8" not in request, path.name
 
 
 @pytest.mark.parametrize("name", ["bench.yaml", "hardware.yaml", "mirror_19.yaml", "membrane_37.yaml"])

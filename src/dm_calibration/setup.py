@@ -1,10 +1,14 @@
+from pathlib import Path
+from xml.etree import ElementTree
+
 from setuptools import find_packages, setup
 
-package_name = "dm_calibration"
+package = ElementTree.parse(Path(__file__).parent / "package.xml")
+package_name = package.findtext("name")
 
 setup(
     name=package_name,
-    version="0.1.0",
+    version=package.findtext("version"),
     packages=find_packages(exclude=["test"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
@@ -13,10 +17,10 @@ setup(
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},  # tells `colcon test` to use pytest
     zip_safe=True,
-    maintainer="Deformable mirror maintainers",
-    maintainer_email="maintainers@deformable-mirror.example",
-    description="Interferometer maps in, calibrations of a deformable mirror out",
-    license="Apache-2.0",
+    maintainer=package.findtext("maintainer"),
+    maintainer_email=package.find("maintainer").get("email"),
+    description=package.findtext("description"),
+    license=package.findtext("license"),
     entry_points={
         "console_scripts": [
             "interferometer = dm_calibration.interferometer_node:main",

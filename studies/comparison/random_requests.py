@@ -10,7 +10,6 @@ from dm_msgs.msg import Calibration, MirrorInfo
 
 from dm_common.errors import Refusal
 from dm_common.messages import doubles
-from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.recipes import RecipeError
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
@@ -77,7 +76,7 @@ def active_of(bench: SimulatedBench, calibration: Calibration) -> ActiveCalibrat
         neighbour_difference_max=limits.neighbour_difference,
         slew_rate_max=bench.slew_rate,
     )
-    return active_calibration(calibration, info, APERTURE_TOLERANCE)
+    return active_calibration(calibration, info)
 
 
 def draw_targets(active: ActiveCalibration, count: int, rng: np.random.Generator) -> list[FocusTarget]:

@@ -40,7 +40,8 @@ int main(int argc, char ** argv)
   }
   auto ended = client->async_get_result(accepted.get());
   if (rclcpp::spin_until_future_complete(node, ended, std::chrono::seconds(60)) != rclcpp::FutureReturnCode::SUCCESS) {
-    RCLCPP_ERROR(node->get_logger(), "the move did not end within 60 s");
+    RCLCPP_ERROR(node->get_logger(), "the move did not end within 60 s: it is cancelled");
+    rclcpp::spin_until_future_complete(node, client->async_cancel_goal(accepted.get()), std::chrono::seconds(5));
     return EXIT_FAILURE;
   }
   const auto result = ended.get().result;

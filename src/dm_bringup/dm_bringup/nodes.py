@@ -156,7 +156,7 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
         given.pop("autostart", None)
     if given.get("autostart") == BY_EVENTS:
         given["autostart"] = "false"
-    switches = {name: flag(name, text) for name, text in given.items()}
+    switches = {name: flag(name, text, BY_EVENTS if name == "autostart" else "") for name, text in given.items()}
     if switches:
         parameters.append(switches)
     return {
@@ -206,8 +206,8 @@ def remapping(rule: str) -> tuple[str, str]:
     return old, new
 
 
-def flag(name: str, text: str) -> bool:
-    """Raises ValueError for what is neither true nor false."""
+def flag(name: str, text: str, other: str = "") -> bool:
+    """Raises ValueError for what is neither true nor false; the sentence names the `other` value there may be."""
     if text.lower() not in ("true", "false"):
-        raise ValueError(f"{name} = {text!r}: must be true or false")
+        raise ValueError(f"{name} = {text!r}: must be true{f', {other}' if other else ''} or false")
     return text.lower() == "true"

@@ -44,20 +44,31 @@ def start_nodes(context):
 
 
 def brought_up(action):
-    """Configure a node when its process has started, and activate it when it is inactive."""
+    """Configure a node when its process has started, and activate it when that is done.
+
+    Where somebody else configures it later, activating it is left to them.
+    """
+    asked = set()
 
     def change(transition):
         return [EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(action), transition_id=transition))]
 
+    def begin(_context):
+        asked.add(action)
+        return change(Transition.TRANSITION_CONFIGURE)
+
+    def go_on(_context):
+        ours = bool(asked)
+        asked.clear()
+        return change(Transition.TRANSITION_ACTIVATE) if ours else []
+
     # A request that leaves before both sides have discovered each other is lost, and so is one to a process that died.
-    begin = TimerAction(period=DISCOVERY_S, actions=change(Transition.TRANSITION_CONFIGURE))
+    start = TimerAction(period=DISCOVERY_S, actions=[OpaqueFunction(function=begin)])
     configured = {"start_state": "configuring", "goal_state": "inactive"}
     return [
-        RegisterEventHandler(OnProcessStart(target_action=action, on_start=[begin])),
+        RegisterEventHandler(OnProcessStart(target_action=action, on_start=[start])),
         RegisterEventHandler(
-            OnStateTransition(
-                target_lifecycle_node=action, entities=change(Transition.TRANSITION_ACTIVATE), **configured
-            )
+            OnStateTransition(target_lifecycle_node=action, entities=[OpaqueFunction(function=go_on)], **configured)
         ),
     ]
 

@@ -30,6 +30,13 @@ class _Recorded:
         return context[self.arguments[0]]
 
 
+def _brought_up(start: _Recorded, transition: _Recorded) -> tuple[Any, Any]:
+    """What the handlers of a node's start and of its configuration call."""
+    (timer,) = start.arguments[0].keywords["on_start"]
+    asked, configured = timer.keywords["actions"][0], transition.arguments[0].keywords["entities"][0]
+    return asked.keywords["function"], configured.keywords["function"]
+
+
 class _Managed(_Recorded):
     """A lifecycle node."""
 
@@ -41,12 +48,14 @@ class _Managed(_Recorded):
 def test_launch_files_start_what_up_starts(
     config: str, nodes: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stand_ins = dict.fromkeys(("LaunchConfiguration", "OpaqueFunction", "GroupAction"), _Recorded)
+    names = ("LaunchConfiguration", "OpaqueFunction", "GroupAction", "TimerAction", "RegisterEventHandler")
+    stand_ins = dict.fromkeys((*names, "OnProcessStart"), _Recorded)
+    of_nodes = {"Node": _Recorded, "LifecycleNode": _Managed, "OnStateTransition": _Recorded}
     parts = ("actions", "event_handlers", "events", "substitutions", "launch_description_sources")
     for name in ("launch", *(f"launch.{part}" for part in parts)):
         monkeypatch.setitem(sys.modules, name, MagicMock(**stand_ins))
     for name in ("", ".actions", ".event_handlers", ".events", ".events.lifecycle"):
-        monkeypatch.setitem(sys.modules, f"launch_ros{name}", MagicMock(Node=_Recorded, LifecycleNode=_Managed))
+        monkeypatch.setitem(sys.modules, f"launch_ros{name}", MagicMock(**of_nodes))
     monkeypatch.setattr(sys.modules["launch"], "LaunchDescription", _Recorded)
     folder = SHARE / "config"
     path = folder / config
@@ -69,6 +78,9 @@ def test_launch_files_start_what_up_starts(
     driven = start_nodes(DEFAULTS | {"config": str(path), "autostart": "events"})
     assert [isinstance(action, _Managed) for action in driven[-3:]] == [False, False, True]
     assert driven[-1].keywords["parameters"][1] == {"autostart": False} and len(driven) == len(nodes) + 2 * len(managed)
+    asks, goes_on = _brought_up(*driven[-3:-1])
+    assert goes_on(None) == []  # somebody else configured it: activating it is theirs
+    assert asks(None) and goes_on(None) and goes_on(None) == []
     with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
         start_nodes(DEFAULTS | {"config": str(tmp_path / "none.yaml")})
 
@@ -103,6 +115,7 @@ def test_what_a_fleet_sets_reaches_every_node() -> None:
         assert action["arguments"][-1] == "debug"
         assert (action["respawn"], action["respawn_delay"]) == (True, 2.0)
     assert arguments_of(NODES[0], DEFAULTS | {"config": "c.yaml"})["parameters"] == ["c.yaml"]
-    for name, value in (("respawn", "perhaps"), ("remap", "image_raw")):
-        with pytest.raises(ValueError, match=f"{name}.*must be"):
-            arguments_of(NODES[0], DEFAULTS | {name: value})
+    wrong = {"respawn": "must be true or false", "autostart": "must be true, events or false", "remap": "must be of"}
+    for name, text in wrong.items():
+        with pytest.raises(ValueError, match=f"{name}.*{text}"):
+            arguments_of(NODES[1], DEFAULTS | {name: "perhaps"})

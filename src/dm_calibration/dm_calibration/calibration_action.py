@@ -150,7 +150,7 @@ class CalibrateAction:
             hysteresis_maps=goal.hysteresis_maps or (LAST_PART_ENDS if goal.until else self._values["hysteresis_maps"]),
             until=goal.until,
         )
-        return make_plan(PlanKind(goal.plan), mirror, options), options
+        return make_plan(PlanKind(goal.plan or PlanKind.FULL), mirror, options), options
 
     def _forecast(self, goal: Calibrate.Goal, plan: Plan, mirror: Mirror, result: Calibrate.Result) -> None:
         """Fill in what is to be expected; the message of a dry run."""

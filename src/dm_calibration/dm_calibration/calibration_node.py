@@ -44,13 +44,14 @@ from dm_common.ros.worker import WorkerActionServer, WorkerService
 class CalibrationNode(ManagedNode):
     """Topics, services and the action of the calibration; what they do is in CalibrationManager and CalibrateAction.
 
-    While it is inactive it takes no maps, and the calibration in use stays; a cleanup withdraws that.
+    While it is inactive it takes no maps, and the calibration in use stays; a cleanup, or another folder, withdraws it.
     """
 
     def __init__(self) -> None:
         super().__init__("calibration", PARAMETERS, hardware_id="calibration")
         self._frame_id = ""
         self._start_pending = False
+        self._loaded_by = ""  # what `load_on_start` was when it was carried out last
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.with_lease(qos.LATCHED))
         self._reports = ReportWriter(self._log_report)
@@ -81,13 +82,17 @@ class CalibrationNode(ManagedNode):
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
 
     def configure(self) -> None:
-        self._manager.store.folder = Path(self._values["calibration_folder"]).expanduser()
+        folder = Path(self._values["calibration_folder"]).expanduser()
+        if folder != self._manager.store.folder:
+            self.clean_up()  # what is in use is not in the new folder
+            self._manager.store.folder = folder
 
     def activate(self) -> None:
-        if self._manager.in_use is not None:
+        wanted, in_use = self._values["load_on_start"], self._manager.in_use is not None
+        if in_use and wanted == self._loaded_by:
             return
-        self._start_pending = bool(self._values["load_on_start"])
-        if not self._start_pending:  # else nobody shall take for uncalibrated what is about to be loaded
+        self._loaded_by, self._start_pending = wanted, bool(wanted)
+        if not (self._start_pending or in_use):  # else nobody shall take for uncalibrated what is about to be loaded
             self._publish(None, None)
         self._load_pending()
 
@@ -116,6 +121,7 @@ class CalibrationNode(ManagedNode):
     def _publish(self, calibration: Calibration | None, file: Path | None) -> None:
         error_max = self._values["calibrated_error_max"]
         message = calibration_message(calibration, file, self._frame_id, error_max)
+        message.aperture_tolerance = float(self._values["aperture_tolerance"])
         self._listener.begin(calibration)
         self._listener.amend(message)
         self._publisher.publish(message)

@@ -11,7 +11,8 @@ from dm_calibration.procedure.bump_check import BumpOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift_filter import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
-from dm_common.ros.parameters import APERTURE_PARAMETER, AUTOSTART, Parameter, real, switch, text, whole
+from dm_common.mirror import APERTURE_TOLERANCE
+from dm_common.ros.parameters import AUTOSTART, Parameter, real, switch, text, whole
 
 PARAMETERS = (
     AUTOSTART,
@@ -76,7 +77,12 @@ PARAMETERS = (
         "explains; 0 = not checked.",
         live=True,
     ),
-    APERTURE_PARAMETER,
+    Parameter(
+        "aperture_tolerance",
+        real(APERTURE_TOLERANCE, 1e-6, 0.5),
+        "Largest relative difference between the aperture radius of maps or calibrations and the mirror's.",
+        live=True,
+    ),
     Parameter("folds", whole(10, 2, 1000), "Folds of the cross-validation.", live=True),
     Parameter(
         "epsilon",

@@ -206,7 +206,7 @@ def acquisition_settings(values: Mapping[str, Any]) -> AcquisitionSettings:
         folder=watched,
         patterns=values["file_pattern"],
         stable_time=values["stable_time"],
-        trigger_command=[argument for argument in values["trigger_command"]],
+        trigger_command=list(values["trigger_command"]),
         trigger_suffix=values["trigger_output_suffix"],
         trigger_timeout=values["trigger_timeout"],
     )

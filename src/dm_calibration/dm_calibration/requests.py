@@ -15,7 +15,7 @@ _METHOD = {"method": text("", choices=("", *METHODS))}
 
 CALIBRATE = Fields(
     {
-        "plan": whole(0, choices={int(kind): kind.name for kind in PlanKind}),
+        "plan": text("", choices=("", *PlanKind)),
         "surfaces": texts([], sizes=range(1001)),
         "poke_amplitude": real(0.0, 0.01, 1.0, zero=_CONFIGURED),
         "reference_every": whole(0, 1, 1000, zero=_CONFIGURED),

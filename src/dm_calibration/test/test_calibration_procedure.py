@@ -67,7 +67,7 @@ def test_a_state_without_a_map_is_dropped_and_reported(bench: LinearBench, mirro
 
 
 def test_several_states_without_a_map_end_the_run(bench: LinearBench, mirror: Mirror) -> None:
-    bench.failing = {label: 99 for label in ("poke+02", "poke-02", "poke+03")}
+    bench.failing = dict.fromkeys(("poke+02", "poke-02", "poke+03"), 99)
     with pytest.raises(Refusal, match="3 states in a row gave no map; the last: no map within 5 s") as caught:
         run(bench, mirror)
     assert caught.value.error_code == 302
@@ -75,7 +75,7 @@ def test_several_states_without_a_map_end_the_run(bench: LinearBench, mirror: Mi
 
 
 def test_failures_that_are_not_in_a_row_do_not_end_it(bench: LinearBench, mirror: Mirror) -> None:
-    bench.failing = {label: 99 for label in ("poke+01", "poke-02", "poke+04", "poke-05")}
+    bench.failing = dict.fromkeys(("poke+01", "poke-02", "poke+04", "poke-05"), 99)
     assert len(run(bench, mirror).outcome.dropped) == 4
 
 

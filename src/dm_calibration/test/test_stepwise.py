@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.regression.stepwise import FREEDOM_MIN, SelectionOptions, leave_one_out, stepwise
+from dm_common.errors import ErrorCode, Refusal
 
 NAMES = [f"x{k}" for k in range(58)]
 
@@ -23,6 +25,15 @@ def sm() -> Any:
 
 def candidates(seed: int, n: int = 50, count: int = 58) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((n, count))
+
+
+def test_without_statsmodels_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For which rosdep has no key."""
+    monkeypatch.setitem(sys.modules, "statsmodels.api", None)
+    x = candidates(1)
+    with pytest.raises(Refusal, match="apt-get install python3-statsmodels") as refused:
+        stepwise(x, x[:, 3] + candidates(2)[:, 0], NAMES)
+    assert refused.value.error_code == ErrorCode.NOT_SUPPORTED
 
 
 def test_finds_the_variables_that_matter_and_agrees_with_statsmodels(sm: Any) -> None:

@@ -29,7 +29,7 @@ from dm_msgs.srv import (
 )
 from sensor_msgs.msg import Image
 
-from dm_client.connection import WATCHED, Connection, DeformableMirrorError, Watched
+from dm_client.connection import RESTING, WATCHED, Connection, DeformableMirrorError, Watched
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 
@@ -118,7 +118,7 @@ class DeformableMirrorClient(Connection):
             if state is None or state.driver_state != ActuatorState.STATE_ACTIVE:
                 reason = (state.message or "it is not active") if state else "it is not heard: are the nodes running?"
                 return ErrorCode.DRIVER_INACTIVE, f"pdm_driver does not accept commands: {reason}"
-            return (able.error_code, able.message) if able and able.error_code == ErrorCode.NODE_INACTIVE else (0, "")
+            return (able.error_code, able.message) if able and able.error_code in RESTING else (0, "")
 
         if not self.wait(lambda: not refusal()[0], timeout_s) and (refused := refusal())[0]:
             raise DeformableMirrorError(*refused)

@@ -42,6 +42,13 @@ UNAVAILABLE = {
     "pdm_driver": ErrorCode.DRIVER_UNAVAILABLE,
     "interferometer": ErrorCode.INTERFEROMETER_UNAVAILABLE,
 }
+#: What `capabilities` say of a controller or driver that takes no requests, be it that they have not heard better yet.
+RESTING = (
+    ErrorCode.NODE_INACTIVE,
+    ErrorCode.DRIVER_INACTIVE,
+    ErrorCode.DRIVER_UNAVAILABLE,
+    ErrorCode.ELECTRONICS_UNREACHABLE,
+)
 #: Two connections of one process need two names.
 _NUMBERS = itertools.count(1)
 

@@ -28,7 +28,7 @@ class Value:
         default: the value when none is given.
         low, high: allowed range of numbers (of each element for arrays), inclusive.
         unit: SI unit, "" when it has none.
-        choices: allowed strings; of numbers, the names of those allowed.
+        choices: allowed strings.
         zero: what 0 stands for, be it outside the range; "" = nothing in particular.
         infinite: whether infinity is a value like others; NaN never is.
         sizes: numbers of elements that an array may have.
@@ -39,7 +39,7 @@ class Value:
     low: float = -math.inf
     high: float = math.inf
     unit: str = ""
-    choices: tuple[str, ...] | Mapping[int, str] = ()
+    choices: tuple[str, ...] = ()
     zero: str = ""
     infinite: bool = False
     sizes: Sequence[int] = range(100_001)
@@ -56,8 +56,6 @@ class Value:
 
     def allowed(self) -> str:
         """The allowed values as text, the type first."""
-        if isinstance(self.choices, Mapping):
-            return ", ".join(f"{number} ({name})" for number, name in self.choices.items())
         if self.choices:
             return "one of " + ", ".join(choice or "empty" for choice in self.choices)
         kind = self.item.__name__ + ("[]" if self.many else "")
@@ -70,8 +68,8 @@ class Value:
         """Raise unless `given` may be the value of `name`; the sentence names both, and what is allowed.
 
         Raises:
-            Refusal: NOT_FINITE, OUT_OF_RANGE (numbers and their choices), INVALID_LENGTH (arrays and texts),
-                UNKNOWN_NAME (choices of texts).
+            Refusal: NOT_FINITE, OUT_OF_RANGE (numbers), INVALID_LENGTH (arrays and texts),
+                UNKNOWN_NAME (choices).
         """
         if self.many:
             self._check_array(name, given)
@@ -95,12 +93,9 @@ class Value:
 
     def _check_numbers(self, name: str, given: NDArray[np.float64], subject: str) -> None:
         """`subject`: name and value as they were given; "" = of an array, the first that is wrong."""
-        if isinstance(self.choices, Mapping):
-            right = np.isin(given, list(self.choices))
-        else:
-            right = (given >= self.low) & (given <= self.high) & (self.infinite | ~np.isinf(given))
-            if self.zero:
-                right |= given == 0.0
+        right = (given >= self.low) & (given <= self.high) & (self.infinite | ~np.isinf(given))
+        if self.zero:
+            right |= given == 0.0
         if right.all():
             return
         # NaN and infinity are named before what is merely too large.

@@ -23,7 +23,7 @@ from waiting import wait_until
 TABLE = (
     AUTOSTART,
     Parameter("gain", real(2.0, 0.0, 10.0), "gain", live=True),
-    Parameter("count", whole(3, 0, 10), "count; 7 will not do with anything, 8 will not begin"),
+    Parameter("count", whole(3, 0, 10), "count; 7 will not do with anything, 8 and 9 will not begin"),
 )
 
 
@@ -49,6 +49,8 @@ class Example(ManagedNode):
         self.did.append(f"configure {self._values['count']}")
 
     def activate(self) -> None:
+        if self._values["count"] == 9:
+            raise KeyError("a defect of the node")
         if self._values["count"] == 8:
             raise ValueError("count = 8: will not begin")
         self.did.append("activate")
@@ -78,7 +80,7 @@ def served(observer: Observer) -> Iterator[Example]:
 
 
 def test_a_node_that_rests_refuses_and_ends_its_goals(served: Example, observer: Observer) -> None:
-    assert served.did == ["configure 3", "configure 3", "activate"] and served.level == OK
+    assert served.did == ["configure 3", "activate"] and served.level == OK
     client = ActionClient(observer.node, MoveFocus, "move_focus")
     wait_until(client.server_is_ready)
     accepted = client.send_goal_async(MoveFocus.Goal())
@@ -132,6 +134,17 @@ def test_parameters_change_while_it_rests_and_wrong_ones_keep_it_resting(observe
     assert node.did[-2:] == ["configure 4", "activate"]
     node.trigger_shutdown()
     assert node.did[-2:] == ["deactivate", "clean up"] and not node.configured
+    node.destroy_node()
+
+
+def test_a_node_that_fails_by_a_defect_says_so_until_it_goes(observer: Observer) -> None:
+    node = Example(context=observer.node.context, parameter_overrides=[RosParameter("count", value=9)])
+    node.autostart()
+    assert not node.active and not node.configured and node.level == ERROR
+    assert "a defect of the node" in node.inactive() and "configure`, then `activate" in node.inactive()
+    assert node.put("count", 4) == ""
+    node.autostart()
+    assert node.active and node.level == OK
     node.destroy_node()
 
 

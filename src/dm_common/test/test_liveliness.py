@@ -39,6 +39,20 @@ def test_a_node_that_comes_at_last_is_what_was_waited_for(watched: Watched) -> N
     assert gone() == "" and not watched.lost
 
 
+def test_a_dead_node_is_missing_within_two_seconds_and_a_stall_is_forgiven(
+    watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lease lapses at most LEASE_S after the node said last that it lives; those who wait look often."""
+    now = 100.0
+    monkeypatch.setattr(qos.time, "monotonic", lambda: now)
+    watched.change(1, 0)
+    now += qos.LEASE_S
+    watched.change(-1, 1)
+    assert watched.lost and not watched.missing()
+    now = 101.9
+    assert watched.missing()
+
+
 @pytest.mark.parametrize("lapsed_before", [False, True])
 def test_a_node_that_was_started_anew_within_its_lease_counts_as_gone(watched: Watched, lapsed_before: bool) -> None:
     watched.change(1, 0)

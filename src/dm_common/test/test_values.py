@@ -14,7 +14,7 @@ from dm_common.values import TEXT_MAX, Fields, real, reals, text, texts, whole, 
 
 FIELDS = Fields(
     {
-        "request.mode": whole(0, choices={0: "AUTO", 1: "DIRECT"}),
+        "request.mode": text("", choices=("", "auto", "direct")),
         "settle_time": real(0.0, 0.1, 600.0, "s", zero="as configured"),
         "distance": real(0.0, 0.0, math.inf, "m", infinite=True),
         "dioptre": real(0.0),
@@ -28,7 +28,7 @@ FIELDS = Fields(
 
 def message(**changed: Any) -> Any:
     values = {
-        "request": SimpleNamespace(mode=changed.pop("mode", 0)),
+        "request": SimpleNamespace(mode=changed.pop("mode", "")),
         "settle_time": 0.0,
         "distance": math.inf,
         "dioptre": -1e9,
@@ -48,7 +48,7 @@ def test_right_values_pass(changed: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("changed", "code", "sentence"),
     [
-        ({"mode": 7}, ErrorCode.OUT_OF_RANGE, "request.mode = 7: must be 0 (AUTO), 1 (DIRECT)"),
+        ({"mode": "7"}, ErrorCode.UNKNOWN_NAME, "request.mode = '7': must be one of empty, auto, direct"),
         (
             {"settle_time": -3.0},
             ErrorCode.OUT_OF_RANGE,
@@ -78,6 +78,6 @@ def test_wrong_values_are_named_with_what_is_allowed(changed: dict[str, Any], co
 
 
 def test_a_refused_message_holds_no_figures_that_look_like_values() -> None:
-    state = without_figures(FocusState(mode=2))
+    state = without_figures(FocusState(mode="direct"))
     assert math.isnan(state.predicted_rms) and math.isnan(state.curvature_min)
-    assert state.mode == 2 and state.header.stamp.sec == 0 and not state.signals
+    assert state.mode == "direct" and state.header.stamp.sec == 0 and not state.signals

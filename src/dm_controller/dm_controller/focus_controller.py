@@ -76,7 +76,7 @@ class FocusController:
         """Use a dm_msgs/Calibration if it belongs to the dm_msgs/MirrorInfo, None = not known; else refuse requests."""
         effects: list[Effect] = []
         before = self.active
-        settings = [self._values[name] for name in ("aperture_tolerance", "hold_tilt", "optical_axis")]
+        settings = [self._values[name] for name in ("hold_tilt", "optical_axis")]
         try:
             active = active_calibration(calibration, mirror, *settings)
             # A new revision leaves the shape that stands as it is: so it can be held on.

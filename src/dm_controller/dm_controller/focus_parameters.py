@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from dm_common.ros.parameters import APERTURE_PARAMETER, AUTOSTART, Parameter, real, switch, text, whole
+from dm_common.ros.parameters import AUTOSTART, Parameter, real, switch, text, whole
 from dm_common.values import Fields, reals
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S
@@ -123,7 +123,6 @@ PARAMETERS: Final = (
         "stands still where the vertex of the sphere stays on it; `./dm calibrate --boresight` finds it",
         live=True,
     ),
-    APERTURE_PARAMETER,
     *LOOP_PARAMETERS,
 )
 

@@ -87,7 +87,7 @@ def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) ->
 @pytest.mark.parametrize(
     ("code", "fields"),
     [
-        (ErrorCode.OUT_OF_RANGE, {"operation": 4}),
+        (ErrorCode.UNKNOWN_NAME, {"operation": "keep"}),
         (ErrorCode.INVALID_ARGUMENT, {"holder": " "}),
         (ErrorCode.NOT_FINITE, {"lease": float("nan")}),
         (ErrorCode.OUT_OF_RANGE, {"lease": -1.0}),

@@ -27,7 +27,8 @@ from dm_simulation.mirror.zernike import Array
 @dataclass(frozen=True)
 class FilesConfig:
     """Map files: where they go, "dat" or "datx", unit of .datx heights, intensity frame in .dat, seconds over which a
-    file grows (0: it appears whole), bytes of maps that are kept there (0: all), and the name of the part."""
+    file grows (0: it appears whole), bytes of maps that are kept there (0: all), and the name of the part.
+    """
 
     folder: Path = Path("maps")
     format: str = "datx"

@@ -166,7 +166,8 @@ def test_other_numbers_of_actuators() -> None:
 
 def test_design_numbers(plate: Plate) -> None:
     """Agreed: condition number 11.8 for Zernikes 2-21, coupling 0.46, up to 83 nm beyond 21 terms for one poke of full
-    stroke, fitting limit 3.0 / 7.7 / 16.5 nm rms at 20 / 22 / 24 mm. A 1 mm plate: 3.7 and 0.12."""
+    stroke, fitting limit 3.0 / 7.7 / 16.5 nm rms at 20 / 22 / 24 mm. A 1 mm plate: 3.7 and 0.12.
+    """
     terms = zernike.terms_to_order(5)
 
     def response(of: Plate, radius: float) -> tuple[Array, Array, Array, Array]:

@@ -32,14 +32,10 @@ def price(client: Any, axis: Any) -> dict[str, Any]:
     from dm_controller.planning.target import FocusTarget
 
     figures: dict[str, Any] = {}
-    aperture_tolerance, reachable_tolerance = (
-        get_parameter(client, "focus_controller", f"{name}_tolerance") for name in ("aperture", "reachable")
-    )
+    reachable_tolerance = get_parameter(client, "focus_controller", "reachable_tolerance")
     wanted = [client.capabilities.curvature_min, client.capabilities.curvature_max]
     for name, hold in (("held", True), ("free", False)):
-        active = active_calibration(
-            client.latest("calibration"), client.mirror_info, aperture_tolerance, hold, tuple(axis)
-        )
+        active = active_calibration(client.latest("calibration"), client.mirror_info, hold, tuple(axis))
         low, high = active.reachable_range(FocusTarget(0.0), reachable_tolerance)
         rms = max(active.mirror.plan(FocusTarget(curvature)).rms for curvature in wanted)
         figures[name] = {"curvature_min": low, "curvature_max": high, "residual_rms_nm": 1e9 * rms}

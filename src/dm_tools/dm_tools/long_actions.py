@@ -136,9 +136,11 @@ def calibration_step(feedback: Any) -> str:
 
 def converge_step(feedback: Any) -> str:
     """Feedback of the action `converge`: the map and how far off it was."""
+    if feedback.message or not feedback.step:
+        return feedback.message or "no map yet"
     return f"map {feedback.step}: largest coefficient {feedback.max_zernike * 1e9:.1f} nm"
 
 
 def recipe_step(feedback: Any) -> str:
     """Feedback of the action `build_recipes`: the curvature, the map and how far off it was."""
-    return f"{feedback.curvature:+.4f} 1/m, {converge_step(feedback)}"
+    return (f"{feedback.curvature:+.4f} 1/m, " if feedback.step else "") + converge_step(feedback)

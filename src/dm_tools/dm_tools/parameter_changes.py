@@ -24,7 +24,9 @@ def set_parameter(client: Any, node: str, name: str, value: Any) -> None:
     answer = _answer(client, node, lambda parameters: parameters.set_parameters([Parameter(name, value=value)]))
     if not all(each.successful for each in answer.results):
         reasons = "; ".join(each.reason for each in answer.results)
-        raise _error(f"the node `{node}` did not take {name}: {reasons}")
+        from dm_client import DeformableMirrorError
+
+        raise DeformableMirrorError(ErrorCode.INVALID_ARGUMENT, f"the node `{node}` did not take {name}: {reasons}")
 
 
 def get_parameter(client: Any, node: str, name: str) -> Any:
@@ -38,6 +40,8 @@ def get_parameter(client: Any, node: str, name: str) -> Any:
 def _answer(client: Any, node: str, ask: Any) -> Any:
     from rclpy.parameter_client import AsyncParameterClient
 
+    from dm_client import DeformableMirrorError
+    from dm_client.connection import UNAVAILABLE
     from dm_common.ros.clients import answers_arrive
 
     parameters = AsyncParameterClient(client.node, node)
@@ -45,13 +49,8 @@ def _answer(client: Any, node: str, ask: Any) -> Any:
         answer = ask(parameters)
         if client.wait(answer.done):
             return answer.result()
-    raise _error(f"the node `{node}` does not answer: is it running (./dm up)?")
-
-
-def _error(text: str) -> Exception:
-    from dm_client import DeformableMirrorError
-
-    return DeformableMirrorError(ErrorCode.INTERNAL, text)
+    code = UNAVAILABLE.get(node, ErrorCode.TIMEOUT)
+    raise DeformableMirrorError(code, f"the node `{node}` does not answer: is it running (./dm up)?")
 
 
 def source_of(target: Path, config: Path | None, serial: str) -> Path:

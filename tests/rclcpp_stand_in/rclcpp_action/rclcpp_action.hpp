@@ -6,6 +6,7 @@
 #include <memory>
 #include <string>
 
+#include "action_msgs/srv/cancel_goal.hpp"
 #include "rclcpp/rclcpp.hpp"
 
 namespace rclcpp_action
@@ -21,6 +22,8 @@ struct Client
   using GoalHandle = ClientGoalHandle<Action>;
   bool wait_for_action_server(std::chrono::seconds timeout);
   std::shared_future<std::shared_ptr<GoalHandle>> async_send_goal(const typename Action::Goal & goal);
+  std::shared_future<std::shared_ptr<action_msgs::srv::CancelGoal::Response>> async_cancel_goal(
+    std::shared_ptr<GoalHandle> handle);
   std::shared_future<typename GoalHandle::WrappedResult> async_get_result(std::shared_ptr<GoalHandle> handle);
 };
 template<typename Action>

@@ -183,7 +183,8 @@ def follow(
 
 def weights_of(features: Floats, left: Floats, gains: Floats, prior: Floats, between: Floats) -> Floats:
     """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md and the inverse prior covariance
-    `between` (N, N) over actuators times `prior` (F, F) over features."""
+    `between` (N, N) over actuators times `prior` (F, F) over features.
+    """
     count, actuators = features.shape[1:]
     flat = features.transpose(0, 2, 1).reshape(len(features), -1)
     normal = (flat.T @ flat).reshape(actuators, count, actuators, count)

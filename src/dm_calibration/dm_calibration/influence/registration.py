@@ -91,7 +91,8 @@ class _Similarity(NamedTuple):
 
 class _Match(NamedTuple):
     """A similarity, the place (A,) of each bump under it, their mean square distance (in square pitches), and which
-    (A,) lie at their places."""
+    (A,) lie at their places.
+    """
 
     similarity: _Similarity
     place: NDArray[np.int64]
@@ -168,7 +169,8 @@ def _matched(seen: Places, active: NDArray[np.int64], places: Places, step: floa
 
 def _over_each_other(seen: Places, places: Places, factor: complex, mirrored: bool) -> list[_Similarity]:
     """The similarities of this `factor` that put the centroids over each other, and, where actuators are missing so
-    that these are not the same, the innermost bump over the places in the middle."""
+    that these are not the same, the innermost bump over the places in the middle.
+    """
     images = _seen(_Similarity(factor, 0j, mirrored), places)
     shifts = [seen.mean() - images.mean()]
     if len(seen) < len(places):

@@ -44,8 +44,8 @@ _RINGS = {"p43": 1, "p44": 2, "p45": 3}
 _CENTRE = {f"p{46 + k}": round(-0.8 + 0.2 * k, 1) for k in range(9)}
 _ZERNIKES = {f"pz{k + 1:02d}": k for k in range(len(ZERNIKE_NAMES))}
 
-SIGNAL_NAMES = tuple([*_LEVELS, *_POKES, *_RINGS, *_CENTRE])
-MODEL_NAMES = tuple([*SPHERES, *_ZERNIKES])
+SIGNAL_NAMES = (*_LEVELS, *_POKES, *_RINGS, *_CENTRE)
+MODEL_NAMES = (*SPHERES, *_ZERNIKES)
 #: All names of Table 1, in its order.
 TABLE_1 = SIGNAL_NAMES + MODEL_NAMES
 

@@ -85,7 +85,8 @@ def find_retrace(maps: Sequence[Floats]) -> tuple[Floats, float, float]:
 
 def undistorted(sag: Floats, distortion: float) -> Floats:
     """(height, width) with everything where it is: what lies at the edge was seen further out by the share `distortion`
-    of its distance to the centre, other places by its square times that. Linear between pixels, NaN where any is."""
+    of its distance to the centre, other places by its square times that. Linear between pixels, NaN where any is.
+    """
     from scipy import ndimage  # here: most benches need no correction
 
     x, y, half = _axes(sag.shape)
@@ -99,7 +100,8 @@ def undistorted(sag: Floats, distortion: float) -> Floats:
 @dataclass(frozen=True)
 class LateralScale:
     """What a grid says of an instrument: m per pixel at the centre of the map, radial distortion as a share at its
-    edge, 95 % bounds on the relative error of the first and on that of the other, and rms distance left, m."""
+    edge, 95 % bounds on the relative error of the first and on that of the other, and rms distance left, m.
+    """
 
     pitch: float
     distortion: float
@@ -133,7 +135,8 @@ def lateral_scale(marks: ArrayLike, shape: tuple[int, ...]) -> LateralScale:
 
 def _similarity(seen: NDArray[np.complex128], place: NDArray[np.complex128]) -> tuple[Floats, Floats, float]:
     """(5,) scale as a complex number, shift and distortion that take `place` to what is seen, their covariance, and the
-    rms distance left."""
+    rms distance left.
+    """
     from scipy.optimize import least_squares
 
     size = np.abs(place - place.mean()).max()

@@ -43,7 +43,8 @@ class Orientation:
 
     def after(self, turn: float, mirrored: bool) -> Orientation:
         """The orientation for a mirror that the maps, as this one has them, show mirrored left to right (or not) and
-        then turned counter-clockwise by `turn`, rad."""
+        then turned counter-clockwise by `turn`, rad.
+        """
         rotate = self.rotate_deg - math.degrees(turn)
         if mirrored:  # mirroring after a rotation is rotating the other way after mirroring
             rotate = -rotate

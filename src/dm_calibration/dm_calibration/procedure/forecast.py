@@ -37,7 +37,8 @@ TYPICAL_RISE, TYPICAL_WIDTH = 4e-6, 0.9
 @dataclass(frozen=True)
 class Forecast:
     """Attributes: s; m as `HysteresisFit.held_out_max_zernike`, 0 = not known without an influence function; maps,
-    0 = all of the plan."""
+    0 = all of the plan.
+    """
 
     duration: float
     max_zernike: float

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from enum import Enum, IntEnum
+from enum import Enum, StrEnum
 from itertools import chain
 
 import numpy as np
@@ -26,14 +26,14 @@ LAST_PART_ENDS = 420
 CHECK_ROOM = 0.999
 
 
-class PlanKind(IntEnum):
+class PlanKind(StrEnum):
     """What to measure; the values are those of dm_msgs/Calibrate."""
 
-    FULL = 0
-    POKES = 1
-    SURFACES = 2
-    POKE_CHECK = 3
-    HYSTERESIS = 4
+    FULL = "full"
+    POKES = "pokes"
+    SURFACES = "surfaces"
+    POKE_CHECK = "poke_check"
+    HYSTERESIS = "hysteresis"
 
 
 class StepKind(Enum):

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_common.errors import ErrorCode, Refusal
 
 Floats = NDArray[np.float64]
 
@@ -138,8 +139,13 @@ def stepwise(
             candidates, any that the others determine. (With fewer samples every set of candidates is dependent; the
             selection then leaves out what the selected ones determine.) Or no freedom left for one variable.
         ValueError: a constant response.
+        Refusal: NOT_SUPPORTED, statsmodels is not installed.
     """
-    import statsmodels.api as sm  # here: with pandas and all that comes with it, it takes a third of a node's start
+    try:
+        import statsmodels.api as sm  # here: with pandas and all that comes with it, it takes a third of a node's start
+    except ModuleNotFoundError as error:
+        text = "the regression needs statsmodels: `sudo apt-get install python3-statsmodels`, or pip"
+        raise Refusal(ErrorCode.NOT_SUPPORTED, text) from error
 
     options = options or SelectionOptions()
     x, y, w = _samples(candidates, response, weights, 0)

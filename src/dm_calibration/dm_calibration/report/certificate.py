@@ -1,5 +1,6 @@
 """The two pages of the report that one hangs up: what the calibration promises, until when, and who says so; and a
-picture of every actuator."""
+picture of every actuator.
+"""
 
 from __future__ import annotations
 

@@ -90,6 +90,7 @@ class ManagedNode(LifecycleNode):
         self.configured = self.active = False
         self.session = 0
         self._trouble = ""
+        self._made: Mapping[str, Any] | None = None  # the parameters that `configure` was called for
         self._unlock = "deactivate" if self.rests else "cleanup"
         self._values = declare(self, table, on_change, self._unlocked, self._unlock, check)
         self._diagnostics = Diagnostics(self, hardware_id, self._health_in_any_state)
@@ -100,7 +101,7 @@ class ManagedNode(LifecycleNode):
     # --- what nodes do ---
 
     def configure(self) -> None:
-        """Make what the parameters ask for; of a node that `rests` before every activation too."""
+        """Make what the parameters ask for; of a node that `rests` before an activation too, where they changed."""
 
     def activate(self) -> None:
         """Begin."""
@@ -169,11 +170,20 @@ class ManagedNode(LifecycleNode):
             self.get_logger().error(f"configuration refused: {error}")
             self.refused(self._trouble)
             return TransitionCallbackReturn.FAILURE
-        except Exception:
+        except Exception as error:
+            self._trouble = f"a defect, see the log: {error}"
             self.get_logger().error(traceback.format_exc())
             return TransitionCallbackReturn.ERROR
         self._trouble = ""
         return TransitionCallbackReturn.SUCCESS
+
+    def _make(self) -> None:
+        """Configure, unless it was done for the parameters as they are."""
+        if self._made != self._values:
+            self._made = None
+            self._values.check()
+            self.configure()
+            self._made = dict(self._values)
 
     def _rest(self) -> None:
         if self.active:
@@ -182,16 +192,16 @@ class ManagedNode(LifecycleNode):
 
     def _release(self) -> None:
         self._rest()
-        self.configured = False
+        self.configured, self._made = False, None
         self.clean_up()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        done = self._done(self._values.check, self.configure)
+        done = self._done(self._make)
         self.configured = done == TransitionCallbackReturn.SUCCESS
         return done
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        if self.rests and (done := self._done(self._values.check, self.configure)) != TransitionCallbackReturn.SUCCESS:
+        if self.rests and (done := self._done(self._make)) != TransitionCallbackReturn.SUCCESS:
             return done
         super().on_activate(state)  # publishers, before anything is published
         self.active, self.session = True, self.session + self.rests
@@ -212,4 +222,7 @@ class ManagedNode(LifecycleNode):
         return self._done(self._release)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        return self._done(self._release)
+        trouble = self._trouble
+        done = self._done(self._release)
+        self._trouble = trouble  # it is unconfigured now, for this reason
+        return done

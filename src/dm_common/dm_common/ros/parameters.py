@@ -19,7 +19,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from dm_common.errors import Refusal
-from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.values import Value, real, reals, switch, text, texts, whole, wholes
 
 __all__ = [
@@ -140,13 +139,6 @@ class Parameter:
 
 #: Of every lifecycle node.
 AUTOSTART = Parameter("autostart", switch(True), "Configure and activate by itself after the start.")
-#: Of every node that holds calibrations against the mirror.
-APERTURE_PARAMETER = Parameter(
-    "aperture_tolerance",
-    real(APERTURE_TOLERANCE, 0.0, 0.5),
-    "Largest relative difference between the aperture radius of maps or calibrations and the mirror's.",
-    live=True,
-)
 
 
 class Values(dict[str, Any]):

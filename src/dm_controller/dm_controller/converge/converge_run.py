@@ -17,6 +17,7 @@ from rclpy.node import Node
 from dm_common.errors import Cancelled, ErrorCode, Refusal
 from dm_common.messages import doubles
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
+from dm_common.values import without_figures
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
 from dm_controller.converge.goals import ending
 from dm_controller.loop_actions import LoopBench
@@ -42,7 +43,8 @@ class ConvergeRun:
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
         steps: list[LoopStep] = []
-        feedback = Converge.Feedback()
+        feedback = without_figures(Converge.Feedback())
+        feedback.curvature = handle.request.request.curvature
 
         def report(step: LoopStep) -> None:
             steps.append(step)

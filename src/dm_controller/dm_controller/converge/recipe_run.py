@@ -23,6 +23,7 @@ from dm_common.messages import recipe_book_message
 from dm_common.recipes import shape_text
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
+from dm_common.values import without_figures
 from dm_controller.converge.goals import ending, recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench
@@ -49,7 +50,7 @@ class RecipeRun:
 
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
-        feedback = BuildRecipes.Feedback()
+        feedback = without_figures(BuildRecipes.Feedback())
 
         try:
             with self._bench.reserved(handle, feedback, handle.request, BUSY):

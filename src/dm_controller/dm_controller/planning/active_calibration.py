@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
-from dm_common.mirror import mismatch
+from dm_common.mirror import APERTURE_TOLERANCE, mismatch
 from dm_common.recipes import RecipeBook
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.planner import HysteresisFigures, Planner
@@ -93,7 +93,6 @@ class ActiveCalibration:
 def active_calibration(
     calibration: Calibration | None,
     mirror: MirrorInfo | None,
-    aperture_tolerance: float,
     hold_tilt: bool = True,
     axis: Sequence[float] = (0.0, 0.0),
 ) -> ActiveCalibration:
@@ -114,7 +113,7 @@ def active_calibration(
             calibration.mirror_serial,
             calibration.actuators,
             calibration.aperture_radius,
-            aperture_tolerance,
+            calibration.aperture_tolerance or APERTURE_TOLERANCE,
         )
         if wrong:
             raise Refusal(ErrorCode.CALIBRATION_MISMATCH, f"calibration {calibration.id}: {wrong}")

@@ -51,11 +51,11 @@ class PlanningContext(NamedTuple):
     degauss: Degauss
 
 
-def choose_move(target: FocusTarget, mode: int, budget: float, context: PlanningContext) -> Move:
-    """The move to `target` by the way that the mode of a request asks for; AUTO may take `budget` s.
+def choose_move(target: FocusTarget, mode: str, budget: float, context: PlanningContext) -> Move:
+    """The move to `target` by the way that the mode of a request asks for; `auto` may take `budget` s.
 
     Raises:
-        Refusal: no recipe serves the target in the mode CONDITIONED.
+        Refusal: no recipe serves the target in the mode conditioned.
     """
     if mode == _CONDITIONED:
         return _conditioned(target, context)
@@ -81,18 +81,18 @@ def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
     book, degauss = context.active.recipes, context.degauss
     if not book.recipes:
         raise Refusal(
-            ErrorCode.NOT_SUPPORTED, "mode CONDITIONED: this calibration holds no recipes; use AUTO or DIRECT"
+            ErrorCode.NOT_SUPPORTED, "mode conditioned: this calibration holds no recipes; use auto or direct"
         )
     if degauss.steps != book.degauss_steps:
         raise Refusal(
             ErrorCode.CALIBRATION_MISMATCH,
-            f"mode CONDITIONED: the recipes begin with a degauss of {book.degauss_steps} half-swings, not of "
+            f"mode conditioned: the recipes begin with a degauss of {book.degauss_steps} half-swings, not of "
             f"{degauss.steps} (condition.degauss_steps): build them again, or set it to 0",
         )
     try:
         recipe = context.active.corrections.find(target)
     except RecipeError as error:
-        raise Refusal(ErrorCode.OUT_OF_RANGE, f"mode CONDITIONED: {error}") from error
+        raise Refusal(ErrorCode.OUT_OF_RANGE, f"mode conditioned: {error}") from error
     return replace(_after_degauss(target, context, recipe), mode=_CONDITIONED)
 
 

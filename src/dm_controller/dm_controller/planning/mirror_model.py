@@ -289,7 +289,8 @@ class CalibratedMirror:
 
     def _bisect(self, target: FocusTarget, near: float, far: float, tolerance: float) -> float:
         """The reachable curvature between `near`, which is, and `far` next to that: one edge, as the programme is
-        convex."""
+        convex.
+        """
         while abs(far - near) > 1e-5:
             middle = 0.5 * (near + far)
             if self.command(target.with_curvature(middle))[1] <= tolerance:

@@ -72,7 +72,7 @@ class Move:
     known: bool
     duration: float
     _predict: Callable[[], Plan]
-    mode: int = _DIRECT
+    mode: str = _DIRECT
     degauss: int | None = None
 
     @cached_property

@@ -13,7 +13,7 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
 from dm_common.optics.conic import conic_coefficients, conic_sag
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
-from dm_common.values import Fields, real, reals, whole
+from dm_common.values import Fields, real, reals, text
 
 
 class TargetError(Refusal):
@@ -23,11 +23,12 @@ class TargetError(Refusal):
         super().__init__(ErrorCode.OUT_OF_RANGE, message)
 
 
+MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED)
 #: What the fields of a target, and those of a request beside them, may be.
 TARGET = Fields({"curvature": real(0.0), "conic_constant": real(0.0), "zernike": reals([], sizes=(0, len(TERMS)))})
 REQUEST = Fields(
     {
-        "mode": whole(0, choices={0: "AUTO", 1: "DIRECT", 2: "CONDITIONED"}),
+        "mode": text("", choices=("", *MODES)),
         "time_budget": real(0.0, 0.0, 1e9, "s", zero="as configured"),
     }
 )
@@ -115,7 +116,7 @@ class Request:
         curvature: 1/m.
         conic_constant: 0 = sphere.
         zernike: m, added sag, Born & Wolf; empty = none.
-        mode: FocusRequest.MODE_AUTO, MODE_DIRECT or MODE_CONDITIONED.
+        mode: one of MODES; "" = AUTO.
         time_budget: s that AUTO may take; 0 = as configured.
         stamp_ns: when it was made; 0 = now.
         holder: who asks, where somebody holds the mirror; "" = nobody in particular.
@@ -125,7 +126,7 @@ class Request:
     curvature: float = 0.0
     conic_constant: float = 0.0
     zernike: tuple[float, ...] = ()
-    mode: int = 0
+    mode: str = FocusRequest.MODE_AUTO
     time_budget: float = 0.0
     stamp_ns: int = 0
     holder: str = ""

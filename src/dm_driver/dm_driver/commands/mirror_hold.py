@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from enum import IntEnum
+from enum import StrEnum
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.values import real, whole
+from dm_common.values import real, text
 
 #: A hold that is not renewed ends after this time, s, where its holder names no other.
 LEASE_S = 3.0
@@ -20,16 +20,16 @@ LEASE_S = 3.0
 LEASE_MAX_S = 3600.0
 
 
-class Operation(IntEnum):
+class Operation(StrEnum):
     """The constants of dm_msgs/HoldMirror."""
 
-    HOLD = 0
-    RENEW = 1
-    TAKE_OVER = 2
-    RELEASE = 3
+    HOLD = "hold"
+    RENEW = "renew"
+    TAKE_OVER = "take_over"
+    RELEASE = "release"
 
 
-_OPERATION = whole(0, choices={int(operation): operation.name for operation in Operation})
+_OPERATION = text("", choices=("", *Operation))
 _DURATION = real(0.0, 0.0, unit="s")
 _LEASE = real(0.0, 0.0, LEASE_MAX_S, "s")
 
@@ -61,7 +61,7 @@ class MirrorHold:
         with self._lock:
             return self._sentence()
 
-    def ask(self, operation: int, holder: str, purpose: str = "", duration: float = 0.0, lease: float = 0.0) -> None:
+    def ask(self, operation: str, holder: str, purpose: str = "", duration: float = 0.0, lease: float = 0.0) -> None:
         """Hold the mirror, or give it back, as in dm_msgs/HoldMirror.
 
         Raises:

@@ -126,7 +126,8 @@ class VoltScale:
     @property
     def resolution(self) -> float:
         """Normalised signal of the code that counts most, the last one; quantisation moves no signal inside the range
-        by more than half of it."""
+        by more than half of it.
+        """
         volts_per_code = abs(self._dac_span * self.amplifier_gain) / self.max_code
         power = LAWS[self.law]
         return 2.0 * power * self.volts_max ** (power - 1) * volts_per_code / self._powers[1]

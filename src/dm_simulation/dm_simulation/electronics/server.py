@@ -34,7 +34,8 @@ DISCOVERY_ANSWER = b"EDAC40".ljust(17) + b"02-00-00-DA-C4-00\r\n"
 @dataclass(frozen=True)
 class PortsConfig:
     """Where the units are to be found: loopback ports (0 = any free one, -1 = off), the path of a symbolic link to the
-    pseudo-terminal ("" = off), and what is spoken there (by default a USB DAC-40)."""
+    pseudo-terminal ("" = off), and what is spoken there (by default a USB DAC-40).
+    """
 
     tcp_port: int = 1234
     udp_port: int = 1234

@@ -1,4 +1,4 @@
-"""The bench's side of the trigger: one line of text in, one out, over a loopback TCP port.
+r"""The bench's side of the trigger: one line of text in, one out, over a loopback TCP port.
 
 `MEASURE <absolute path, or nothing>\\n` is answered by `OK <path>\\n` or `ERROR <words>\\n`.
 """

@@ -156,7 +156,7 @@ async def poke(session: Session, actuator: int, amplitude: float, then_measure: 
 
 async def release(session: Session) -> str:
     """Go back to the shape that stood before the poke."""
-    base, (_mirror, requested) = session.base, _mirror_and_signals(session)
+    base, (_, requested) = session.base, _mirror_and_signals(session)
     if base is None:
         return "nothing is poked"
     session.base = None

@@ -196,7 +196,7 @@ def calibrate(
     if hysteresis is not None or until:
         plan = CalibrationPlan.hysteresis
     goal = Calibrate.Goal(
-        plan=list(CalibrationPlan).index(plan),
+        plan=plan.name,
         hysteresis_maps=hysteresis or 0,
         until=metres(until) if until else 0.0,
         dry_run=dry_run,

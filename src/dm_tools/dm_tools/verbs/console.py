@@ -23,7 +23,13 @@ def console(
     mirror keeps its shape.
     """
     from dm_tools.console.console_node import ConsoleNode
-    from dm_tools.console.page import HOST, serve
+
+    try:
+        from dm_tools.console.page import HOST, serve
+    except ModuleNotFoundError as error:
+        if error.name != "nicegui":
+            raise
+        raise RuntimeError("the console needs NiceGUI: `pip install nicegui`, see docs/install.md") from error
 
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,5 +1,6 @@
 """`dm measure`: take one map. `dm check`: compare one with the calibration in use, and let it improve it.
-`dm instrument`: find from files what the interferometer itself adds to every map."""
+`dm instrument`: find from files what the interferometer itself adds to every map.
+"""
 
 from __future__ import annotations
 

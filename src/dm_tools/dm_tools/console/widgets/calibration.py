@@ -54,7 +54,7 @@ class CalibrationCard:
 
     def _goal(self) -> Calibrate.Goal:
         """What the fields ask for. Raises ValueError naming the field."""
-        goal = Calibrate.Goal(plan=int(self._plan.value), note=str(self._note.value or ""), activate=True)
+        goal = Calibrate.Goal(plan=str(self._plan.value), note=str(self._note.value or ""), activate=True)
         if goal.plan == Calibrate.Goal.PLAN_HYSTERESIS and self._maps.value is not None:
             length = float(self._maps.value)
             if not (length.is_integer() and 0 <= length <= 100_000):

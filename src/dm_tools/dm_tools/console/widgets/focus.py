@@ -75,7 +75,7 @@ class FocusCard:
         if self._number.value is None or self._conic.value is None:
             raise ValueError("curvature and conic constant must be numbers")
         return FocusRequest(
-            curvature=float(self._number.value), conic_constant=float(self._conic.value), mode=int(self._mode.value)
+            curvature=float(self._number.value), conic_constant=float(self._conic.value), mode=str(self._mode.value)
         )
 
     def _start_move(self) -> None:

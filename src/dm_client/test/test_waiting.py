@@ -1,0 +1,40 @@
+"""What a client waits for before it takes the nodes for ready. Without processes."""
+
+from __future__ import annotations
+
+import pytest
+from dm_msgs.msg import ActuatorState, Capabilities
+
+from dm_client import DeformableMirrorClient, DeformableMirrorError
+from dm_common.errors import ErrorCode
+
+
+def client(driver: int, able: int | None) -> DeformableMirrorClient:
+    """One that has heard this state of the driver and this code of the controller; None = there is no controller."""
+    heard = DeformableMirrorClient.__new__(DeformableMirrorClient)
+    heard.messages = {"actuator_state": ActuatorState(driver_state=driver)}
+    if able is not None:
+        heard.messages["capabilities"] = Capabilities(error_code=able, message="not yet")
+    return heard
+
+
+@pytest.mark.parametrize("able", [None, ErrorCode.OK, ErrorCode.NOT_CALIBRATED])
+def test_it_is_ready_when_driver_and_controller_take_requests(able: int | None) -> None:
+    client(ActuatorState.STATE_ACTIVE, able).wait_until_active(0.0)
+
+
+@pytest.mark.parametrize(
+    ("driver", "able", "code"),
+    [
+        (ActuatorState.STATE_INACTIVE, ErrorCode.OK, ErrorCode.DRIVER_INACTIVE),
+        (ActuatorState.STATE_ACTIVE, ErrorCode.NODE_INACTIVE, ErrorCode.NODE_INACTIVE),
+        # The driver is back, and the controller has not heard it yet.
+        (ActuatorState.STATE_ACTIVE, ErrorCode.DRIVER_INACTIVE, ErrorCode.DRIVER_INACTIVE),
+        (ActuatorState.STATE_ACTIVE, ErrorCode.DRIVER_UNAVAILABLE, ErrorCode.DRIVER_UNAVAILABLE),
+        (ActuatorState.STATE_ACTIVE, ErrorCode.ELECTRONICS_UNREACHABLE, ErrorCode.ELECTRONICS_UNREACHABLE),
+    ],
+)
+def test_it_is_not_ready_while_either_says_otherwise(driver: int, able: int, code: int) -> None:
+    with pytest.raises(DeformableMirrorError) as waited:
+        client(driver, able).wait_until_active(0.0)
+    assert waited.value.error_code == code
