@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.responses import WEAKEST_PATTERN
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 
 Floats = NDArray[np.float64]
+
+#: Patterns weaker than this share of the strongest are noise.
+WEAKEST_PATTERN = 0.03
 
 
 class Reduction:

@@ -12,17 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.hysteresis.reduction import Reduction
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import usable_sag
 from dm_common.optics.piston_tilt import fill_gaps
-from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
+from dm_common.optics.zernike import basis
 
 Floats = NDArray[np.float64]
 
 #: Least uncertainty of a response, m, that of data without noise.
 SCATTER_MIN = 1e-11
-#: Patterns weaker than this share of the strongest are noise.
-WEAKEST_PATTERN = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +53,6 @@ def responses_of(maps: MapSet) -> Responses:
     """
     usable = np.asarray(np.isfinite(maps.sag).any(axis=1) & np.isfinite(maps.coefficients).all(axis=1))
     sag = usable_sag(maps, ["" if good else "no data" for good in usable])
-    weight = np.sqrt(maps.points.weight)
     modes = basis(maps.points.x, maps.points.y)
     design = np.column_stack((np.ones(len(maps)), maps.applied))[usable]
     model: Floats = maps.coefficients[usable] @ modes.T
@@ -63,15 +61,7 @@ def responses_of(maps: MapSet) -> Responses:
         filled = fill_gaps(sag[usable], model, maps.points)
         solution = np.asarray(np.linalg.lstsq(design, filled, rcond=None)[0], dtype=np.float64)
         model = design @ solution
-    orthogonal: Floats = np.linalg.qr(weight[:, None] * modes)[0]
-
-    def beyond(rows: Floats) -> Floats:
-        weighted = rows * weight
-        return np.asarray(weighted - (weighted @ orthogonal) @ orthogonal.T)
-
-    _, strength, patterns = np.linalg.svd(beyond(solution[1:]), full_matrices=False)
-    patterns = patterns[strength > WEAKEST_PATTERN * strength[0]]
-    scale = TERM_RMS[PISTON_TILT : maps.terms]
-    values = np.zeros((len(maps), len(scale) + len(patterns)))
-    values[usable] = np.hstack((maps.coefficients[usable, PISTON_TILT:] * scale, beyond(filled) @ patterns.T))
-    return Responses(values, len(scale), usable)
+    reduction = Reduction(maps.points, solution[1:].T, maps.terms)
+    values = np.zeros((len(maps), reduction.size))
+    values[usable] = reduction.reduce(maps.coefficients[usable], filled)
+    return Responses(values, reduction.coefficients, usable)

@@ -172,8 +172,14 @@ def check_comparable(
         )
     else:
         different = _other_setup(measured, outcome.setup) if outcome.setup else ""
-    if not different and outcome.records and measured.coefficients.shape != outcome.records[0].coefficients.shape:
+    first = outcome.records[0] if outcome.records else measured
+    if not different and measured.coefficients.shape != first.coefficients.shape:
         different = f"{measured.coefficients.size} Zernike terms, the maps before had others"
+    if not different and abs(measured.radius_px - first.radius_px) > aperture_tolerance * first.radius_px > 0.0:
+        different = (
+            f"aperture of {measured.radius_px:.1f} pixels radius, before it was {first.radius_px:.1f}: the map does "
+            "not show the whole pupil, or another"
+        )
     if different:
         raise MeasurementError(ErrorCode.MAP_REJECTED, different)
 
