@@ -202,11 +202,16 @@ def _checksum(content: bytes) -> bytes:
     return text[-1:] + text[:-1]
 
 
-def h5_bytes(waves: NDArray[Any], wavelength: str = "632.8 nm", xpix: str | None = "0.024 mm") -> bytes:
+def h5_bytes(
+    waves: NDArray[Any],
+    wavelength: str = "632.8 nm",
+    xpix: str | None = "0.024 mm",
+    path: str = "measurement0/genraw",
+) -> bytes:
     """A file of 4Sight of `waves` (height, width), NaN = no data."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
-        group = file.create_group("measurement0/genraw")
+        group = file.create_group(path)
         group["data"] = np.where(np.isfinite(waves), waves, np.finfo(np.float32).max).astype("<f4")
         group.attrs["wavelength"] = np.bytes_(wavelength)
         if xpix is not None:

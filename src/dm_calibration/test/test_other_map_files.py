@@ -99,6 +99,7 @@ def test_a_fits_file_whose_checksum_does_not_agree_is_refused(tmp_path: Path) ->
         (h5_bytes(SAG, wavelength="red"), "wavelength = 'red': must be a length"),
         (h5_bytes(SAG, xpix="3 px"), "xpix = '3 px'"),
         (h5_bytes(SAG[0]), "must be a two-dimensional table"),
+        (h5_bytes(SAG, path="Measurement/SurfaceInWaves"), "a .4D file of 4Sight does not tell its wavelength"),
         (h5_bytes(np.full((4, 4), np.nan)), "none of the 4 x 4 pixels is valid"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

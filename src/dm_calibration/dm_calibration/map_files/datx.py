@@ -60,6 +60,8 @@ def parse_datx(content: bytes) -> SurfaceMap:
     try:
         check_end(content, len(content))
         with h5py.File(io.BytesIO(content), "r") as file:
+            if "Measurement" in file and "MetaData" not in file:
+                raise MapFileError("a .4D file of 4Sight does not tell its wavelength: save the map as .h5 or .fits")
             return parse_four_d(file, content) if FOUR_D in file else _parse(file, content)
     except MapFileError:
         raise
