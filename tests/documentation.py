@@ -168,6 +168,7 @@ PARSED = {
     "./dm report path/to/calibration.h5 --out reports --json figures.json": "an example of a path",
     "./dm replay runs/monday": "in its own time; run with --rate 10",
     "./dm replay runs/monday --recalibrate": "needs a recorded calibration; test_recording.py runs it",
+    "./dm replay runs/theirs --recalibrate --config my_bench.yaml": "needs such a recording; test_recording.py runs it",
     "./dm compare --plant preisach --seed 5 --json runs/compare.json": _LONG + "test_compare.py runs its parts",
     "./dm compare --hysteresis --plant all": _LONG + "test_ablation.py runs its parts",
     "./dm compare --hysteresis --plant all --seed 51 --seed 52 --seed 53": _LONG + "test_ablation.py runs its parts",
