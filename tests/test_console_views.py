@@ -34,11 +34,12 @@ from dm_common.optics.zernike import basis
 from dm_tools.console import status, view_models
 from dm_tools.console.charts.command_map import command_map, outlines
 from dm_tools.console.charts.heat_map import SAG_COLOURS, heat_map
-from dm_tools.console.charts.plots import loop_chart, residual_chart, zernike_chart
+from dm_tools.console.charts.plots import INK, loop_chart, residual_chart, zernike_chart
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import SHOWN_S, Session
 from dm_tools.console.state_observer import StateObserver
+from dm_tools.console.style import CSS
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
 from dm_tools.running_suite import NEEDED
 
@@ -363,6 +364,11 @@ def test_charts_are_described_and_have_axes() -> None:
     zernike = zernike_chart(view_models.bars(message, None, False), "Coefficient")
     assert "largest pentafoil sin Z5,5: 20.00 nm" in zernike.description
     assert "residual of 2 maps, the last 3.0 nm" in residual_chart([2.0, 3.0]).description
+
+
+def test_what_charts_draw_in_ink_is_light_in_the_dark() -> None:
+    dark = CSS[CSS.index("prefers-color-scheme: dark") :]
+    assert f'.chart svg [fill="{INK}"]' in dark and f'.chart svg [stroke="{INK}"]' in dark  # marks as well as text
 
 
 def test_a_heat_map_is_a_picture_of_the_surface_the_right_way_up() -> None:

@@ -102,8 +102,8 @@ class AppliedHistory:
             )
         if estimate.state is None or (law.remembers and estimate.unknown):
             raise MapNotUsableError(
-                f"the history of the actuators is not known: {estimate.unknown}; a degauss over the full range cures "
-                "that"
+                f"the history of the actuators is not known: {estimate.unknown}; a degauss over the full range "
+                "(./dm degauss) cures that"
             )
         return SettledState(law.effective(law.advance(estimate.state, time)), since)
 

@@ -83,7 +83,7 @@ button:focus-visible, .q-slider:focus-within { outline: 3px solid var(--focus); 
     --doubt: #f0b35c; --error-page: #3a1c1e; --doubt-page: #33270f; --focus: #7fb6e8;
     --on-primary: #0d1a26; }
   body { --q-primary: #7fb6e8 !important; --q-negative: #ff9a94 !important; --q-warning: #f0b35c !important; }
-  .chart svg text[fill="#1f2933"] { fill: var(--ink); }
+  .chart svg [fill="#1f2933"] { fill: var(--ink); }
   .chart svg [stroke="#1f2933"] { stroke: var(--ink); }
   .chart svg [stroke="#c3ccd5"] { stroke: var(--rule); }
 }

@@ -57,7 +57,7 @@ def measure(
         f"largest coefficients beyond tilt: {', '.join(f'{name} {value:+.1f} nm' for name, value in largest)}"
     )
     if figures["curvature"] is not None:
-        console.print(f"defocus: as of a surface of {figures['curvature']:+.4f} 1/m")
+        console.print(f"defocus: as of a surface of {round(figures['curvature'], 4) + 0.0:+.4f} 1/m")
     console.print(f"file: {info.file}", soft_wrap=True)
     if reference_sphere is not None:
         figures["pitch"] = _scale(info, coefficients, reference_sphere)
