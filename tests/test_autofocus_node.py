@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import io
 import math
 import os
 import runpy
@@ -23,9 +24,10 @@ from action_msgs.msg import GoalStatus
 from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import GetFocusRange, HoldMirror, SetFocus, SetFocusDistance
+from PIL import Image as PillowImage
 from rclpy.qos import qos_profile_sensor_data
 from scipy.ndimage import gaussian_filter
-from sensor_msgs.msg import CameraInfo, Image, Range
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Range
 
 from dm_autofocus import CameraFocusClient
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
@@ -67,6 +69,9 @@ class FilmedScene:
         self._pending: FocusState | None = None
         self.info = self.node.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
         self._image = self.node.create_publisher(Image, "image_raw", qos_profile_sensor_data)
+        self.compressed = False
+        topic = "camera/image/compressed"
+        self._compressed = self.node.create_publisher(CompressedImage, topic, qos_profile_sensor_data)
         self._state = self.node.create_publisher(FocusState, "focus_state", qos.STATE)
         self._driver = self.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
         self._capabilities = self.node.create_publisher(Capabilities, "capabilities", qos.LATCHED)
@@ -136,6 +141,13 @@ class FilmedScene:
             self._publish_image(np.clip(blurred, 0, 255).astype(np.uint8), exposed)
 
     def _publish_image(self, pixels: np.ndarray, exposed: Any) -> None:
+        if self.compressed:
+            file = io.BytesIO()
+            PillowImage.fromarray(pixels).save(file, "JPEG", quality=95)
+            small = CompressedImage(format="mono8; jpeg compressed mono8", data=array.array("B", file.getvalue()))
+            small.header.stamp = exposed
+            self._compressed.publish(small)
+            return
         height, width = pixels.shape
         message = Image(height=height, width=width, encoding="mono8", step=width)
         message.header.frame_id = "camera"
@@ -240,6 +252,18 @@ def test_a_focus_stack_gives_a_sharp_image_and_its_distances(
         with pytest.raises(DeformableMirrorError, match=r"no texture.* largest value, 255") as blank:
             client.focus_stack(images=5)
         assert blank.value.error_code == ErrorCode.NOT_CONVERGED
+
+
+def test_compressed_images_are_taken_as_they_come(start: Start, observer: Observer) -> None:
+    """Who remaps image_raw remaps its compressed topic, as with image_transport."""
+    with FilmedScene(observer, object_curvature=0.0173) as played:
+        played.compressed = True
+        parameters, remap = {**PARAMETERS, "image_transport": "compressed"}, "image_raw:=/camera/image"
+        start("dm_autofocus", "autofocus", parameters, "--ros-args", "-r", remap, "--")
+        wait_until(lambda: played.states, 60, "the first figure of an image")
+        found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+        assert found.error_code == ErrorCode.OK, found.message
+        assert found.curvature == pytest.approx(0.0173, abs=0.0012)
 
 
 def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer) -> None:

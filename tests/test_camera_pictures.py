@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from dm_autofocus.sharpness import check_region, cut
-from dm_tools.demo.demo_camera import Focused, Shot, camera_config, regions
+from dm_tools.demo.demo_camera import Approach, Focused, Shot, Sweep, camera_config, regions
 from dm_tools.demo.pictures import HOLD, save_animation, save_contact_sheet
 
 pytestmark = pytest.mark.slow
@@ -32,13 +32,18 @@ def found() -> list[Focused]:
 
 
 def test_the_animation_shows_every_image_and_rests_on_the_last(found: list[Focused], tmp_path: Path) -> None:
-    with Image.open(save_animation(found, tmp_path / "a.gif", "two objects", frames_per_second=10)) as animation:
+    shots = found[0].shots
+    sweep = Sweep(shots, 0.2, shots[0].image, np.full((24, 32), 7.0, np.float32), 1.2)
+    approach = Approach(shots[:3], [6.0, 5.5, 5.0])
+    file = save_animation(found, sweep, approach, tmp_path / "a.gif", "two objects", frames_per_second=10)
+    with Image.open(file) as animation:
         durations = []
         for frame in range(getattr(animation, "n_frames", 1)):  # equal frames are merged into a longer one
             animation.seek(frame)
             durations.append(animation.info["duration"])
-    assert len(durations) >= 2 * 4
-    assert sum(durations) == pytest.approx(100 * 2 * (4 + HOLD), rel=0.02)
+    frames = 2 * (4 + HOLD) + len(sweep.shots) + 2 * HOLD + len(approach.shots) + HOLD
+    assert len(durations) >= 2 * 4 + 4 + 1 + 3
+    assert sum(durations) == pytest.approx(100 * frames, rel=0.02)
 
 
 def test_the_contact_sheet_is_written(found: list[Focused], tmp_path: Path) -> None:

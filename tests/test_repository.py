@@ -92,6 +92,7 @@ KEYS = {
         for name in ("h5py", "matplotlib", "numpy", "reportlab", "rich", "scipy", "serial", "typer", "yaml")
     },
     "mcap": "mcap-ros2-support",
+    "PIL": "python3-pil",
 }
 #: Modules that rosdep does not know; the package's README says how to install them. Starlette comes with NiceGUI.
 WITHOUT_KEY = {"nicegui", "starlette", "statsmodels", "Pyro4"}

@@ -107,11 +107,11 @@ def track(stage: Stage, by_optics: bool = True) -> None:
         tracker.feed(tenengrad(image), (image,), begin)
         if tracker.lost:
             search = FocusSearch(config, model, stage.place)
-            while not search.done and stage.running:
-                stage.go(search.step.curvature)
+            while not search.current.done and stage.running:
+                stage.go(search.current.step.curvature)
                 seen = stage.expose()[1]
                 search.feed(tenengrad(seen), (seen,))
-            tracker = tracker_of(search.peak or Peak(tracker.centre, tenengrad(image), False))
+            tracker = tracker_of(search.current.peak or Peak(tracker.centre, tenengrad(image), False))
 
 
 def search_anew(stage: Stage) -> None:

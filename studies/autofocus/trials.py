@@ -86,11 +86,11 @@ def _few_images(stage: _Stage) -> tuple[float | None, str]:
     scene = stage.camera.scene
     config, model = search_of(scene), model_of(scene)
     search = FocusSearch(config, model, scene.start)
-    while not search.done:
-        stage.go(search.step.curvature)
+    while not search.current.done:
+        stage.go(search.current.step.curvature)
         image = stage.expose()
         search.feed(tenengrad(image), (image,))
-    return (search.peak.curvature if search.peak else None), search.reason
+    return (search.current.peak.curvature if search.current.peak else None), search.reason
 
 
 def _sweep_from_below(stage: _Stage) -> tuple[float | None, str]:

@@ -9,8 +9,8 @@ from typing import Any
 from dm_msgs.action import Autofocus
 from rclpy.node import Node
 
-from dm_autofocus.autofocus_parameters import focus_lens, search_config
-from dm_autofocus.focus_probe import SharpnessSample
+from dm_autofocus.autofocus_parameters import focus_lens, given_focal_length, search_config
+from dm_autofocus.focus_probe import SharpnessSample, raw_image
 from dm_autofocus.images import exposure_fault, grey
 from dm_autofocus.optics import depth_of_focus, distance_of
 from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
@@ -52,13 +52,11 @@ class AutofocusAction(ProbeAction):
             raise Refusal(ErrorCode.OUT_OF_RANGE, str(error)) from error
 
     def _carry_out(self, goal_handle: WorkerGoal, plan: tuple[SearchConfig, Region], result: Any) -> None:
-        peak, config, swept = self._search(goal_handle, *plan)
+        peak, config, remarks = self._search(goal_handle, *plan)
         self._fill(result, peak)
         if goal_handle.request.track:
             self._track(goal_handle, config, plan[1], peak, result)
-        result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}"
-        if swept:
-            result.message += f"; the range was swept: {swept}"
+        result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}{remarks}"
         if peak.at_limit:
             result.message += "; at the end of the range: the object may lie beyond it"
 
@@ -66,15 +64,15 @@ class AutofocusAction(ProbeAction):
         """Search from beginning to end and stand on the peak; without one, where the mirror stood before.
 
         Returns:
-            The peak; the search with the range that was possible, which depends on the actuators' history too; the
-            reason why the range was swept, "" = it was not.
+            The peak; the search with the range that was possible, which depends on the actuators' history too;
+            remarks for the result's message.
         """
         before = self._probe.curvature
         sample: SharpnessSample | None = None
         approach = self._values["search.approach"]
         search = FocusSearch(replace(config, approach=0.0), self._model(config, region), before)
-        while not search.done:
-            step = search.step
+        while not search.current.done:
+            step = search.current.step
             try:
                 self._go(goal_handle, step.curvature)
             except Refusal as error:
@@ -82,18 +80,18 @@ class AutofocusAction(ProbeAction):
                     raise
                 self._draw_in(search, error)
                 continue
-            if search.config.approach < approach and not self._stands_where_sent():
+            if search.current.config.approach < approach and not self._stands_where_sent():
                 search.sweep("the mirror's hysteresis is not known", approach)
                 continue
             if not step.measured:
                 search.feed(None)
                 continue
-            phase, sample = search.phase, self._measure(goal_handle, region)
+            phase, sample = search.current.phase, self._measure(goal_handle, region)
             search.feed(sample.sharpness, sample.regions)
             self._report(goal_handle, phase, sample, step.curvature, search.measured, search.steps)
         if search.reason:
             self._log.info(f"the range was swept: {search.reason}")
-        if search.peak is None:
+        if search.current.peak is None:
             if math.isfinite(before):
                 self._go(goal_handle, before)
             fault = exposure_fault(sample.regions[0]) if sample else ""
@@ -102,18 +100,31 @@ class AutofocusAction(ProbeAction):
                 "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
                 f"the range{fault and '; '}{fault}; the mirror is back where it was",
             )
-        self._go(goal_handle, search.step.curvature)
-        return search.peak, search.config, search.reason
+        self._go(goal_handle, search.current.step.curvature)
+        return search.current.peak, search.current.config, self._remarks(search)
+
+    def _remarks(self, search: FocusSearch) -> str:
+        """What the user should know of how the focus was found."""
+        swept = f"; the range was swept: {search.reason}" if search.reason else ""
+        scale = search.fitting_scale()
+        if scale == 1:
+            return swept
+        given = given_focal_length(self._values, self._probe.camera_info)
+        return swept + (
+            f"; by their blur the images would fit a focal length of {scale * given:.0f} px, {given:.0f} px is given "
+            "(optics.focal_length_px, or fx of camera_info)"
+        )
 
     def _model(self, config: SearchConfig, region: Region) -> DefocusModel | str:
         """How images of the region are blurred, or the reason why that is not known."""
-        radius, image = ready_capabilities(self._probe).aperture_radius, self._probe.newest
+        radius, newest = ready_capabilities(self._probe).aperture_radius, self._probe.newest
         if not self._values["search.few_images"]:
             return "search.few_images is false"
-        if image is None:
+        if newest is None:
             return "there was no image yet to show its size"
         try:
             lens = focus_lens(self._values, radius, self._probe.camera_info)
+            image = raw_image(newest)
             pixels = grey(image)
             # Of a Bayer sensor every second pixel along a side is green.
             lens = replace(lens, focal_length_px=lens.focal_length_px * pixels.shape[1] / image.width)
@@ -149,7 +160,7 @@ class AutofocusAction(ProbeAction):
             self._report(goal_handle, Phase.TRACK, sample, wanted, 0, 0)
             if tracker.lost:
                 try:
-                    peak, config, _swept = self._search(goal_handle, config, region)
+                    peak, config, _remarks = self._search(goal_handle, config, region)
                     position = peak.curvature
                 except Refusal as error:
                     if error.error_code != ErrorCode.NOT_CONVERGED:

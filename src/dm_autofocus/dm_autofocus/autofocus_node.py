@@ -53,6 +53,7 @@ class AutofocusNode(ManagedNode):
 
     def configure(self) -> None:
         self._optics = focus_optics(self._values)
+        self._probe.subscribe()
         self._timer.cancel()
         if rate := self._values["monitor_rate"]:
             self._timer.timer_period_ns = round(1e9 / rate)
@@ -140,7 +141,7 @@ class AutofocusNode(ManagedNode):
         try:
             ready_capabilities(self._probe)
             if self._probe.newest is None:
-                raise Refusal(ErrorCode.TIMEOUT, f"no image on {self.resolve_topic_name('image_raw')} yet")
+                raise Refusal(ErrorCode.TIMEOUT, f"no image on {self._probe.topic} yet")
             if self._image_problem:
                 raise Refusal(ErrorCode.INVALID_ARGUMENT, self._image_problem)
         except Refusal as error:

@@ -43,6 +43,11 @@ PARAMETERS: Final = (
         "Region of interest: left, top, width, height as shares of the image.",
         live=True,
     ),
+    Parameter(
+        "image_transport",
+        text("raw", choices=("raw", "compressed")),
+        "raw: images come on image_raw; compressed: as JPEG or PNG on image_raw/compressed.",
+    ),
     Parameter("images_per_step", whole(1, 1, 100), "Images whose median sharpness counts at each position."),
     Parameter("image_timeout", real(2.0, 0.01, 600.0, "s"), "Longest wait for an image that counts."),
     Parameter("move_timeout", real(5.0, 0.01, 600.0, "s"), "Longest wait for a move to end."),
@@ -145,6 +150,14 @@ def search_config(values: Mapping[str, Any], aperture_radius: float, low: float,
     )
 
 
+def given_focal_length(values: Mapping[str, Any], camera_info: Any) -> float:
+    """Focal length [px] by the parameter, else by a sensor_msgs/CameraInfo (None = none came yet); 0 = not known."""
+    focal_length = values["optics.focal_length_px"]
+    if focal_length == 0 and camera_info is not None:
+        focal_length = camera_info.k[0] / max(camera_info.binning_x, 1)
+    return float(focal_length)
+
+
 def focus_lens(values: Mapping[str, Any], aperture_radius: float, camera_info: Any) -> FocusLens:
     """What defocus looks like in the camera.
 
@@ -155,9 +168,7 @@ def focus_lens(values: Mapping[str, Any], aperture_radius: float, camera_info: A
     Raises:
         ValueError: the focal length is not known.
     """
-    focal_length = values["optics.focal_length_px"]
-    if focal_length == 0 and camera_info is not None:
-        focal_length = camera_info.k[0] / max(camera_info.binning_x, 1)
+    focal_length = given_focal_length(values, camera_info)
     if not focal_length > 0:
         reason = "came not yet" if camera_info is None else "holds no fx"
         raise ValueError(f"optics.focal_length_px is 0, and camera_info {reason}")

@@ -10,15 +10,15 @@ from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import AutofocusState
 from dm_msgs.srv import GetFocusRange, SetFocusDistance
 from numpy.typing import NDArray
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from dm_autofocus.boresight import STEP, Boresight, BoresightError, find_boresight
-from dm_autofocus.focus_probe import IMAGES
+from dm_autofocus.focus_probe import IMAGES, raw_image
 from dm_autofocus.images import grey, pixels_of
 from dm_autofocus.sharpness import check_region, cut
 from dm_client import Claim, DeformableMirrorClient, DeformableMirrorError
 from dm_common.errors import ErrorCode
-from dm_common.messages import seconds
+from dm_common.messages import seconds as seconds_of
 from dm_common.optics.zernike import PISTON_TILT, TERMS
 from dm_common.ros import qos
 
@@ -82,6 +82,21 @@ class CameraFocusClient(DeformableMirrorClient):
         goal.curvature_min, goal.curvature_max = (float(value) for value in curvature_range)
         return self.run_action("autofocus", goal, on_feedback, timeout_s)
 
+    def track(
+        self,
+        seconds: float,
+        region: Sequence[float] = (),
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+        **claim: Unpack[Claim],
+    ) -> None:
+        """Search the sharpest focus in a region as `autofocus`, and stay on it; ends after so many seconds in all."""
+        goal = Autofocus.Goal(region=[float(value) for value in region], track=True, **claim)
+        try:
+            self.run_action("autofocus", goal, on_feedback, seconds)
+        except DeformableMirrorError as error:
+            if error.error_code != ErrorCode.TIMEOUT:
+                raise
+
     def focus_stack(
         self,
         *,
@@ -138,23 +153,25 @@ class CameraFocusClient(DeformableMirrorClient):
         reach = self.focus_range()
         step = STEP * reach.curvature_tolerance
         focus = min(max(focus, reach.curvature_min + 2 * step), reach.curvature_max - 2 * step)
-        if "image_raw" not in self.messages:
-            self.messages["image_raw"] = None
-            self.hear("image_raw", Image, IMAGES)
+        topics = {"image_raw": Image, "image_raw/compressed": CompressedImage}
+        for topic, kind in topics.items():
+            if topic not in self.messages:
+                self.messages[topic] = None
+                self.hear(topic, kind, IMAGES)
 
         def see(curvature: float, tilt: NDArray[np.float64]) -> NDArray:
             zernike = np.zeros(len(TERMS))
             zernike[1:PISTON_TILT] = tilt
             state = self.focus(curvature, zernike=zernike.tolist(), **claim)
-            begin = seconds(state.header.stamp) + state.predicted_duration + SETTLE_S
+            begin = seconds_of(state.header.stamp) + state.predicted_duration + SETTLE_S
 
-            def arrived() -> bool:
-                image = self.messages["image_raw"]
-                return image is not None and seconds(image.header.stamp) >= begin
+            def fresh() -> list[Any]:
+                came = [self.messages[topic] for topic in topics if self.messages[topic] is not None]
+                return [image for image in came if seconds_of(image.header.stamp) >= begin]
 
-            if not self.wait(arrived):
+            if not self.wait(lambda: bool(fresh())):
                 raise DeformableMirrorError(ErrorCode.TIMEOUT, "no image on image_raw that was stamped after a move")
-            return cut(grey(self.messages["image_raw"]), part)
+            return cut(grey(raw_image(fresh()[0])), part)
 
         try:
             return find_boresight(see, focus, step, pairs)

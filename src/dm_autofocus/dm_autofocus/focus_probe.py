@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import statistics
+import sys
 import threading
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -17,9 +19,9 @@ from dm_msgs.msg import ActuatorState, Capabilities, FocusRequest, FocusState
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from dm_autofocus.images import ImageError, SettledGate, grey
+from dm_autofocus.images import ImageError, SettledGate, decompressed, grey
 from dm_autofocus.sharpness import METRICS, Region, cut
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
@@ -39,19 +41,32 @@ class SharpnessSample:
     regions: tuple[NDArray, ...]
 
 
+def raw_image(message: Image | CompressedImage) -> Image:
+    """The image itself, or what is in a compressed one. Raises ImageError when it cannot be decoded."""
+    if isinstance(message, Image):
+        return message
+    pixels, encoding = decompressed(bytes(message.data), message.format)
+    image = Image(header=message.header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
+    image.step, image.is_bigendian = pixels.nbytes // image.height, int(sys.byteorder == "big")
+    image.data = array("B", pixels.tobytes())
+    return image
+
+
 class FocusProbe:
     """Moves by `focus_request` and measures on `image_raw`; `move` and `measure` wait: call them from a worker thread.
 
     Args:
         node: hosts the topics.
-        values: parameters `metric`, `images_per_step`, `image_timeout`, `move_timeout`, `settle_time`, `stamp_lead`.
+        values: parameters `image_transport`, `metric`, `images_per_step`, `image_timeout`, `move_timeout`,
+            `settle_time`, `stamp_lead`.
 
     Attributes:
         capabilities: the latest; None before the first.
         curvature: as taken last, whoever asked for it [1/m]; NaN before.
         user: action that holds the mirror; "" = none does.
         target: as asked for by `move` last [1/m]; NaN while nobody holds the mirror.
-        newest: the latest image; None before the first.
+        topic: of the images.
+        newest: the latest image as it came; None before the first.
         camera_info: the latest; None before the first.
         answer: of the controller to the latest `move`; None before it.
         counted, dropped: images since it was held.
@@ -63,7 +78,7 @@ class FocusProbe:
         self._gate = SettledGate(values["settle_time"], values["stamp_lead"])
         self.capabilities: Capabilities | None = None
         self.curvature = math.nan
-        self.newest: Image | None = None
+        self.newest: Image | CompressedImage | None = None
         self.camera_info: CameraInfo | None = None
         self.counted = self.dropped = 0
         self._driver: ActuatorState | None = None
@@ -73,15 +88,29 @@ class FocusProbe:
         self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
         self._other_request: float | None = None  # of another node, while held [1/m]
         self._measuring = False
-        self._fresh: Image | None = None
+        self._fresh: Image | CompressedImage | None = None
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self._hold = MirrorHolder(node, node.get_name())
-        self._topic = node.resolve_topic_name("image_raw")
-        node.create_subscription(Image, "image_raw", self._on_image, IMAGES)
+        self._node = node
+        self._images: Any = None
+        self.topic = ""
         node.create_subscription(CameraInfo, "camera_info", self._on_camera_info, IMAGES)
         node.create_subscription(FocusState, "focus_state", self._on_focus_state, qos.STATE)
         node.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)
         node.create_subscription(Capabilities, "capabilities", self._on_capabilities, qos.LATCHED)
+
+    def subscribe(self) -> None:
+        """Take images as `image_transport` says now."""
+        compressed = self._values["image_transport"] == "compressed"
+        # Who remaps image_raw remaps what is made of it, as with image_transport.
+        topic = self._node.resolve_topic_name("image_raw") + ("/compressed" if compressed else "")
+        if topic == self.topic:
+            return
+        if self._images is not None:
+            self._node.destroy_subscription(self._images)
+        kind = CompressedImage if compressed else Image
+        self._images = self._node.create_subscription(kind, topic, self._on_image, IMAGES)
+        self.topic, self.newest = topic, None
 
     # --- messages ---
 
@@ -91,7 +120,7 @@ class FocusProbe:
     def _on_camera_info(self, message: CameraInfo) -> None:
         self.camera_info = message
 
-    def _on_image(self, message: Image) -> None:
+    def _on_image(self, message: Image | CompressedImage) -> None:
         with self._changed:
             self.newest = message
             if not (self._measuring and self._gate.open_for(seconds(message.header.stamp))):
@@ -229,18 +258,19 @@ class FocusProbe:
         sharpness = statistics.median(sample.sharpness for sample in samples)
         return SharpnessSample(sharpness, samples[-1].image, tuple(sample.regions[0] for sample in samples))
 
-    def sharpness_of(self, message: Image, region: Region) -> SharpnessSample:
+    def sharpness_of(self, message: Image | CompressedImage, region: Region) -> SharpnessSample:
         """Sharpness of an image in a region.
 
         Raises:
             Refusal: the image cannot be used.
         """
         try:
-            part = cut(grey(message), region)
+            image = raw_image(message)
+            part = cut(grey(image), region)
             sharpness = METRICS[self._values["metric"]](part)
         except (ImageError, ValueError) as error:
-            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self._topic}: {error}") from error
-        return SharpnessSample(sharpness, message, (part,))
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self.topic}: {error}") from error
+        return SharpnessSample(sharpness, image, (part,))
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
         """Wait for a condition or `stop()`; False when neither came in time. Raises Refusal on another's move."""
@@ -258,7 +288,7 @@ class FocusProbe:
         return True
 
     def _no_image_reason(self) -> str:
-        text = f"no image of the settled focus on {self._topic} within {self._values['image_timeout']:g} s: "
+        text = f"no image of the settled focus on {self.topic} within {self._values['image_timeout']:g} s: "
         if self.newest is None:
             return text + "none came at all; is the camera running?"
         if seconds(self.newest.header.stamp) == 0:

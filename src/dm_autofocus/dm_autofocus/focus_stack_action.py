@@ -123,6 +123,8 @@ def camera_info_for(image: Image, known: CameraInfo | None, focal_length_px: flo
     if known is None and focal_length_px > 0:
         centre = (image.width - 1) / 2, (image.height - 1) / 2
         info.k = [focal_length_px, 0.0, centre[0], 0.0, focal_length_px, centre[1], 0.0, 0.0, 1.0]
+    if not np.any(info.r):
+        info.r = np.eye(3).ravel()
     if not np.any(info.p):
         info.p = np.pad(np.reshape(info.k, (3, 3)), [(0, 0), (0, 1)]).ravel()
     return info

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -53,8 +54,37 @@ ENCODINGS: dict[str, _Layout] = {
 CLIPPED = 0.2
 
 
+#: Encodings of the modes that Pillow decodes images to; others are turned to colours.
+MODES = {"L": "mono8", "I;16": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
+
+
 class ImageError(ValueError):
     """An image that cannot be used; the message says why."""
+
+
+def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
+    """Pixels (height, width, ...) and encoding of the JPEG or PNG of a `sensor_msgs/CompressedImage`.
+
+    Args:
+        data: the file.
+        image_format: as the message has it; of "bayer_rggb8; jpeg compressed", what stands first.
+
+    Raises:
+        ImageError: it is no image that Pillow can read.
+    """
+    from PIL import Image, UnidentifiedImageError  # only who has compressed images pays for it
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            decoded = image if image.mode in MODES else image.convert("RGB")
+            pixels, encoding = np.asarray(decoded), MODES[decoded.mode]
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ImageError(f"an image of the format {image_format!r} that cannot be decoded: {error}") from error
+    mosaic = image_format.partition(";")[0].strip()
+    layout = ENCODINGS.get(mosaic)
+    if layout is not None and layout.green is not None and pixels.ndim == 2 and pixels.dtype == np.dtype(layout.type):
+        encoding = mosaic  # what was compressed is the sensor's pattern
+    return pixels, encoding
 
 
 def pixels_of(message: Any) -> NDArray:

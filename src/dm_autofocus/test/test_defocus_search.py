@@ -27,13 +27,13 @@ def model() -> DefocusModel:
 def run(search: FocusSearch, camera: DefocusedCamera, reach: float = math.inf) -> list[float]:
     """Feed a search to its end; returns where images were taken."""
     visited = []
-    while not search.done:
-        if abs(search.step.curvature) > reach:
+    while not search.current.done:
+        if abs(search.current.step.curvature) > reach:
             search.refuse()
             continue
-        visited.append(search.step.curvature)
+        visited.append(search.current.step.curvature)
         image = camera.expose(visited[-1])
-        search.feed(tenengrad(image) if search.step.measured else None, (image,))
+        search.feed(tenengrad(image) if search.current.step.measured else None, (image,))
     return visited
 
 
@@ -68,10 +68,10 @@ def test_large_regions_are_tiled_and_small_ones_refused() -> None:
 def test_the_focus_is_found_in_few_images(model: DefocusModel, place: float, start: float) -> None:
     search = FocusSearch(CONFIG, model, start)
     visited = run(search, DefocusedCamera(clouds(), place))
-    assert search.peak is not None and not search.peak.at_limit
-    assert search.peak.curvature == pytest.approx(place, abs=DEPTH / 2)
+    assert search.current.peak is not None and not search.current.peak.at_limit
+    assert search.current.peak.curvature == pytest.approx(place, abs=DEPTH / 2)
     assert search.measured == len(visited) <= 10
-    assert (search.reason, search.phase) == ("", Phase.FINE)
+    assert (search.reason, search.current.phase) == ("", Phase.FINE)
     if start == 0.02:
         assert visited[0] > 0, "the nearer one first"
 
@@ -80,14 +80,14 @@ def test_the_focus_is_found_in_few_images(model: DefocusModel, place: float, sta
 def test_an_object_beyond_the_range_is_said_so(model: DefocusModel, place: float) -> None:
     search = FocusSearch(CONFIG, model, 0.0)
     run(search, DefocusedCamera(clouds(), place))
-    assert search.peak is not None and search.peak.at_limit
+    assert search.current.peak is not None and search.current.peak.at_limit
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_nothing_to_see_ends_without_a_focus_and_without_a_sweep(model: DefocusModel, noise: float) -> None:
     search = FocusSearch(CONFIG, model, 0.0)
     visited = run(search, DefocusedCamera(np.ones((2 * SIDE, 2 * SIDE)), 0.0, noise))
-    assert (search.peak, search.reason) == (None, "")
+    assert (search.current.peak, search.reason) == (None, "")
     assert np.diff(np.sort([LOW, *visited, HIGH])).max() <= 0.1001 * (HIGH - LOW)
 
 
@@ -95,7 +95,7 @@ def test_nothing_to_see_ends_without_a_focus_and_without_a_sweep(model: DefocusM
 def test_nothing_to_see_takes_no_more_images_than_a_sweep(model: DefocusModel, points: int) -> None:
     search = FocusSearch(replace(CONFIG, coarse_points=points), model, 0.0)
     visited = run(search, DefocusedCamera(np.ones((2 * SIDE, 2 * SIDE)), 0.0, 0.01))
-    assert search.done and len(visited) <= points
+    assert search.current.done and len(visited) <= points
 
 
 def test_what_is_seen_only_after_many_images_is_searched_and_not_swept(
@@ -107,26 +107,26 @@ def test_what_is_seen_only_after_many_images_is_searched_and_not_swept(
     camera = DefocusedCamera(clouds(), 0.0)
     monkeypatch.setattr(defocus_search, "EVIDENCE", math.inf)
     for _image in range(10):
-        image = camera.expose(search.step.curvature)
+        image = camera.expose(search.current.step.curvature)
         search.feed(tenengrad(image), (image,))
     monkeypatch.setattr(defocus_search, "EVIDENCE", 25.0)
     run(search, camera)
-    assert search.peak is not None and search.peak.curvature == pytest.approx(0.0, abs=DEPTH / 2)
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.0, abs=DEPTH / 2)
     assert search.reason == ""
 
 
 def test_what_the_mirror_refuses_is_left_out(model: DefocusModel) -> None:
     search = FocusSearch(CONFIG, model, 0.0)
     run(search, DefocusedCamera(clouds(), 0.01), reach=0.017)
-    assert search.peak is not None and search.peak.curvature == pytest.approx(0.01, abs=DEPTH / 2)
-    assert search.config.low > -0.021 and search.config.high < 0.021
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.01, abs=DEPTH / 2)
+    assert search.current.config.low > -0.021 and search.current.config.high < 0.021
 
 
 @pytest.mark.parametrize("fed", [0, 3])
 def test_a_mirror_that_refuses_all_ends_a_search_with_that_reason(model: DefocusModel, fed: int) -> None:
     search, camera = FocusSearch(CONFIG, model, 0.0), DefocusedCamera(clouds(), 0.01)
     for _image in range(fed):
-        search.feed(1.0, (camera.expose(search.step.curvature),))
+        search.feed(1.0, (camera.expose(search.current.step.curvature),))
     with pytest.raises(ValueError, match="range = "):
         while True:
             search.refuse()
@@ -136,10 +136,10 @@ def test_an_image_that_the_range_was_drawn_in_past_is_no_top(model: DefocusModel
     """What the mirror took at first it may refuse later: its reach depends on its history."""
     search, camera = FocusSearch(CONFIG, model, 0.0), DefocusedCamera(clouds(), -0.0185)
     for _image in range(2):
-        image = camera.expose(search.step.curvature)
+        image = camera.expose(search.current.step.curvature)
         search.feed(tenengrad(image), (image,))
     run(search, camera, reach=0.012)
-    assert search.peak is not None and search.peak.at_limit and search.peak.curvature > -0.013
+    assert search.current.peak is not None and search.current.peak.at_limit and search.current.peak.curvature > -0.013
 
 
 def test_where_the_optics_do_not_explain_the_images_the_range_is_swept(
@@ -149,14 +149,35 @@ def test_where_the_optics_do_not_explain_the_images_the_range_is_swept(
     monkeypatch.setattr(defocus_search, "MOST_IMAGES", 3)
     search = FocusSearch(CONFIG, model, 0.0)
     camera = DefocusedCamera(clouds(), 0.012)
-    while not search.done and not search.reason:
-        image = camera.expose(search.step.curvature)
+    while not search.current.done and not search.reason:
+        image = camera.expose(search.current.step.curvature)
         search.feed(tenengrad(image), (image,))
     assert "do not explain" in search.reason and search.measured == 3
     before = search.measured
     visited = run(search, DefocusedCamera(clouds(), 0.012))
-    assert search.peak is not None and search.peak.curvature == pytest.approx(0.012, abs=DEPTH)
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.012, abs=DEPTH)
     assert search.measured == before + len(visited) <= search.steps
+
+
+@pytest.mark.parametrize("told", [0.25, 0.5, 1.0])
+def test_optics_that_contradict_the_images_are_named_with_what_would_fit(told: float) -> None:
+    """Who gives half the focal length hears that twice as much would fit; who gives the right one hears nothing."""
+    lens = replace(LENS, focal_length_px=told * LENS.focal_length_px)
+    search = FocusSearch(CONFIG, DefocusModel((SIDE, SIDE), lens, HIGH - LOW + 10 * DEPTH), 0.0)
+    run(search, DefocusedCamera(clouds(), 0.0123))
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.0123, abs=DEPTH)
+    assert search.fitting_scale() == pytest.approx(1 / told)
+    assert FocusSearch(CONFIG, "not known", 0.0).fitting_scale() == 1
+
+
+def test_things_at_several_distances_that_the_optics_do_not_explain_are_swept(
+    model: DefocusModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(defocus_search, "EVIDENCE", math.inf)
+    search = FocusSearch(CONFIG, model, 0.0)
+    run(search, DefocusedCamera(clouds(), 0.0123))
+    assert "do not explain" in search.reason
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.0123, abs=DEPTH)
 
 
 def test_images_of_another_size_are_swept(model: DefocusModel) -> None:
@@ -170,5 +191,5 @@ def test_without_optics_or_a_mirror_to_trust_every_sweep_begins_below(model: Def
     search = FocusSearch(CONFIG, model, 0.0)
     search.sweep("the mirror's hysteresis is not known", math.inf)
     visited = run(search, DefocusedCamera(clouds(), 0.01))
-    assert search.peak is not None and search.peak.curvature == pytest.approx(0.01, abs=DEPTH)
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.01, abs=DEPTH)
     assert visited.count(LOW) >= 3

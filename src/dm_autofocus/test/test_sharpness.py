@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from dm_autofocus.images import ImageError, exposure_fault, grey
+from dm_autofocus.images import ImageError, decompressed, exposure_fault, grey
 from dm_autofocus.sharpness import METRICS, check_region, cut, local_tenengrad, tenengrad
 
 
@@ -113,6 +115,31 @@ def test_of_a_bayer_pattern_the_green_pixels_count(pattern: str, bits: int) -> N
         if colour == "g":
             wanted += mosaic[place // 2 : 6 : 2, place % 2 : 8 : 2]
     np.testing.assert_array_equal(grey(message(mosaic, f"bayer_{pattern}{bits}", padding=3)), wanted)
+
+
+@pytest.mark.parametrize(
+    ("kind", "file", "image_format", "encoding"),
+    [
+        ("u1", "PNG", "mono8; png compressed ", "mono8"),
+        ("u2", "PNG", "mono16; png compressed ", "mono16"),
+        ("u1", "JPEG", "jpeg", "mono8"),
+        ("u1", "PNG", "bayer_grbg8; png compressed", "bayer_grbg8"),
+        ("3u1", "JPEG", "bgr8; jpeg compressed bgr8", "rgb8"),
+        ("4u1", "PNG", "png", "rgba8"),
+    ],
+)
+def test_compressed_images_give_their_pixels(kind: str, file: str, image_format: str, encoding: str) -> None:
+    smooth = np.add.outer(np.arange(16), np.arange(24)) * (1000 if kind == "u2" else 3)
+    pixels = np.broadcast_to(smooth[..., None], (16, 24, int(kind[0]))) if len(kind) == 3 else smooth
+    written = io.BytesIO()
+    Image.fromarray(pixels.astype(kind[-2:])).save(written, file)
+    read, name = decompressed(written.getvalue(), image_format)
+    assert name == encoding and read.shape == pixels.shape
+    np.testing.assert_allclose(read, pixels, atol=4 if file == "JPEG" else 0)
+    if file == "PNG":
+        for broken in (written.getvalue()[:45], b"", b"nothing"):
+            with pytest.raises(ImageError, match="cannot be decoded"):
+                decompressed(broken, image_format)
 
 
 @pytest.mark.parametrize("encoding", ["nv21", "64FC1", "jpeg", ""])

@@ -100,10 +100,20 @@ class SceneCamera:
         self._inside = squares <= (pupil_diameter / 2) ** 2
         self._aperture = self._inside.astype(np.float32)
         self._half_square = (squares / 2).astype(np.float32)
-        # What is left to focus for each object, as dioptre at the mirror: lens at rest minus object.
-        at_mirror = [(1 / distance if distance else 0.0) for distance in (config.rest_distance, *config.distances)]
-        self._defocus = (at_mirror[0] - np.array(at_mirror[1:])) / config.relay_magnification**2
         self._textures = [fft.rfft2(part) for part in self._scene(scene_rng)]
+        self.place(config.distances)
+
+    def place(self, distances: Sequence[float]) -> None:
+        """Put the objects at other distances [m].
+
+        Raises:
+            ValueError: there are more or fewer objects.
+        """
+        if len(distances) != len(self.config.distances):
+            raise ValueError(f"camera.distances = {list(distances)}: must stay {len(self.config.distances)} distances")
+        # What is left to focus for each object, as dioptre at the mirror: lens at rest minus object.
+        at_mirror = [(1 / distance if distance else 0.0) for distance in (self.config.rest_distance, *distances)]
+        self._defocus = (at_mirror[0] - np.array(at_mirror[1:])) / self.config.relay_magnification**2
         self._last: tuple[Array, NDArray[np.float32]] | None = None
 
     def _scene(self, rng: np.random.Generator) -> list[NDArray[np.float32]]:

@@ -114,7 +114,8 @@ PARAMETERS = (
     Parameter(
         "camera.distances",
         reals(list(_CAMERA.distances), 0.0, 1e6, "m"),
-        "Distances of the objects, from left to right; 0 = infinity.",
+        "Distances of the objects, from left to right; 0 = infinity. Their number stays.",
+        live=True,
     ),
     Parameter("camera.photons", real(_CAMERA.photons, 1.0, 1e9), "Electrons per pixel at the mean grey level."),
     Parameter("electronics.tcp_port", whole(_PORTS.tcp_port, -1, 65535), f"EDAC40 over TCP {_PORT_TEXT}"),

@@ -12,6 +12,7 @@ import json
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ class VirtualBenchNode(Node):
 
     def __init__(self) -> None:
         super().__init__("virtual_bench")
-        values = declare(self, PARAMETERS)
+        values = declare(self, PARAMETERS, self._on_change)
         speed = values["clock.speed"]
         self._fast_clock = FastClock(speed) if speed > 0 else None
         self._stop = threading.Event()
@@ -89,6 +90,13 @@ class VirtualBenchNode(Node):
             law = "membrane"
         pace = f"{speed:g} times as fast as real time" if speed > 0 else "in real time"
         self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; {pace}")
+
+    def _on_change(self, changes: Mapping[str, Any]) -> None:
+        if self.bench.camera is not None and "camera.distances" in changes:
+            try:
+                self.bench.camera.place(changes["camera.distances"])
+            except ValueError as error:
+                self.get_logger().error(str(error))
 
     def _now(self) -> float:
         if self._fast_clock is not None:

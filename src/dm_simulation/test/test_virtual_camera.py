@@ -57,6 +57,15 @@ def test_the_wavefront_vanishes_in_focus() -> None:
         assert np.abs(wavefront).max() < 1e-12
 
 
+def test_objects_can_be_moved_and_their_number_stays() -> None:
+    camera = make()
+    blurred = camera.expose(sphere(focusing(5.0)))
+    camera.place((5.0, 15.0, 0.0))
+    assert detail(camera.expose(sphere(focusing(5.0))), 0) > 2 * detail(blurred, 0)
+    with pytest.raises(ValueError, match="must stay 3 distances"):
+        camera.place((5.0,))
+
+
 def test_a_relay_squares_the_reach() -> None:
     camera = make(replace(CONFIG, relay_magnification=2.0))
     assert np.abs(camera.wavefronts(sphere(focusing(6.0) / 4))[0]).max() < 1e-12

@@ -14,7 +14,8 @@ with the frequency u in cycles per pixel, f the focal length in pixels and w = (
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,9 @@ TRANSFER_ERROR_NEAR = 0.1
 NOISE_RATIO = 1.1
 #: Power that is none.
 TINY = 1e-18
+#: Factors on the focal length that are tried, images that count by their distance from the focus in steps of the table,
+#: and how much better another focal length must explain them to be named (twice a log ratio).
+SCALES, FITTED, BETTER = (0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0), 48.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class DefocusModel:
         window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(columns + 2)[1:-1])
         self._window = window / math.sqrt(np.vdot(window, window))
         self._smooth = [np.linalg.qr(np.vander(np.linspace(-1, 1, side), 3))[0] for side in (rows, columns)]
-        edges = _band_edges(min(rows, columns))
+        self._edges = edges = _band_edges(min(rows, columns))
         frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns)[None])
         band = np.digitize(frequency, edges) - 1
         self._inside = (band >= 0) & (band < len(edges) - 1)
@@ -99,8 +103,34 @@ class DefocusModel:
         # The window makes neighbours alike: 1.5 along each side.
         self.modes = self._count * len(self._starts) / 2.25
         self._step = STEP * depth_of_focus(lens.aperture_radius, lens.wavelength)
-        self._transfer = _transfer_table(edges, lens, math.ceil(reach / self._step) + 2)
+        self._look_through(lens, math.ceil(reach / self._step) + 2)
+
+    def _look_through(self, lens: FocusLens, length: int) -> None:
+        self._lens = lens
+        self._transfer = _transfer_table(self._edges, lens, length)
         self._envelope = _envelope(self._transfer)
+
+    def fitting_scale(self, focus: float, places: Floats, powers: Floats) -> float:
+        """How many times as large the focal length would have to be for the optics to explain images; 1 = they do.
+
+        Between 0.35 and 2 it is 1: aberrations that blur an image at every focus look like a shorter focal length, and
+        errors of that size cost images, not accuracy.
+
+        Args:
+            focus: where the object is [1/m].
+            places: where the images were taken [1/m], (I,).
+            powers: of the images, (I, K).
+        """
+        near = np.abs(places - focus) < FITTED * self._step
+        grid = np.linspace(focus - 4 * self._step, focus + 4 * self._step, 9)
+        other, misfits = copy(self), {}
+        for scale in SCALES:
+            lens = replace(self._lens, focal_length_px=scale * self._lens.focal_length_px)
+            other._look_through(lens, int(FITTED) + 8)
+            misfits[scale] = other.judge(grid, places[near], powers[near], TRANSFER_ERROR)[0].min()
+        best = min(misfits, key=misfits.__getitem__)
+        named = (best <= 0.35 or best >= 2) and misfits[best] < misfits[1.0] - BETTER
+        return best if named else 1.0
 
     def powers(self, image: NDArray) -> Floats:
         """Mean power in each band, (K,), of an image of the model's shape, relative to its brightness squared.

@@ -4,7 +4,8 @@ A state machine as `PeakSearch`, for a mirror that stands where it is sent. Each
 every possible place of the object (`DefocusModel`): the texture's own power in each band is taken as whatever explains
 the images best, so only ratios between images count (depth from defocus [31, 32]). The next image is taken at the most
 probable place, or in the widest gap while nothing was seen that changes with focus. An image on either side then
-confirms it: the top must stand above both. The place is the mean of the probability that the images near it leave.
+confirms it: the top must stand above both. The place is the mean of the probability that the images near it leave, two
+on either side: where the pupil is not ideal, what one side says is wrong by as much as the other, the other way.
 """
 
 from __future__ import annotations
@@ -17,19 +18,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_autofocus.search.defocus_model import TRANSFER_ERROR, TRANSFER_ERROR_NEAR, DefocusModel, Floats
-from dm_autofocus.search.peak_search import MOST_REFUSALS, RETREAT, Peak, Phase, SearchConfig, Step
+from dm_autofocus.search.peak_search import (
+    MOST_REFUSALS,
+    NOISE_POINTS,
+    RETREAT,
+    Peak,
+    Phase,
+    SearchConfig,
+    Step,
+    is_hill,
+)
 
 #: How much better than a scene that does not change with focus a place must explain the images (twice a log ratio).
 EVIDENCE = 25.0
 #: The same when the search ends. Of 4160 scenes without anything to see, 14 reached 26 to 42 by chance; scenes with a
 #: texture of 5 % contrast and more end at 100 or above.
 CERTAIN = 60.0
+#: Reason to give up.
+UNEXPLAINED = "the optics do not explain how the images change with focus"
 #: Images at most from where they change with focus on, and in most searches.
-MOST_IMAGES, EXPECTED_IMAGES = 15, 6
-#: Step to either side of the focus, and how far beyond the range objects are thought of, in depths of focus.
-SIDE, BEYOND = 4.5, 10.0
-#: Standard deviation [depths of focus] above which another image is taken.
-PRECISION = 0.25
+MOST_IMAGES, EXPECTED_IMAGES = 15, 7
+#: Steps to either side of the focus, at least and at most, and how far beyond the range objects are thought of, in
+#: depths of focus. The last images are one and two steps to either side.
+SIDE, SIDE_MAX, BEYOND = 3.0, 9.0, 10.0
+#: Where the last images are, and more of them above a standard deviation of so many depths of focus, in steps.
+LAST, MORE, PRECISION = (-1, 1, -2, 2), (0, 1.5, -1.5, 0.5, -0.5), 0.2
 
 
 class DepthFromDefocus:
@@ -127,7 +140,7 @@ class DepthFromDefocus:
             return
         _place, spread = _mean_and_spread(self._grid, misfit)
         best = float(np.clip(self._grid[misfit.argmin()], config.low, config.high))
-        side = float(np.clip(2 * spread, SIDE * tolerance, 2 * SIDE * tolerance))
+        side = float(np.clip(2 * spread, SIDE * tolerance, SIDE_MAX * tolerance))
         near = np.abs(places - best) < 2 * side
         if np.where(inside, np.abs(places - best), np.inf).min() > 0.4 * side:
             self._go(best)
@@ -152,16 +165,17 @@ class DepthFromDefocus:
             # What else is in the picture leads the model astray, not the sharpness.
             self._confirm(places, sharpness, int(sharpness.argmax()), side)
             return
-        near = np.abs(offset) < 2 * side
-        grid = places[top] + tolerance * np.arange(-SIDE, SIDE, 0.125)
+        near = np.abs(offset) < 3 * side
+        grid = places[top] + 1.5 * side * np.linspace(-1, 1, 73)
         grid = grid[(grid >= self.config.low) & (grid <= self.config.high)]
         misfit, _evidence = self._model.judge(grid, places[near], np.array(self._powers)[near], TRANSFER_ERROR_NEAR)
         place, spread = _mean_and_spread(grid, misfit)
-        if spread > PRECISION * tolerance and self._more:
-            for wanted in (place - side, place + side, place):
-                if self.config.low <= wanted <= self.config.high and np.abs(places - wanted).min() > 0.3 * side:
-                    self.step = Step(wanted)
-                    return
+        steps = LAST if spread < PRECISION * tolerance else LAST + MORE
+        for wanted in place + side * np.array(steps):
+            free = np.abs(places - wanted).min() > 0.3 * side
+            if free and self._more and self.config.low <= wanted <= self.config.high:
+                self.step = Step(float(wanted))
+                return
         if self._evidence < CERTAIN:
             self._give_up("so little changes with the focus that it may be noise")
             return
@@ -180,7 +194,12 @@ class DepthFromDefocus:
         gap = int(np.diff(ends).argmax())
         width = float(np.diff(ends)[gap])
         parts = math.ceil(width * (points - 1) / (high - low) - 1e-6)
-        if parts < 2:
+        if parts < 2 and self.measured < NOISE_POINTS:
+            self.step = Step(float(places[np.argmax(self._sharpness)]))
+        elif parts < 2 and is_hill(np.array(self._sharpness)[places.argsort()], self.config.least_contrast):
+            # Things at several distances, say: sharpness finds its way without the optics.
+            self._give_up(UNEXPLAINED)
+        elif parts < 2:
             self.done = True
             self.step = Step(float(places[-1]))
         elif self.measured >= points:
@@ -197,7 +216,7 @@ class DepthFromDefocus:
         if self._more:
             self.step = Step(place)
         else:
-            self._give_up("the optics do not explain how the images change with focus")
+            self._give_up(UNEXPLAINED)
 
     def _give_up(self, reason: str) -> None:
         self.gave_up, self.done = reason, True

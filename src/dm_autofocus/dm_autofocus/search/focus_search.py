@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 from numpy.typing import NDArray
 
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import EXPECTED_IMAGES, DepthFromDefocus
-from dm_autofocus.search.peak_search import Peak, PeakSearch, Phase, SearchConfig, Step
+from dm_autofocus.search.peak_search import PeakSearch, SearchConfig
 
 
 class FocusSearch:
@@ -21,73 +22,61 @@ class FocusSearch:
         start: where the mirror stands [1/m]; NaN = not known.
 
     Attributes:
+        current: what searches now: its `step`, `phase`, `done`, `peak` and `config` are those of the search.
         reason: why the range is swept; "" = it is not.
     """
 
     def __init__(self, config: SearchConfig, model: DefocusModel | str, start: float) -> None:
         self.reason = ""
         self._before = 0
-        self._search: DepthFromDefocus | PeakSearch
+        self._model = model
+        self._seen: list[tuple[float, NDArray]] = []  # place and powers of each image
+        self.current: DepthFromDefocus | PeakSearch
         if isinstance(model, str):
-            self._search, self.reason = PeakSearch(config), model
+            self.current, self.reason = PeakSearch(config), model
         else:
-            self._search = DepthFromDefocus(config, model, start)
-
-    @property
-    def config(self) -> SearchConfig:
-        """As given, the range as far as it was not refused."""
-        return self._search.config
-
-    @property
-    def step(self) -> Step:
-        """Where to go next; after the end, where to stand."""
-        return self._search.step
-
-    @property
-    def phase(self) -> Phase:
-        """COARSE or FINE."""
-        return self._search.phase
-
-    @property
-    def done(self) -> bool:
-        """Whether nothing more is to be fed."""
-        return self._search.done
-
-    @property
-    def peak(self) -> Peak | None:
-        """What was found."""
-        return self._search.peak
+            self.current = DepthFromDefocus(config, model, start)
 
     @property
     def measured(self) -> int:
         """Positions measured so far."""
-        return self._before + self._search.measured
+        return self._before + self.current.measured
 
     @property
     def steps(self) -> int:
         """Positions to be measured, about."""
-        expected = EXPECTED_IMAGES if isinstance(self._search, DepthFromDefocus) else self._before + self.config.steps
-        return max(expected, self.measured)
+        swept = isinstance(self.current, PeakSearch)
+        return max(self._before + self.current.config.steps if swept else EXPECTED_IMAGES, self.measured)
 
     def feed(self, sharpness: float | None, images: Sequence[NDArray] = ()) -> None:
-        """Report sharpness and images (H, W) at `step`; None when it was not to be measured."""
-        if isinstance(self._search, PeakSearch):
-            self._search.feed(sharpness)
+        """Report sharpness and images (H, W) at `current.step`; None when it was not to be measured."""
+        model = self._model
+        if sharpness is not None and isinstance(model, DefocusModel) and images and images[0].shape == model.shape:
+            self._seen.append((self.current.step.curvature, model.powers(images[0])))
+        if isinstance(self.current, PeakSearch):
+            self.current.feed(sharpness)
             return
         assert sharpness is not None
-        self._search.feed(sharpness, images)
+        self.current.feed(sharpness, images)
         self._sweep_after_all()
 
     def refuse(self) -> None:
-        """Report that the mirror cannot take `step`. Raises ValueError when hardly anything of the range is left."""
-        self._search.refuse()
+        """Report that the mirror cannot take the step. Raises ValueError when hardly anything of the range is left."""
+        self.current.refuse()
         self._sweep_after_all()
 
     def sweep(self, reason: str, approach: float) -> None:
         """Sweep the range instead, each sweep from `approach` [1/m] below it."""
         self.reason, self._before = reason, self.measured
-        self._search = PeakSearch(replace(self.config, approach=approach))
+        self.current = PeakSearch(replace(self.current.config, approach=approach))
+
+    def fitting_scale(self) -> float:
+        """How many times as large the focal length should be to explain the images; 1 = as it is, or not known."""
+        if isinstance(self._model, str) or self.current.peak is None:
+            return 1.0
+        places, powers = (np.array(part) for part in zip(*self._seen, strict=True))
+        return self._model.fitting_scale(self.current.peak.curvature, places, powers)
 
     def _sweep_after_all(self) -> None:
-        if isinstance(self._search, DepthFromDefocus) and self._search.gave_up:
-            self.sweep(self._search.gave_up, 0.0)
+        if isinstance(self.current, DepthFromDefocus) and self.current.gave_up:
+            self.sweep(self.current.gave_up, 0.0)

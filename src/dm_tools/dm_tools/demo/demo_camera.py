@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # both are slow to import, and `dm --help` needs neither
     from dm_autofocus import CameraFocusClient
     from dm_tools.demo.demo import Hysteresis
 
+#: How fast the nearest object comes nearer [m/s] until it is so far away [m], and how long the search may take [s].
+SPEED, NEAREST, SEARCH_S = 0.7, 4.5, 1.5
 #: Of the calibration: fewer and smaller maps than a bench would take, for a quick demonstration.
 MAPS, PIXELS = 120, 472
 
@@ -66,6 +68,38 @@ def camera_config(folder: Path, law: str, creep: float, seed: int) -> dict[str, 
 def regions(count: int) -> list[tuple[float, float, float, float]]:
     """The middle of each of `count` strips side by side."""
     return [((number + 0.15) / count, 0.15, 0.7 / count, 0.7) for number in range(count)]
+
+
+@dataclass
+class Approach:
+    """Tracking of the first object while it comes nearer.
+
+    Attributes:
+        shots: counted images.
+        distances: true ones of the object when each came [m].
+    """
+
+    shots: list[Shot] = field(default_factory=list)
+    distances: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A focus stack.
+
+    Attributes:
+        shots: its images, in order of the curvature.
+        drift: how far the picture moved over the whole sweep [px].
+        sharp: image that is sharp everywhere (H, W).
+        depth: distances (H, W) [m].
+        seconds: that it took.
+    """
+
+    shots: list[Shot]
+    drift: float
+    sharp: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    seconds: float
 
 
 class Recorder:
@@ -127,6 +161,54 @@ def focus_on(client: CameraFocusClient, recorder: Recorder, item: Focused, settl
     client.focus_distance(item.distance)
     time.sleep(settle)
     item.by_distance = tenengrad(cut(image_now(client, recorder), item.region))
+
+
+def follow(client: CameraFocusClient, recorder: Recorder, region: tuple[float, float, float, float]) -> Approach:
+    """Stay on the first object while it comes nearer."""
+    from dm_msgs.msg import AutofocusState
+    from rclpy.parameter import Parameter
+    from rclpy.parameter_client import AsyncParameterClient
+
+    bench, begun, approach = AsyncParameterClient(client.node, "virtual_bench"), math.nan, Approach()
+    recorder.shots.clear()
+
+    def move(feedback: Any) -> None:
+        nonlocal begun
+        if feedback.phase != AutofocusState.PHASE_TRACK:
+            return
+        now = time.monotonic()
+        begun = now if math.isnan(begun) else begun
+        distance = max(DISTANCES[0] - SPEED * (now - begun), NEAREST)
+        if recorder.shots and distance > NEAREST:
+            approach.shots.append(recorder.shots[-1])
+            approach.distances.append(distance)
+        bench.set_parameters([Parameter("camera.distances", value=[distance, *DISTANCES[1:]])])
+
+    with console.status(f"the nearest object comes nearer by {SPEED:g} m/s"):
+        client.track(SEARCH_S + (DISTANCES[0] - NEAREST) / SPEED, region, move)
+        bench.set_parameters([Parameter("camera.distances", value=list(DISTANCES))])
+        time.sleep(0.3)
+    return approach
+
+
+def sweep_of(client: CameraFocusClient, recorder: Recorder, item: Focused) -> Sweep:
+    """A focus stack, and how far it moved the picture of an object."""
+    from dm_autofocus.boresight import image_shift
+    from dm_autofocus.sharpness import check_region, cut
+
+    recorder.shots.clear()
+    with console.status("a focus stack"):
+        result, sharp, depth = client.focus_stack()
+    shots = sorted(recorder.shots, key=lambda shot: shot.curvature)
+    # Pairs that are blurred alike, on either side of the object's focus.
+    middle = int(np.argmin([abs(shot.curvature - item.result.curvature) for shot in shots]))
+    region, moved = check_region(item.region), []
+    for step in range(1, min(4, middle, len(shots) - 1 - middle) + 1):
+        below, above = shots[middle - step], shots[middle + step]
+        shift = image_shift(cut(below.image, region), cut(above.image, region))
+        moved.append(np.hypot(*shift) / (above.curvature - below.curvature))
+    drift = float(np.median(moved)) * (shots[-1].curvature - shots[0].curvature) if moved else math.nan
+    return Sweep(shots, drift, sharp[..., 0], depth, result.duration)
 
 
 def figures_of(item: Focused) -> dict[str, Any]:
@@ -210,11 +292,17 @@ def demo_camera(
             ]
             for item in found:
                 focus_on(camera, recorder, item)
+            sweep = sweep_of(camera, recorder, found[1])
+            approach = follow(camera, recorder, found[0].region)
     show(found, reach.curvature_tolerance)
+    console.print(
+        f"focus stack of {len(sweep.shots)} images in {sweep.seconds:.1f} s; the picture moved by {sweep.drift:.1f} px "
+        f"meanwhile; an object was tracked over {len(approach.shots)} images"
+    )
     title = f"autofocus through a simulated PDM30-37, hysteresis: {law}"
     with console.status("writing the animation"):
         sheet = save_contact_sheet(found, folder / "camera.png", title)
-        animation = save_animation(found, folder / "camera.gif", title)
+        animation = save_animation(found, sweep, approach, folder / "camera.gif", title)
     console.print(f"pictures: {os.path.relpath(sheet)}, {os.path.relpath(animation)}")
     write_json(
         json,
@@ -224,6 +312,8 @@ def demo_camera(
             "seed": seed,
             "calibration": calibration_figures(calibrated),
             "camera": [figures_of(item) for item in found],
+            "stack": {"images": len(sweep.shots), "seconds": sweep.seconds, "drift_px": sweep.drift},
+            "tracked_images": len(approach.shots),
             "depth_of_focus_dioptre": 2 * reach.curvature_tolerance,
             "seconds": time.monotonic() - started,
         },

@@ -1,8 +1,8 @@
-"""Pictures of searches: a contact sheet and an animation."""
+"""Pictures of the camera's demonstration: a contact sheet and an animation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -72,37 +73,83 @@ def save_contact_sheet(found: Sequence[Any], path: Path, title: str) -> Path:
     return path
 
 
-def save_animation(found: Sequence[Any], path: Path, title: str, frames_per_second: int = 12) -> Path:
-    """Every counted image of every search, one after the other, with the sharpness beside it, as a GIF.
+def save_animation(
+    found: Sequence[Any], sweep: Any, approach: Any, path: Path, title: str, frames_per_second: int = 12
+) -> Path:
+    """What the camera does, as a GIF: searches, a sweep in which the picture stands still, its depth, and tracking.
 
     Args:
         found: as for `save_contact_sheet`.
+        sweep, approach: of `dm demo --camera`.
         path: GIF file to write.
         title: of the animation.
         frames_per_second: of the animation.
     """
-    figure: Figure = plt.figure(figsize=(8.4, 3.6), layout="constrained")
-    figure.suptitle(title, fontsize=9)
-    left, right = figure.subplots(1, 2)
+    figure: Figure = plt.figure(figsize=(8.4, 3.8), layout="constrained")
+    figure.suptitle(title, fontsize=8, color="gray")
+    left, right, below = figure.subplots(1, 3, width_ratios=(1, 1, 0.04))
     picture, frame = _draw_image(left, found[0].shots[0].image, found[0].region, COLOURS[0])
     _sharpness_axes(right, found)
     clouds = [right.plot([], [], "o", color=colour, markersize=3)[0] for colour in COLOURS[: len(found)]]
     cursor = right.axvline(0.0, color="black", linewidth=0.8)
-    schedule = [(number, shown) for number, item in enumerate(found) for shown in range(len(item.shots) + HOLD)]
+    # What stands still: a cross on the middle of the picture.
+    cross = [line(0, color="#F0E442", linewidth=0.8, visible=False) for line in (left.axhline, left.axvline)]
+    depth = right.inset_axes((0, 0, 1, 1))
+    depth.set(visible=False, xticks=[], yticks=[])
+    metres = depth.imshow(sweep.depth, cmap="viridis_r", norm=LogNorm(4, 150), interpolation="nearest")
+    figure.colorbar(metres, cax=below, ticks=[5, 10, 20, 50, 100], format="%g").ax.set_visible(False)
 
-    def draw(at: tuple[int, int]) -> list[Any]:
-        number, shown = at
+    def show(shot: Any, text: str, colour: str, region: Sequence[float] | None = None) -> None:
+        height, width = shot.image.shape
+        picture.set_data(shot.image)
+        frame.set_visible(region is not None)
+        if region is not None:
+            frame.set(xy=(region[0] * width, region[1] * height), edgecolor=colour)
+        cursor.set_xdata([shot.curvature, shot.curvature])
+        left.set_title(text, color=colour, fontsize=9)
+
+    def search(number: int, shown: int) -> None:
         item, colour = found[number], COLOURS[number % len(COLOURS)]
         done = shown >= len(item.shots)
-        shot = item.final if done else item.shots[shown]
-        picture.set_data(shot.image)
-        height, width = shot.image.shape
-        frame.set(xy=(item.region[0] * width, item.region[1] * height), edgecolor=colour)
         past = item.shots[: shown + 1]
         clouds[number].set_data([s.curvature for s in past], [s.sharpness for s in past])
-        cursor.set_xdata([shot.curvature, shot.curvature])
-        text = f"found {item.result.distance:.2f} m" if done else f"searching, image {shown + 1}"
-        left.set_title(f"object at {item.distance:g} m: {text}", color=colour, fontsize=9)
+        text = f"{item.distance:g} m: image {shown + 1}"
+        if done:
+            text = f"{item.distance:g} m: found {item.result.distance:.2f} m, {len(item.shots)} images"
+        show(item.final if done else item.shots[shown], f"1  Few images. {text}", colour, item.region)
+
+    def stand(shown: int) -> None:
+        shot = sweep.shots[shown]
+        for line, centre in zip(cross, shot.image.shape, strict=True):
+            line.set(visible=True)
+            (line.set_ydata if line is cross[0] else line.set_xdata)([centre / 2, centre / 2])
+        show(shot, f"2  The picture stands still: {sweep.drift:.1f} px over the whole sweep", "black")
+
+    def everything(_shown: int) -> None:
+        for line in cross:
+            line.set(visible=False)
+        picture.set_data(sweep.sharp)
+        depth.set(visible=True)
+        below.set_visible(True)
+        left.set_title(f"3  All sharp, and depth: a stack of {sweep.seconds:.1f} s", color="black", fontsize=9)
+        depth.set_title("distance [m]", fontsize=9)
+
+    def track(shown: int) -> None:
+        depth.set(visible=False)
+        below.set_visible(False)
+        text = f"4  Tracking: the object comes nearer, {approach.distances[shown]:.1f} m"
+        show(approach.shots[shown], text, COLOURS[0], found[0].region)
+
+    schedule: list[tuple[Callable[..., None], tuple[int, ...]]] = []
+    for number, item in enumerate(found):
+        schedule += [(search, (number, shown)) for shown in range(len(item.shots) + HOLD)]
+    schedule += [(stand, (shown,)) for shown in range(len(sweep.shots))]
+    schedule += [(everything, (0,))] * 2 * HOLD
+    schedule += [(track, (shown,)) for shown in range(len(approach.shots))]
+    schedule += [(track, (len(approach.shots) - 1,))] * HOLD if approach.shots else []
+
+    def draw(at: tuple[Callable[..., None], tuple[int, ...]]) -> list[Any]:
+        at[0](*at[1])
         return []
 
     draw(schedule[0])
