@@ -16,12 +16,12 @@ from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.check_log import read_checks
 from dm_calibration.recalibration.drift import Drift, DriftRates
-from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions, Verdict
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.atomic_write import StoreError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
-from steady_mirror import SteadyMirror
+from steady_mirror import Floats, SteadyMirror
 
 Made = tuple[SteadyMirror, Calibration]
 
@@ -128,6 +128,26 @@ def test_actuators_that_stick_are_named(
         assert f"actuator {actuator + 1} stands at " in verdict.reason
         assert f"instead of {wanted:+.2f}, as if it were dead" in verdict.reason or abs(wanted) < 0.1
         assert verdict.comparison.probability[actuator] > 0.99
+
+
+def test_one_map_of_an_actuator_that_sticks_widens_the_bound_for_every_other_shape(
+    bench: SteadyMirror, updates: RecalibrationManager
+) -> None:
+    """Where it is asked to stand nearly where it stays, the map shows little of what it does elsewhere."""
+
+    def shown(wanted: Floats) -> Verdict:
+        settled = replace(bench.settled(), effective=wanted)
+        bench.apply(np.where(np.arange(wanted.size) == 6, 0.2, wanted))
+        return updates.take(bench.measure("stuck"), settled)
+
+    rng = np.random.default_rng(4)
+    shapes = rng.uniform(-0.7, 0.7, (20, bench.mirror.actuators))
+    shapes[0, 6] = 0.35
+    first = shown(shapes[0]).comparison.max_zernike
+    bound = updates.disagreement
+    errors = [shown(wanted).comparison.max_zernike for wanted in shapes[1:]]
+    assert max(errors) > 2.0 * first
+    assert max(errors) < bound < 12.0 * first
 
 
 def test_it_goes_on_without_actuators_that_stick(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:

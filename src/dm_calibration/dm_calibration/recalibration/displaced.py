@@ -93,6 +93,19 @@ def described(displaced: Mapping[int, float], probability: Mapping[int, float], 
     return f"{found}; ./dm check {without} goes on without what does not move"
 
 
+def worst_elsewhere(displaced: Mapping[int, float], probability: Mapping[int, float], expected: Floats) -> float:
+    """How many times the error that a map shows another shape may have, where actuators that do not follow make it.
+
+    One that stays where it is errs by as much as it is asked to move: at the far end of the range by most.
+
+    Args:
+        displaced, probability: as :func:`displaced_actuators` finds them; those that are not sure do not count.
+        expected: (N,) effective signals where actuators should stand, within about -1 .. +1.
+    """
+    sure = {actuator: more for actuator, more in displaced.items() if probability[actuator] >= SURE and more}
+    return max((1.0, *((1.0 + abs(expected[actuator] + more)) / abs(more) for actuator, more in sure.items())))
+
+
 def _fault(signal: float, more: float) -> str:
     """What an actuator does that stands `more` beyond its effective `signal`; "" = no single map tells."""
     if abs(signal) < TELLING_SIGNAL:

@@ -21,7 +21,7 @@ from dm_calibration.procedure.applied_history import MapNotUsableError, SettledS
 from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
-from dm_calibration.recalibration.displaced import described
+from dm_calibration.recalibration.displaced import described, worst_elsewhere
 from dm_calibration.recalibration.drift import Drift, DriftRates
 from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
@@ -114,7 +114,8 @@ class RecalibrationManager:
 
     @property
     def disagreement(self) -> float:
-        """Largest coefficient error that maps have shown since one last agreed, m."""
+        """Largest coefficient error that maps have shown since one last agreed, or that the actuators which do not
+        follow, where they have shown such ones, make elsewhere in the range; m."""
         with self._lock:
             return self._disagreement
 
@@ -198,9 +199,11 @@ class RecalibrationManager:
             comparison = drift_filter.compare(updates, *seen)
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
+            found = comparison.displaced, comparison.probability, updates.standing(settled.effective)
+            worst = comparison.max_zernike * worst_elsewhere(*found)
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
-                reason += described(comparison.displaced, comparison.probability, updates.standing(settled.effective))
+                reason += described(*found)
             elif without:
                 reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:
@@ -213,7 +216,7 @@ class RecalibrationManager:
             with suppress(OSError):  # the update itself is stored
                 shown = Check.of(measured.stamp_ns, accepted, comparison, changed)
                 append_check(self._file(calibration.id, LOG_SUFFIX), shown)
-            self._disagreement = 0.0 if accepted else max(self._disagreement, comparison.max_zernike)
+            self._disagreement = 0.0 if accepted else max(self._disagreement, worst)
             if accepted:
                 if not repeat:
                     self._since, self._first_ns = settled.since, measured.stamp_ns
