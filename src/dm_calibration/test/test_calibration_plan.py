@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dm_calibration.influence.surfaces import MODEL_NAMES, TABLE_1
-from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, make_plan
+from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, check_shape, make_plan
 from dm_common.names import UnknownNameError
 from linear_mirror import make_mirror
+from steady_mirror import SteadyMirror
 
 
 def test_full_plan_has_pokes_then_surfaces_then_solved_shapes() -> None:
@@ -75,3 +78,22 @@ def test_a_small_mirror_leaves_surfaces_out_or_refuses_them_by_name() -> None:
 def test_options_out_of_range(options: dict[str, float], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         PlanOptions(**options)  # type: ignore[arg-type]
+
+
+def test_checks_lie_where_the_mirror_is_used() -> None:
+    """About the shape that flattens it; all over the range of one that is flat at an end of it, as a membrane."""
+    bench = SteadyMirror()
+    fit = bench.calibrate().fit
+    pulled = replace(fit, sag_offset=-fit.influence_sag @ np.full(fit.actuators, -0.9))
+    plan = make_plan(PlanKind.HYSTERESIS, bench.mirror, PlanOptions(hysteresis_maps=150))
+    steps = [step for step in plan.steps if step.kind is StepKind.CHECK]
+    levels = {}
+    for name, model in (("two-sided", fit), ("one-sided", pulled)):
+        shapes = [check_shape(step, model, bench.mirror).signals for step in steps]
+        levels[name] = np.array([shape.mean() for shape in shapes if shape is not None])
+        assert all(shape is not None and bench.mirror.limits.allow(shape) for shape in shapes)
+    assert np.allclose(
+        levels["two-sided"], [step.signals.mean() for step in steps if step.signals is not None], atol=0.1
+    )
+    assert levels["one-sided"].min() < -0.7 and levels["one-sided"].max() > 0.7
+    assert abs(levels["one-sided"].mean()) < 0.25

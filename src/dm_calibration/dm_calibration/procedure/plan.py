@@ -24,6 +24,9 @@ FIRST_PART, NEXT_PART = 120, 60
 LAST_PART_ENDS = 420
 #: Share of the neighbour limit that checks may use: rounding must not break it.
 CHECK_ROOM = 0.999
+#: Share of the range from mid range to an end from which on a mirror that is flat there is one-sided; and by how much
+#: its checks spread further than those about mid range, to reach both ends.
+ONE_SIDED, LEVELS_WIDER = 0.5, 1.5
 
 
 class PlanKind(StrEnum):
@@ -181,11 +184,20 @@ def _parts(options: PlanOptions) -> list[int]:
 def check_shape(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:
     """`step` with the signals that make its shape on a flat surface, as every request in use does.
 
-    The law is tested, and fitted, where it will be used: about the signals that flatten the mirror.
+    The law is tested, and fitted, where it will be used: about the signals that flatten the mirror. Where that is an
+    end of its range, as of a membrane that is only pulled, at levels all over the range.
     """
     assert step.signals is not None
     limits = mirror.limits
     inside = replace(limits, neighbour_difference=CHECK_ROOM * limits.neighbour_difference)
+    flat = surfaces.solve_shape(np.zeros_like(model.sag_offset), model, mirror, inside)[0]
+    room = 0.5 * (limits.high - limits.low)
+    if abs((flat - mirror.rest).mean()) > ONE_SIDED * room:
+        away = step.signals - mirror.rest
+        level = float(np.clip(LEVELS_WIDER * away.mean(), -CHECK_ROOM * room, CHECK_ROOM * room))
+        pattern = away - away.mean()
+        share = (CHECK_ROOM * room - abs(level)) / max(float(np.abs(pattern).max()), 1e-12)
+        return replace(step, signals=mirror.rest + level + min(share, 1.0) * pattern)
     target = model.influence_sag @ (step.signals - mirror.rest)
     return replace(step, signals=limits.scaled(surfaces.solve_shape(target, model, mirror, inside)[0])[0])
 
