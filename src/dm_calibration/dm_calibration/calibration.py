@@ -170,9 +170,10 @@ def from_columns(columns: Mapping[str, Column], attributes: Mapping[str, Attribu
         )
     try:
         points = SamplePoints(*(np.asarray(columns[f"points/{name}"], dtype=np.float64) for name in _POINTS))
-        # Files of before it was kept do not tell when the mirror moved, nor of interruptions.
+        # Files of before it was kept do not tell when the mirror moved, nor of interruptions and temperature.
         unknown = np.zeros(len(columns["maps/stamp_ns"]), dtype=np.int64)
-        columns = {"maps/moved_ns": unknown, "maps/segment": unknown, **columns}
+        before = {"moved_ns": unknown, "segment": unknown, "temperature": np.full(len(unknown), np.nan)}
+        columns = {f"maps/{name}": value for name, value in before.items()} | dict(columns)
         raw: dict[str, Any] = {f.name: columns[f"maps/{f.name}"] for f in fields(MapSet) if f.name != "points"}
         maps = MapSet(points=points, **raw)
         # Nothing was known of the instrument before it was kept.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,7 @@ def put_updates(
     doubts: list[str],
     mirror_changed: bool,
     disagreement: float,
+    warm_error: float = 0.0,
 ) -> None:
     """What later maps have shown, into the `message` of the calibration that they update.
 
@@ -96,11 +98,12 @@ def put_updates(
         doubts: sentences, added to the known limitations.
         mirror_changed: the calibration no longer counts as CALIBRATED.
         disagreement: largest coefficient error that maps have shown since one last agreed, m: no bound is below it.
+        warm_error: what a temperature that is not known may change, m.
     """
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
-    message.held_out_max_zernike = max(message.held_out_max_zernike, disagreement)
-    message.hysteresis.held_out_max_zernike = max(message.hysteresis.held_out_max_zernike, disagreement)
+    for promise in (message, message.hysteresis):
+        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, disagreement), warm_error)
     message.revision = updates.revision
     message.checked = time_message(updates.checked_ns)
     message.gain_drift = abs(updates.largest_gain[0])

@@ -163,6 +163,12 @@ PARAMETERS = (
         "A calibration that no map has agreed with for so long is stale (default: 30 days).",
         live=True,
     ),
+    Parameter(
+        "temperature.silent_after",
+        real(60.0, 0.1, 86400.0, "s"),
+        "After so long without a message on `temperature` that of the mirror is not known.",
+        live=True,
+    ),
 )
 
 

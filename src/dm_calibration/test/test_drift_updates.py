@@ -218,6 +218,71 @@ def test_a_mirror_that_does_not_drift_is_not_made_worse(
     assert kept < 1.02 * without
 
 
+def warm_months(
+    bench: SteadyMirror, updates: RecalibrationManager, rng: np.random.Generator, gain: float, figure: float, maps: int
+) -> None:
+    """Maps of random shapes, a day apart, at 15 to 25 degC; gains and astigmatism change by so much per K."""
+    for _ in range(maps):
+        temperature = float(rng.uniform(15.0, 25.0))
+        warm(bench, rng, gain, figure, temperature)
+        measured = replace(bench.measure("warm", days=1.0), temperature=temperature)
+        verdict = updates.take(measured, bench.settled())
+        assert verdict.accepted, verdict.reason
+
+
+def warm(bench: SteadyMirror, rng: np.random.Generator, gain: float, figure: float, temperature: float) -> None:
+    """Another shape at this temperature; the calibration is of 20 degC."""
+    bench.drift(gain * (temperature - 20.0), figure * (temperature - 20.0) * np.sqrt(6.0) * (np.arange(21) == 4))
+    bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
+
+
+def at_20_degrees(made: Made) -> Made:
+    bench, calibration = made
+    maps = calibration.maps
+    return bench, replace(calibration, maps=replace(maps, temperature=np.full(len(maps), 20.0)))
+
+
+@pytest.mark.parametrize(("gain", "figure"), [(1e-3, 2e-9), (0.0, 3e-9), (-2e-3, 0.0)])
+def test_what_the_temperature_does_is_foretold(
+    bench: SteadyMirror, made: Made, tmp_path: Path, gain: float, figure: float
+) -> None:
+    """Learnt from a month of maps, stored, and corrected at a temperature that has not been before."""
+    warmed, rng = at_20_degrees(made), np.random.default_rng(21)
+    warm_months(bench, begun(warmed, tmp_path), rng, gain, figure, 30)
+    updates, errors = begun(warmed, tmp_path), []
+    assert known(updates).thermal_trust > 0.5
+    for temperature in (12.0, 16.0, 24.0, 28.0):
+        warm(bench, rng, gain, figure, temperature)
+        fits = (made[1].fit, updates.changed_fit(), updates.changed_fit(temperature))
+        errors.append([error(bench, fit) for fit in fits if fit is not None])
+    without, not_known, with_temperature = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert with_temperature < 0.3 * without
+    # Where it stops coming the bound says what it may do; where it comes, no bound is wider.
+    bound = updates.warm_error(float("nan"))
+    assert 0.3 * not_known < bound < 10.0 * not_known
+    assert updates.warm_error(20.0) == 0.0
+    message = calibration_message(updates.calibration, None, "mirror", 1.0)
+    put_updates(message, known(updates), changed_fit(updates), [], False, 0.0, bound)
+    assert message.held_out_max_zernike > bound
+    warm(bench, rng, gain, figure, 25.0)  # and a map without it is still taken
+    assert updates.take(bench.measure("not known"), bench.settled()).accepted
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_temperature_that_does_nothing_makes_nothing_worse(
+    bench: SteadyMirror, made: Made, tmp_path: Path, seed: int
+) -> None:
+    warmed, rng, errors = at_20_degrees(made), np.random.default_rng(seed), []
+    updates = begun(warmed, tmp_path)
+    for _ in range(12):
+        warm_months(bench, updates, rng, 0.0, 0.0, 1)
+        bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
+        fits = (made[1].fit, updates.changed_fit(float(rng.uniform(15.0, 25.0))))
+        errors.append([error(bench, fit) for fit in fits if fit is not None])
+    without, kept = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert kept < 1.02 * without
+
+
 def test_nothing_is_used_before_a_second_shape_has_borne_it_out(
     bench: SteadyMirror, made: Made, updates: RecalibrationManager
 ) -> None:

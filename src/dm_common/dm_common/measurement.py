@@ -45,6 +45,7 @@ class Measurement:
         nominal: (K,) coefficients of the surface that was aimed at, m; None when signals were prescribed.
         segment: number of the degauss, or of the resumption, from which the history of the actuators is known; 0 for a
             run that was not interrupted.
+        temperature: of the mirror, degC; NaN = not known.
     """
 
     points: SamplePoints
@@ -76,6 +77,7 @@ class Measurement:
     applied: Floats = field(default_factory=lambda: np.zeros(0))
     nominal: Floats | None = None
     segment: int = 0
+    temperature: float = float("nan")
 
     def same_map(self, other: Measurement) -> bool:
         """Whether both are of one map: of one stamp, or one file under another stamp.

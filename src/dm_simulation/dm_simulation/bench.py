@@ -143,6 +143,12 @@ class VirtualBench:
 
         return self.electronics.run(sample)
 
+    def temperature(self) -> float:
+        """degC now, of a plate on piezo stacks."""
+        assert isinstance(self.actuators, PiezoActuators)
+        self.displacement()
+        return self.actuators.temperature
+
     def photograph(self) -> NDArray[np.uint8]:
         """An image (height, width) of the scene through the mirror as its surface truly is at this moment.
 

@@ -78,6 +78,11 @@ PARAMETERS = (
     ),
     Parameter("piezo.stiffening", real(_PIEZO.stiffening, 0.0, 0.2), "Share of stroke lost at its ends, in squares."),
     Parameter("piezo.drift", real(_PIEZO.drift, 0.0, 1e-7, "m"), "Drift of the bases over a day."),
+    Parameter("piezo.swing", real(_PIEZO.swing, 0.0, 20.0, "K"), "Swing of the temperature over a day, about 20 degC."),
+    Parameter(
+        "piezo.warm_gain", real(_PIEZO.warm_gain, -0.01, 0.01, "1/K"), "Relative change of all gains per kelvin."
+    ),
+    Parameter("piezo.warm_base", real(_PIEZO.warm_base, 0.0, 1e-7, "m/K"), "What bases go by per kelvin, spread."),
     Parameter("membrane.diameter", real(_MEMBRANE.diameter, 1e-3, 1.0, "m"), "Diameter inside the frame."),
     Parameter("membrane.tension", real(_MEMBRANE.tension, 1e-3, 1e5, "N/m"), "Tension of the membrane."),
     Parameter("membrane.gap", real(_MEMBRANE.gap, 1e-6, 1e-2, "m"), "From the electrodes to the flat membrane."),

@@ -2,7 +2,8 @@
 
 Other nodes meet it as they meet hardware: on the wire and in map files. ROS carries only what a person at the bench
 would do: pull the plug (`~/power`), press the instrument's button (`~/trigger`), read the labels (`~/endpoints`); and
-the images of the camera behind the mirror (`image_raw`, `camera_info`), which a driver of a real camera would publish.
+the images of the camera behind the mirror (`image_raw`, `camera_info`), which a driver of a real camera would publish;
+and the temperature of a plate on piezo stacks (`temperature`), which a sensor would.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -31,10 +32,13 @@ from dm_common.ros.parameters import declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
 from dm_simulation.camera import camera_matrix
+from dm_simulation.mirror.piezo import PiezoActuators
 from dm_simulation.parameters import PARAMETERS, bench_config
 
 #: Longest wait for the driver to leave before this node does, s; `ros2 launch` loses patience after 5 s.
 DRIVER_LEAVES_S = 4.0
+#: Time between two readings of the thermometer, s of the bench's time.
+READING_S = 2.0
 
 
 class FastClock:
@@ -73,6 +77,9 @@ class VirtualBenchNode(Node):
             self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=1))
             self._ticker = threading.Thread(target=self._tick, args=(values["clock.period"],), daemon=True)
             self._ticker.start()
+        if isinstance(self.bench.actuators, PiezoActuators):
+            self._temperature_publisher = self.create_publisher(Temperature, "temperature", qos_profile_sensor_data)
+            self.create_timer(max(READING_S / max(speed, 1.0), 0.01), self._read_temperature)
         self._camera_thread: threading.Thread | None = None
         if self.bench.camera is not None:
             # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
@@ -108,6 +115,12 @@ class VirtualBenchNode(Node):
         while not self._stop.wait(period):
             seconds, nanoseconds = divmod(self._fast_clock.now_ns(), 1_000_000_000)
             self._clock_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+
+    def _read_temperature(self) -> None:
+        seconds, nanoseconds = divmod(round(self._now() * 1e9), 1_000_000_000)
+        reading = Temperature(temperature=self.bench.temperature())
+        reading.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
+        self._temperature_publisher.publish(reading)
 
     def _film(self, period: float) -> None:
         while not self._stop.wait(period - time.monotonic() % period):

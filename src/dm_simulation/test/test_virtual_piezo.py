@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, skew_density
-from dm_simulation.mirror.piezo import DRAWN, PiezoActuators, PiezoConfig
+from dm_simulation.mirror.piezo import DRAWN, ROOM, PiezoActuators, PiezoConfig
 from dm_simulation.mirror.preisach import PreisachOperator, drawn_density
 
 Array = NDArray[np.float64]
@@ -321,3 +321,20 @@ def test_a_stuck_actuator_stays_and_the_others_go_on() -> None:
     actuators.stuck[0] = True
     actuators.apply(np.full(2, 0.5), 0.0)
     np.testing.assert_allclose(actuators.displacement, [0.0, 2e-6])
+
+
+def test_gains_and_bases_go_with_the_temperature() -> None:
+    """By the share of the gains and the lengths of the bases that belong to one kelvin; nothing else changes."""
+    config = PiezoConfig(law="none", creep=0.0, swing=2.0, warm_gain=1e-3, warm_base=5e-9)
+    actuators = PiezoActuators(config, np.random.default_rng(3), np.zeros(4))
+    seen = []
+    for time in (1000.0, 40000.0):
+        shapes = []
+        for signals in (np.zeros(4), np.full(4, 0.5)):
+            actuators.apply(signals, time)
+            shapes.append(actuators.displacement)
+        seen.append((actuators.temperature - ROOM, shapes[0], shapes[1] - shapes[0]))
+    (colder, bases, moved), (warmer, later, more) = seen
+    assert abs(warmer - colder) > 0.5 and max(abs(warmer), abs(colder)) <= 2.0
+    np.testing.assert_allclose(bases / colder, later / warmer)
+    np.testing.assert_allclose(more / moved, (1.0 + 1e-3 * warmer) / (1.0 + 1e-3 * colder), rtol=1e-12)

@@ -50,6 +50,7 @@ class MapSet:
     nominal: Floats
     moved_ns: NDArray[np.int64]
     segment: NDArray[np.int64]
+    temperature: Floats
 
     def __post_init__(self) -> None:
         points = self.points
@@ -68,6 +69,7 @@ class MapSet:
             "nominal": (count, terms),
             "moved_ns": (count,),
             "segment": (count,),
+            "temperature": (count,),
         }
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:

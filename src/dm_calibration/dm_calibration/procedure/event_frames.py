@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
@@ -100,6 +101,8 @@ def _plain(value: Any, arrays: list[bytes]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for name in _RECORD if isinstance(value, Measurement) else [field.name for field in fields(value)]:
         item = getattr(value, name)
+        if name == "temperature" and math.isnan(item):
+            continue  # as before it was kept
         if isinstance(item, np.ndarray):
             place = sum(map(len, arrays))
             arrays.append(np.ascontiguousarray(item, dtype="<f8").tobytes())

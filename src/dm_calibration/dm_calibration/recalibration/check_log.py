@@ -7,8 +7,7 @@ import math
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
-from dm_calibration.recalibration.drift import Drift
-from dm_calibration.recalibration.drift_filter import Comparison
+from dm_calibration.recalibration.drift import Comparison, Drift
 
 SUFFIX = ".checks.csv"
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 Floats = NDArray[np.float64]
 
@@ -17,10 +19,23 @@ class DriftRates:
     Attributes:
         gain: relative, of each gain; half of the variance is common to all (temperature).
         figure: m rms.
+        warm_gain, warm_figure: the same for one K, known beforehand of a mirror that no map has shown warmer.
     """
 
     gain: float = 3e-4
     figure: float = 1e-9
+    warm_gain: float = 1e-3
+    warm_figure: float = 2e-9
+
+    def growth(self, actuators: int, values: int) -> Floats:
+        """(N + 2 R + 1, N + 2 R + 1) that one day adds to the covariance of a drift."""
+        figure = self.figure**2 / values * np.eye(values)
+        gains = 0.5 * self.gain**2 * (np.eye(actuators) + 1.0)
+        return np.asarray(block_diag(gains, figure, np.zeros((1 + values, 1 + values))))
+
+    def warm(self, values: int) -> Floats:
+        """(1 + R,) variances of what one K does."""
+        return np.array([self.warm_gain**2, *np.full(values, self.warm_figure**2 / values)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +45,8 @@ class Drift:
     Attributes:
         gain: (N,) relative changes.
         offset: (R,) m rms, change of the figure in reduced values.
-        covariance: (N + R, N + R) of both.
+        thermal: (1 + R,) per K: relative change of all gains, and m rms, change of the figure in reduced values.
+        covariance: (N + 2 R + 1, N + 2 R + 1) of gain, offset and thermal.
         stamp_ns: time it holds for.
         revision: maps taken in.
         checked_ns: stamp of the last of them; 0 = none.
@@ -38,25 +54,44 @@ class Drift:
         foretold: sum of squares of the changes that were foretold to maps, in standard deviations.
         borne_out: sum of their products with the changes that the maps showed.
         stuck: (N,) effective signals at which actuators stand that do not move any more; NaN = it moves.
+        temperatures: (3,) degC, that gain and offset hold at, and the lowest and highest of the maps; NaN = not known.
+        warm_foretold, warm_borne_out: as `foretold` and `borne_out`, of the changes by temperature alone.
     """
 
     gain: Floats
     offset: Floats
+    thermal: Floats
     covariance: Floats
     stamp_ns: int
     stuck: Floats
+    temperatures: Floats
     revision: int = 0
     checked_ns: int = 0
     surprising: int = 0
     foretold: float = 0.0
     borne_out: float = 0.0
+    warm_foretold: float = 0.0
+    warm_borne_out: float = 0.0
 
     @property
     def trust(self) -> float:
         """The share of gain and offset that maps not used for them have borne out, 0 to 1."""
-        if self.foretold <= 0.0:
-            return 0.0
-        return float(np.clip((self.borne_out - np.sqrt(self.foretold)) / self.foretold, 0.0, 1.0))
+        return _share(self.foretold, self.borne_out)
+
+    @property
+    def thermal_trust(self) -> float:
+        """The same of the changes by temperature."""
+        return _share(self.warm_foretold, self.warm_borne_out)
+
+    def warmer(self, temperature: float) -> float:
+        """K above what gain and offset hold at; 0 where not known."""
+        above = temperature - float(self.temperatures[0])
+        return above if np.isfinite(above) else 0.0
+
+    @property
+    def temperature_range(self) -> float:
+        """K by which maps were colder or warmer than what gain and offset hold at, at most; 0 where not known."""
+        return float(np.nan_to_num(np.abs(self.temperatures - self.temperatures[0]).max()))
 
     def standing(self, effective: Floats) -> Floats:
         """Where the actuators stand when `effective` (N,) is asked for."""
@@ -75,7 +110,69 @@ class Drift:
         index = int(np.abs(self.gain).argmax())
         return self.trust * float(self.gain[index]), index
 
+    def figures(self) -> dict[str, object]:
+        """For diagnostics, as they are used."""
+        gain, actuator = self.largest_gain
+        return {
+            "gain_drift_percent": round(100.0 * gain, 4),
+            "gain_drift_actuator": actuator + 1,
+            "offset_drift_nm": round(self.offset_rms * 1e9, 3),
+            "gain_per_kelvin_percent": round(100.0 * self.thermal_trust * float(self.thermal[0]), 4),
+            "figure_per_kelvin_nm": round(1e9 * self.thermal_trust * float(np.linalg.norm(self.thermal[1:])), 3),
+            "revision": self.revision,
+        }
+
     @property
     def offset_rms(self) -> float:
         """Change of the figure as it is used, m rms."""
         return self.trust * float(np.linalg.norm(self.offset))
+
+
+class Taken(NamedTuple):
+    """A map that came later.
+
+    Attributes:
+        coefficients: (K,) m.
+        sag: (P,) m, NaN = no data.
+        effective: (N,) effective signals at the time of the map.
+        stamp_ns: of the map; a time before the drift's is taken as the drift's.
+        repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
+            does not average out, so repeats count for less and less.
+        temperature: degC; NaN = not known. That of the first map which tells it stands for that of a calibration
+            which does not.
+    """
+
+    coefficients: Floats
+    sag: Floats
+    effective: Floats
+    stamp_ns: int
+    repeat: int = 0
+    temperature: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A map against its prediction.
+
+    Attributes:
+        max_zernike: m, largest difference of a coefficient beyond tilt from the calibration as it is used.
+        rms: m rms of the difference in sag, piston and tilt removed.
+        surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
+            all values, and the largest single one over the largest to be expected of so many.
+        updated: the drift with this map taken in.
+        displaced: {index: effective signal more than there should be} of the actuators that the difference comes from,
+            the worst first, where a few of them explain it: one that sticks, say.
+        probability: {index: of each of them, against any other actuator and against a map that is bad all over}.
+    """
+
+    max_zernike: float
+    rms: float
+    surprise: float
+    updated: Drift
+    displaced: dict[int, float]
+    probability: dict[int, float]
+
+
+def _share(foretold: float, borne_out: float) -> float:
+    """The positive-part estimate of a regression through the origin, less one standard error."""
+    return float(np.clip((borne_out - np.sqrt(foretold)) / foretold, 0.0, 1.0)) if foretold > 0.0 else 0.0

@@ -1,15 +1,17 @@
 """Gains and figure of a calibrated mirror, followed by recursive least squares over maps that arrive later.
 
-In the reduced values of a map (:class:`~dm_calibration.hysteresis.reduction.Reduction`) a calibration says
-``v = v0 + V e`` with the effective signals e. Later it is ``v = v0 + d + V diag(e) (1 + g)``: gains have changed by the
-shares g, the figure by d. Both walk at random, so what is known of them fades with time; each map is one step of the
-Kalman filter, which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section
-11.3).
+In the reduced values of a map (:class:`~dm_calibration.hysteresis.reduction.Reduction`) a calibration says ``v = v0 + V
+e`` with the effective signals e. Later it is ``v = v0 + d + V diag(e) (1 + g)``: gains have changed by the shares g,
+the figure by d. Where maps tell the temperature, t above that of the calibration, ``k t V e + h t`` comes on top: k of
+all gains and h of the figure do not change. Gains and figure walk at random, so what is known of them fades with time;
+each map is one step of the Kalman filter, which is recursive least squares with that forgetting (Ljung, System
+Identification, 2nd ed., section 11.3).
 
 An estimate of drift is noise as well, and on a mirror that stands still nothing else: taken over as it is, it makes the
 calibration worse. So each map is first a test of what the maps before it made out: the change that they foretell,
 against the change that it shows. Only the share of the former that this evidence carries is used (the positive-part
 estimate of a regression through the origin, less one standard error), none of it before a second shape was measured.
+Changes by temperature are tested so by themselves.
 
 A map that departs further from its prediction than chance allows is a bad map, or the mirror is another one: the caller
 must not take it in.
@@ -17,7 +19,7 @@ must not take it in.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +34,7 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.displaced import displaced_actuators, displacement
-from dm_calibration.recalibration.drift import Drift, DriftRates
+from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, Taken
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
@@ -51,36 +53,14 @@ DISPLACED_SIGMAS = 4.0
 GAIN_SIGMA_MAX = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """A map against its prediction.
-
-    Attributes:
-        max_zernike: m, largest difference of a coefficient beyond tilt from the calibration as it is used.
-        rms: m rms of the difference in sag, piston and tilt removed.
-        surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
-            all values, and the largest single one over the largest to be expected of so many.
-        updated: the drift with this map taken in.
-        displaced: {index: effective signal more than there should be} of the actuators that the difference comes from,
-            the worst first, where a few of them explain it: one that sticks, say.
-        probability: {index: of each of them, against any other actuator and against a map that is bad all over}.
-    """
-
-    max_zernike: float
-    rms: float
-    surprise: float
-    updated: Drift
-    displaced: dict[int, float]
-    probability: dict[int, float]
-
-
 class _Innovation(NamedTuple):
     """A map against its prediction, in R reduced values.
 
     Attributes:
-        prior: (N + R, N + R) covariance of gains and figure at its time.
-        design: (R, N + R) what it shows of them.
-        foretold, shown: (R,) change that the maps before foretell, and that it shows, m rms.
+        prior: (N + 2 R + 1, N + 2 R + 1) covariance of gains, figure and what temperature does, at its time.
+        design: (R, N + 2 R + 1) what it shows of them.
+        foretold, warm, shown: (R,) change that the maps before foretell, that they foretell of the temperature, and
+            that it shows, m rms.
         expected: (R, R) covariance of their difference.
         factor: Cholesky factor of that.
         zernike_error, sag_error: (K,) and (P,) m, from the calibration as it is used.
@@ -89,6 +69,7 @@ class _Innovation(NamedTuple):
     prior: Floats
     design: Floats
     foretold: Floats
+    warm: Floats
     shown: Floats
     expected: Floats
     factor: tuple[Floats, bool]
@@ -122,7 +103,9 @@ class DriftFilter:
             signal_sigma = self._law_sigma(hysteresis)
         self._law = signal_sigma**2 * (self._gain @ self._gain.T)
         self._noise = np.maximum(scatter - np.diag(self._law), NOISE_SHARE_MIN * scatter) + NOISE_MIN
-        self._growth = self._covariance(rates)
+        self._rates, self._growth = rates, rates.growth(fit.actuators, self.reduction.size)
+        known = np.isfinite(maps.temperature) & fit.used
+        self._temperature = float(maps.temperature[known].mean()) if known.any() else np.nan
 
     def start(self, stamp_ns: int) -> Drift:
         """What the calibration itself knows, at its time."""
@@ -131,49 +114,55 @@ class DriftFilter:
         share = np.divide(fit.standard_error, fit.response, out=np.full(fit.actuators, GAIN_SIGMA_MAX), where=shows)
         gain = np.square(np.minimum(share, GAIN_SIGMA_MAX))
         offset = (self._noise + np.diag(self._law)) / max(int(fit.used.sum()), 1) + fit.drift_rms**2 / values
-        moving = np.full(fit.actuators, np.nan)
+        warm = self._rates.warm(values)
         return Drift(
-            np.zeros(fit.actuators), np.zeros(values), np.diag(np.concatenate((gain, offset))), stamp_ns, moving
+            gain=np.zeros(fit.actuators),
+            offset=np.zeros(values),
+            thermal=np.zeros(1 + values),
+            covariance=np.diag(np.concatenate((gain, offset, warm))),
+            stamp_ns=stamp_ns,
+            stuck=np.full(fit.actuators, np.nan),
+            temperatures=np.full(3, self._temperature),
         )
 
-    def compare(
-        self, drift: Drift, coefficients: Floats, sag: Floats, effective: Floats, stamp_ns: int, repeat: int = 0
-    ) -> Comparison:
-        """Compare a map with what `drift` makes of `effective`; nothing is changed.
-
-        Args:
-            coefficients: (K,) m.
-            sag: (P,) m, NaN = no data.
-            effective: (N,) effective signals at the time of the map.
-            stamp_ns: of the map; a time before the drift's is taken as the drift's.
-            repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
-                does not average out, so repeats count for less and less.
-        """
-        seen = self._innovation(drift, coefficients, sag, effective, stamp_ns, repeat)
-        prior, design, innovation, factor = seen.prior, seen.design, seen.shown - seen.foretold, seen.factor
+    def compare(self, drift: Drift, taken: Taken) -> Comparison:
+        """Compare a map with what `drift` makes of it; nothing is changed."""
+        stamp_ns, temperature = taken.stamp_ns, taken.temperature
+        seen = self._innovation(drift, taken)
+        prior, design, factor = seen.prior, seen.design, seen.factor
+        innovation = seen.shown - seen.foretold - seen.warm
         shared = prior @ design.T
-        correction = shared @ cho_solve(factor, innovation)
+        gain, offset, thermal = self._parts(shared @ cho_solve(factor, innovation))
         # Joseph form: symmetric and positive whatever the rounding.
         kalman = cho_solve(factor, shared.T).T
         left = np.eye(len(prior)) - kalman @ design
         noise = seen.expected - design @ shared
         covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
-        evidence = (drift.foretold, drift.borne_out)
-        if not repeat:  # a repeat shares the error of the law with the map before it
-            weighed = cho_solve(factor, seen.foretold)
-            new = (float(weighed @ seen.foretold), float(weighed @ seen.shown))
-            evidence = (EVIDENCE_KEPT * evidence[0] + new[0], EVIDENCE_KEPT * evidence[1] + new[1])
+        evidence = np.array((drift.foretold, drift.borne_out, drift.warm_foretold, drift.warm_borne_out))
+        if not taken.repeat:  # a repeat shares the error of the law with the map before it
+            weighed, warm = cho_solve(factor, seen.foretold), cho_solve(factor, seen.warm)
+            rest = seen.shown - drift.thermal_trust * seen.warm, seen.shown - drift.trust * seen.foretold
+            evidence[:2] *= EVIDENCE_KEPT
+            evidence[2:] *= EVIDENCE_KEPT if seen.warm.any() else 1.0  # a map that is not warmer says nothing of it
+            evidence += weighed @ seen.foretold, weighed @ rest[0], warm @ seen.warm, warm @ rest[1]
+        known = np.append(drift.temperatures, temperature)
         updated = replace(
             drift,
-            gain=drift.gain + correction[: len(effective)],
-            offset=drift.offset + correction[len(effective) :],
+            gain=drift.gain + gain,
+            offset=drift.offset + offset,
+            thermal=drift.thermal + thermal,
             covariance=0.5 * (covariance + covariance.T),
             stamp_ns=max(stamp_ns, drift.stamp_ns),
             revision=drift.revision + 1,
             checked_ns=stamp_ns,
             surprising=0,
-            foretold=evidence[0],
-            borne_out=evidence[1],
+            foretold=float(evidence[0]),
+            borne_out=float(evidence[1]),
+            warm_foretold=float(evidence[2]),
+            warm_borne_out=float(evidence[3]),
+            temperatures=np.array(
+                [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
+            ),
         )
         displaced, probability = displaced_actuators(innovation, self._gain, factor)
         departure = remove_piston_tilt(seen.sag_error[None], self._fit.points)[0]
@@ -186,26 +175,15 @@ class DriftFilter:
             probability=probability,
         )
 
-    def give_up(
-        self,
-        drift: Drift,
-        actuators: list[int],
-        coefficients: Floats,
-        sag: Floats,
-        effective: Floats,
-        stamp_ns: int,
-        repeat: int = 0,
-    ) -> Drift:
+    def give_up(self, drift: Drift, actuators: list[int], taken: Taken) -> Drift:
         """`drift` of a mirror on which `actuators` have no effect any more and stand where a map shows them.
-
-        Other args as those of :meth:`compare`.
 
         Raises:
             MapNotUsableError: one stands where it should, as far as the map shows.
         """
-        seen = self._innovation(drift, coefficients, sag, effective, stamp_ns, repeat)
-        away, sigma = displacement(seen.shown - seen.foretold, self._gain, seen.factor, actuators)
-        at = drift.standing(effective)
+        seen = self._innovation(drift, taken)
+        away, sigma = displacement(seen.shown - seen.foretold - seen.warm, self._gain, seen.factor, actuators)
+        at = drift.standing(taken.effective)
         stuck = drift.stuck.copy()
         for actuator, more, error in zip(actuators, away, sigma, strict=True):
             if np.isnan(stuck[actuator]) and abs(more) < DISPLACED_SIGMAS * error:
@@ -216,31 +194,55 @@ class DriftFilter:
             stuck[actuator] = at[actuator] + more
         return replace(drift, stuck=stuck)
 
-    def _innovation(
-        self, drift: Drift, coefficients: Floats, sag: Floats, effective: Floats, stamp_ns: int, repeat: int
-    ) -> _Innovation:
+    def _parts(self, values: Floats) -> tuple[Floats, Floats, Floats]:
+        """Gains, figure and what temperature does, in `values` (N + 2 R + 1, ...)."""
+        ends = self._fit.actuators, self._fit.actuators + self.reduction.size
+        gain, offset, thermal = np.split(values, ends)
+        return gain, offset, thermal
+
+    def _innovation(self, drift: Drift, taken: Taken) -> _Innovation:
+        coefficients, sag, effective, stamp_ns, repeat, temperature = taken
         elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns)) / DAY_S
         prior = drift.covariance + elapsed * self._growth
-        design = np.hstack((self._gain * np.where(np.isnan(drift.stuck), effective, 0.0), np.eye(self.reduction.size)))
-        changed = self.changed(drift)
+        moved = self._gain * np.where(np.isnan(drift.stuck), effective, 0.0)
+        figure, warmer = np.eye(self.reduction.size), drift.warmer(temperature)
+        warmed = warmer * np.column_stack((moved.sum(axis=1), figure))
+        design = np.hstack((moved, figure, warmed))
+        changed = self.changed(drift, temperature)
         predicted_sag = changed.sag_offset + changed.influence_sag @ effective
         zernike_error = coefficients - changed.zernike_offset - changed.influence_zernike @ effective
         sag_error = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0] - predicted_sag
-        foretold = design @ np.concatenate((drift.gain, drift.offset))
-        shown = self.reduction.reduce(zernike_error, sag_error) + drift.trust * foretold
+        foretold, warm = moved @ drift.gain + drift.offset, warmed @ drift.thermal
+        used = drift.trust * foretold + drift.thermal_trust * warm
+        shown = self.reduction.reduce(zernike_error, sag_error) + used
         # What the calibration itself does not know of its influence function, beyond gains.
         leverage = effective @ self._fit.signal_covariance @ effective
         expected = design @ prior @ design.T + (1.0 + leverage) * np.diag(self._noise) + (1.0 + repeat) ** 2 * self._law
-        return _Innovation(prior, design, foretold, shown, expected, cho_factor(expected), zernike_error, sag_error)
+        if np.isnan(temperature):  # what it has been seen to do may have happened
+            unknown = np.column_stack((moved.sum(axis=1), figure)) @ drift.thermal
+            expected += (drift.thermal_trust * drift.temperature_range) ** 2 * np.outer(unknown, unknown)
+        return _Innovation(
+            prior, design, foretold, warm, shown, expected, cho_factor(expected), zernike_error, sag_error
+        )
 
-    def changed(self, drift: Drift) -> InfluenceFit:
+    def warm_error(self, drift: Drift) -> float:
+        """95 % bound of the largest coefficient error where the temperature is not known, m; 0 = it makes no change.
+
+        It is taken to be within the range of those of the maps.
+        """
+        coefficients = np.abs(self.reduction.expand(drift.thermal[1:])[0])
+        coefficients += np.abs(drift.thermal[0]) * np.abs(self._fit.influence_zernike).sum(axis=1)
+        return float(drift.thermal_trust * drift.temperature_range * coefficients[PISTON_TILT:].max())
+
+    def changed(self, drift: Drift, temperature: float = np.nan) -> InfluenceFit:
         """The influence function with gains and figure as far as what `drift` has found of them is borne out.
 
         Actuators that do not move have none: what they do where they stand is part of the figure.
         """
         fit, moves = self._fit, np.isnan(drift.stuck)
-        coefficients, sag = self.reduction.expand(drift.trust * drift.offset)
-        gain = 1.0 + drift.trust * drift.gain
+        warmer = drift.thermal_trust * drift.warmer(temperature)
+        coefficients, sag = self.reduction.expand(drift.trust * drift.offset + warmer * drift.thermal[1:])
+        gain = 1.0 + drift.trust * drift.gain + warmer * drift.thermal[0]
         zernike, surface = fit.influence_zernike * gain, fit.influence_sag * gain
         at = np.where(moves, 0.0, drift.stuck)
         return replace(
@@ -267,14 +269,6 @@ class DriftFilter:
         reach = np.square(self._gain[:count]).sum()
         error = np.square(hysteresis.zernike_sigma[PISTON_TILT:] * TERM_RMS[PISTON_TILT : PISTON_TILT + count]).sum()
         return float(np.sqrt(error / reach))
-
-    def _covariance(self, rates: DriftRates) -> Floats:
-        """(N + R, N + R) that one day adds."""
-        actuators, values = self._fit.actuators, self.reduction.size
-        growth = np.zeros((actuators + values, actuators + values))
-        growth[:actuators, :actuators] = 0.5 * rates.gain**2 * (np.eye(actuators) + 1.0)
-        growth[actuators:, actuators:] = rates.figure**2 / values * np.eye(values)
-        return growth
 
 
 def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool]) -> float:

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from dm_calibration.calibration_manager import CalibrationManager
 from dm_calibration.calibration_messages import put_updates
 from dm_calibration.calibration_parameters import update_options
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
+from dm_calibration.recalibration.temperature import TemperatureLog
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
 from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel
@@ -37,6 +39,14 @@ PUBLISH_PERIOD_S = 1.0
 #: Maps of which messages are still to come, and maps remembered so that none counts twice.
 INCOMPLETE_KEPT = 8
 MAPS_KEPT = 64
+
+
+def _becomes(condition: Callable[[], bool], patience: float) -> bool:
+    """Whether `condition` holds, now or within `patience` s of wall time."""
+    deadline = time.monotonic() + patience
+    while not (held := condition()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return held
 
 
 class MapListener:
@@ -69,6 +79,8 @@ class MapListener:
         self._dirty = False
         self._was_stale = False
         self._published_at = float("-inf")
+        self._temperatures = TemperatureLog(node, lambda: values["temperature.silent_after"])
+        services.temperature = self._temperatures.at
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="updates")
         node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
         node.create_subscription(ZernikeCoefficients, "zernike", lambda m: self._on_part("zernike", m), qos.STATE)
@@ -79,8 +91,6 @@ class MapListener:
     def stop(self) -> None:
         """Take no more maps."""
         self._worker.shutdown(wait=False, cancel_futures=True)
-
-    # --- the calibration in use ---
 
     def begin(self, calibration: Calibration | None) -> None:
         """Keep `calibration` true from now on."""
@@ -95,25 +105,28 @@ class MapListener:
             self._node.get_logger().warning(remark)
         mirror = self._manager.mirror
         middle = float(mirror.rest[0]) if mirror is not None else 0.0
-        hysteresis = calibration.hysteresis if calibration is not None else None
-        law = hysteresis.law if hysteresis is not None else None
+        law = calibration.hysteresis.law if calibration is not None and calibration.hysteresis is not None else None
         if law is not self._law:  # recipes may have been added to the same calibration
             self._law = law
             self._history.follow(law, middle)
 
     def amend(self, message: CalibrationMsg) -> None:
         """Put what maps have shown since into the message of the calibration in use."""
-        updates, fit = self._updates.updates, self._updates.changed_fit()
+        temperature = self._temperatures.published()
+        updates, fit = self._updates.updates, self._updates.changed_fit(temperature)
         if updates is not None and fit is not None:
             self._published_at, self._dirty = time.monotonic(), False
             changed, disagreement = self._updates.mirror_changed, self._updates.disagreement
-            put_updates(message, updates, fit, self._doubts(), changed, disagreement)
+            warm_error = self._updates.warm_error(temperature)
+            put_updates(message, updates, fit, self._doubts(), changed, disagreement, warm_error)
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""
         doubts = self._updates.doubts
         if self._stale:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
+        if error := self._updates.warm_error(self._temperatures.now()):
+            doubts.append(f"The topic temperature does not come: up to {1e9 * error:.1f} nm are not corrected.")
         return doubts
 
     @property
@@ -133,7 +146,9 @@ class MapListener:
         """Publish what is due; called about once a second by the node."""
         stale = self._stale
         due = time.monotonic() - self._published_at >= PUBLISH_PERIOD_S
-        if (self._dirty or stale != self._was_stale) and due:
+        updates = self._updates.updates
+        warmed = updates is not None and updates.thermal_trust > 0.0 and self._temperatures.changed
+        if (self._dirty or stale != self._was_stale or warmed) and due:
             self._was_stale = stale
             self._manager.publish_again()
 
@@ -142,8 +157,6 @@ class MapListener:
         self._dirty = True
         if time.monotonic() - self._published_at >= PUBLISH_PERIOD_S:
             self._manager.publish_again()
-
-    # --- maps ---
 
     def _on_state(self, message: ActuatorState) -> None:
         if not len(message.applied):
@@ -192,11 +205,9 @@ class MapListener:
         self._judged.append(measured)
         still = self._values["updates.still_time"]
         at = 1e-9 * measured.stamp_ns
-        deadline = time.monotonic() + REPORT_WAIT_S
-        while not self._history.heard_since(at + still):
-            if time.monotonic() > deadline:
-                raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
-            time.sleep(0.01)
+        measured = replace(measured, temperature=self._temperatures.at(at))
+        if not _becomes(lambda: self._history.heard_since(at + still), REPORT_WAIT_S):
+            raise Refusal(ErrorCode.DRIVER_UNAVAILABLE, "pdm_driver has not reported since the map was taken")
         self._node.check_active()  # it may have been deactivated meanwhile
         if self._busy():
             raise Refusal(ErrorCode.BUSY, "a calibration is running")
@@ -214,8 +225,6 @@ class MapListener:
     def _refuse(self, reason: str) -> None:
         self._refused, self._last_refusal = self._refused + 1, reason
 
-    # --- the service ---
-
     def _on_update(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> Any:
         try:
             if request.forget:
@@ -231,8 +240,8 @@ class MapListener:
         return response
 
     def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
+        other = "dry_run" if request.dry_run else "without"
         if request.dry_run or request.without:
-            other = "dry_run" if request.dry_run else "without"
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"forget and {other}: only one of them may be set")
         self._calibration()
         with self._turn:
@@ -247,7 +256,8 @@ class MapListener:
             timeout = self._values["driver_timeout"]
             self._services.hold.wait_for(lambda: not self._busy(), request, "a calibration is running", timeout)
             with self._services.held(request, "a map is compared with the calibration (service update_calibration)"):
-                self._wait_for_rest()
+                # A map of a mirror that does not come to rest is refused, with the reason.
+                _becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_as_it_stands("calibration check")
             try:
                 verdict = self._judge(measured, request.dry_run, [number - 1 for number in request.without])
@@ -260,21 +270,14 @@ class MapListener:
         response.max_zernike, response.rms = comparison.max_zernike, comparison.rms
         response.surprise = comparison.surprise
 
-    def _wait_for_rest(self) -> None:
-        """Let a move end, and the mirror stand for as long as it must before a map; not for ever."""
-        still = self._values["updates.still_time"]
-        deadline = time.monotonic() + REPORT_WAIT_S + 2.0 * still
-        while self._history.still_for(1e-9 * self._node.get_clock().now().nanoseconds) < still:
-            if time.monotonic() > deadline:
-                return  # the map will be refused, with the reason
-            time.sleep(0.01)
+    def _rests(self) -> bool:
+        now = 1e-9 * self._node.get_clock().now().nanoseconds
+        return self._history.still_for(now) >= self._values["updates.still_time"]
 
     def _calibration(self) -> Calibration:
-        if (calibration := self._updates.calibration) is None:
+        if self._updates.calibration is None:
             raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
-        return calibration
-
-    # --- health ---
+        return self._updates.calibration
 
     def health(self) -> tuple[bytes, list[str], dict[str, object]]:
         """Level, warnings and figures for the node's diagnostics."""
@@ -287,11 +290,8 @@ class MapListener:
             warnings.append(f"the gain of actuator {actuator + 1} has drifted by {gain:+.2%}")
         if updates.offset_rms > self._values["updates.offset_drift_max"]:
             warnings.append(f"the figure has drifted by {updates.offset_rms * 1e9:.1f} nm rms")
-        figures: dict[str, object] = {
-            "gain_drift_percent": round(100.0 * gain, 4),
-            "gain_drift_actuator": actuator + 1,
-            "offset_drift_nm": round(updates.offset_rms * 1e9, 3),
-            "revision": updates.revision,
+        figures = updates.figures() | {
+            "temperature": self._temperatures.now(),
             "hours_since_check": round(self._age_s / 3600.0, 3),
             "maps_taken": self._taken,
             "maps_refused": self._refused,

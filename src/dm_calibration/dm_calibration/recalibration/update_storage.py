@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.recalibration.drift import Drift
@@ -16,10 +17,10 @@ from dm_common.atomic_write import write_whole
 SCHEMA = "dm_calibration/updates"
 SCHEMA_VERSION = 1
 
-_ARRAYS = ("gain", "offset", "covariance")
+_ARRAYS = ("gain", "offset", "thermal", "covariance")
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
 #: Not in files of before there were such figures: what they hold was used whole, and is: a trust of exactly 1.
-_EVIDENCE = {"foretold": 100.0, "borne_out": 110.0}
+_EVIDENCE = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0}
 _RESULT = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
 
 
@@ -40,7 +41,7 @@ def write_updates(path: Path, identifier: str, basis: str, updates: Drift) -> No
     Raises:
         OSError: what stood there before still does.
     """
-    columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, "stuck")}
+    columns: dict[str, Column] = {name: getattr(updates, name) for name in (*_ARRAYS, "stuck", "temperatures")}
     attributes: dict[str, Attribute] = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -78,16 +79,23 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         if not isinstance(number, int) or number < 0:
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a whole number from 0")
     arrays = {name: columns.get(name) for name in _ARRAYS}
+    if "thermal" not in columns and isinstance(covariance := arrays["covariance"], np.ndarray):
+        size = len(like.covariance) - len(like.thermal)
+        arrays |= {"thermal": like.thermal, "covariance": block_diag(covariance, like.covariance[size:, size:])}
     for name, value in arrays.items():
         shape = getattr(like, name).shape
         if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
-    stuck = columns.get("stuck", like.stuck)  # before it was kept all moved
+    # Before these were kept all actuators moved, and nothing was known of the temperature.
+    stuck = columns.get("stuck", like.stuck)
+    temperatures = np.asarray(columns.get("temperatures", like.temperatures), dtype=np.float64)
+    if temperatures.shape != (3,):
+        raise UpdatesFileError(f"{path.name}: temperatures must be (3,) numbers")
     if not isinstance(stuck, np.ndarray) or stuck.shape != like.stuck.shape or np.isinf(stuck).any():
         raise UpdatesFileError(f"{path.name}: stuck must be {like.stuck.shape} numbers, NaN where an actuator moves")
     evidence = {name: attributes.get(name, before) for name, before in _EVIDENCE.items()}
     for name, number in evidence.items():
         if not isinstance(number, float) or not np.isfinite(number):
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")
-    found: dict[str, Any] = {**arrays, **numbers, **evidence, "stuck": stuck}
+    found: dict[str, Any] = {**arrays, **numbers, **evidence, "stuck": stuck, "temperatures": temperatures}
     return Drift(**found)

@@ -5,6 +5,7 @@ The calibration's own file is never touched. What later maps have shown stands b
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -22,8 +23,8 @@ from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.recalibration.displaced import described, worst_elsewhere
-from dm_calibration.recalibration.drift import Drift, DriftRates
-from dm_calibration.recalibration.drift_filter import Comparison, DriftFilter
+from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, Taken
+from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
 from dm_common.atomic_write import storing
 from dm_common.measurement import Measurement
@@ -114,8 +115,7 @@ class RecalibrationManager:
 
     @property
     def disagreement(self) -> float:
-        """Largest coefficient error that maps have shown since one last agreed, or that the actuators which do not
-        follow, where they have shown such ones, make elsewhere in the range; m."""
+        """Largest error (m) that maps have shown since one agreed, or that actuators they show make elsewhere."""
         with self._lock:
             return self._disagreement
 
@@ -149,22 +149,27 @@ class RecalibrationManager:
             self._filter = DriftFilter(
                 calibration.fit, calibration.maps, calibration.hysteresis, options.signal_sigma, options.rates
             )
-            fresh = self._filter.start(calibration.stamp_ns)
-            self._updates = fresh
+            self._updates = fresh = self._filter.start(calibration.stamp_ns)
             file = self._file(calibration.id)
             try:
-                stored = read_updates(file, calibration.id, self._basis, fresh)
+                self._updates = read_updates(file, calibration.id, self._basis, fresh) or fresh
             except UpdatesFileError as error:
                 return f"updates of {calibration.id} are ignored: {error}"
-            self._updates = stored or fresh
             return ""
 
-    def changed_fit(self) -> InfluenceFit | None:
-        """The influence function as maps have found it; None without a calibration."""
+    def changed_fit(self, temperature: float = math.nan) -> InfluenceFit | None:
+        """The influence function as maps have found it, at `temperature` (degC); None without a calibration."""
         with self._lock:
             if self._filter is None or self._updates is None:
                 return None
-            return self._filter.changed(self._updates)
+            return self._filter.changed(self._updates, temperature)
+
+    def warm_error(self, temperature: float) -> float:
+        """95 % bound of what `temperature` (degC) may change of a coefficient, m; 0 where it is known."""
+        with self._lock:
+            if self._filter is None or self._updates is None or math.isfinite(temperature):
+                return 0.0
+            return self._filter.warm_error(self._updates)
 
     def take(
         self, measured: Measurement, settled: SettledState, dry_run: bool = False, without: Sequence[int] = ()
@@ -193,10 +198,11 @@ class RecalibrationManager:
                     f"{calibration.fit.actuators}"
                 )
             repeat = self._repeats(measured.stamp_ns, settled)
-            seen = measured.coefficients, measured.sag, settled.effective, measured.stamp_ns, repeat
+            where = settled.effective, measured.stamp_ns, repeat, measured.temperature
+            taken = Taken(measured.coefficients, measured.sag, *where)
             if without:
-                updates = drift_filter.give_up(updates, list(without), *seen)
-            comparison = drift_filter.compare(updates, *seen)
+                updates = drift_filter.give_up(updates, list(without), taken)
+            comparison = drift_filter.compare(updates, taken)
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
             found = comparison.displaced, comparison.probability, updates.standing(settled.effective)

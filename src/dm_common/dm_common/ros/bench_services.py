@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -61,6 +62,7 @@ class BenchServices:
         cancelled: asked while waiting.
         map_time: s of ROS time that the last map took; 0 = none was taken yet.
         waiting: called with what is waited for, a node that is missing for example; "" = it goes on.
+        temperature: of the mirror (degC) at a time (s of ROS time); NaN = not known.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
@@ -77,6 +79,7 @@ class BenchServices:
         self.settle_time = float(values["settle_time"])
         self.cancelled: Callable[[], bool] = _never
         self.map_time = 0.0
+        self.temperature: Callable[[float], float] = lambda _time: math.nan
         self._commanded: Floats | None = None
         self._history_known = False
         node.create_subscription(ActuatorState, "actuator_state", self._on_state, qos.STATE)
@@ -211,7 +214,8 @@ class BenchServices:
         try:
             # The state was read after the map, so its stamp is of the write that the map shows.
             moved_ns = stamp_ns(self.state.header.stamp) if self.state is not None else 0
-            return replace(measurement_from(response), moved_ns=moved_ns)
+            measured = measurement_from(response)
+            return replace(measured, moved_ns=moved_ns, temperature=self.temperature(1e-9 * measured.stamp_ns))
         except ValueError as error:
             raise Refusal(ErrorCode.INTERNAL, f"measure: {error}") from error
 
@@ -289,9 +293,7 @@ class BenchServices:
         deadline = time.monotonic() + _STATE_WAIT_S
         while self.state is not None and self._commanded is not None:
             requested = np.array(self.state.requested, dtype=np.float64)
-            if requested.shape == self._commanded.shape and np.allclose(
-                requested, self._commanded, rtol=0.0, atol=_SAME_SIGNAL
-            ):
+            if requested.shape == self._commanded.shape and np.abs(requested - self._commanded).max() <= _SAME_SIGNAL:
                 return
             if time.monotonic() > deadline or self.cancelled():
                 raise Refusal(ErrorCode.PREEMPTED, "somebody else commanded the mirror meanwhile: stop them first")

@@ -14,6 +14,8 @@ from dm_simulation.mirror.zernike import Array
 
 #: Time constants of the part of a loop that lags behind fast moves, s, and how many of them a decade holds.
 LAG_TIMES_S, LAG_PER_DECADE = np.geomspace(1e-3, 10.0, 13), 3
+#: degC, and the length of a day, s.
+ROOM, DAY_S = 20.0, 86400.0
 #: Periods of the drift of a day, s.
 DRIFT_PERIODS_S = np.array([86400.0, 7 * 3600.0, 3600.0])
 
@@ -36,6 +38,9 @@ class PiezoConfig:
         rate_dependence: share by which the loop widens with each decade of speed.
         stiffening: share of half the stroke that is lost at signals -1 and +1, in squares.
         drift: of the bases over a day, m.
+        swing: of the temperature about ROOM over a day, K.
+        warm_gain: relative change of all gains per K.
+        warm_base: standard deviation of what the bases go by per K, m.
     """
 
     stroke: float = 8e-6
@@ -53,10 +58,21 @@ class PiezoConfig:
     rate_dependence: float = 0.0
     stiffening: float = 0.0
     drift: float = 0.0
+    swing: float = 0.0
+    warm_gain: float = 0.0
+    warm_base: float = 0.0
 
 
 #: Stacks of which each has a law, a loop and a creep of its own.
-DRAWN = PiezoConfig(law="drawn_preisach", hysteresis_spread=0.15, creep_spread=0.1, spectrum_spread=0.2)
+DRAWN = PiezoConfig(
+    law="drawn_preisach",
+    hysteresis_spread=0.15,
+    creep_spread=0.1,
+    spectrum_spread=0.2,
+    swing=0.5,
+    warm_gain=5e-4,
+    warm_base=2e-9,
+)
 
 
 class PiezoActuators:
@@ -99,6 +115,12 @@ class PiezoActuators:
         self._crept = np.repeat(self._position[:, None], len(self._creep_times), axis=1)
         self._lagged = np.repeat((self._position - self.signals)[:, None], len(LAG_TIMES_S), axis=1)
         self._time = time
+        self._warm, self._noon = config.warm_base * rng.standard_normal(count), rng.uniform(0.0, 2.0 * np.pi)
+
+    @property
+    def temperature(self) -> float:
+        """degC at the time last given."""
+        return float(ROOM + self.config.swing * np.sin(2.0 * np.pi * self._time / DAY_S + self._noon))
 
     def advance(self, time: float) -> None:
         """Let creep go on until `time`. A clock that jumps back only moves the origin of time."""
@@ -126,4 +148,6 @@ class PiezoActuators:
         moved = position + creep + config.rate_dependence / LAG_PER_DECADE * lag.sum(axis=1)
         moved = moved - config.stiffening * moved * np.abs(moved)
         turns = np.sin(2 * np.pi * self._time / DRIFT_PERIODS_S + self._drift_phase)
-        return np.asarray(config.stroke / 2 * self.gain * moved + (self._drift * turns).sum(axis=1))
+        warmer = self.temperature - ROOM
+        gain = self.gain * (1.0 + config.warm_gain * warmer)
+        return np.asarray(config.stroke / 2 * gain * moved + (self._drift * turns).sum(axis=1) + self._warm * warmer)

@@ -83,7 +83,7 @@ _DECLARED = (
         "calibration",
         "calibration",
         publish=(*_HEALTH, "calibration"),
-        subscribe=("actuator_state", "mirror_info", "surface_map_info", "surface_samples", "zernike"),
+        subscribe=("actuator_state", "mirror_info", "surface_map_info", "surface_samples", "temperature", "zernike"),
         reply=(
             *("fit_influence_function", "fit_regression", "list_calibrations", "load_calibration"),
             *("predict_error", "store_recipes", "update_calibration"),
@@ -138,7 +138,7 @@ _DECLARED = (
 _SIMULATION = NodeInterface(
     "virtual_bench",
     "virtual_bench",
-    publish=(*_HEALTH, CLOCK, "camera_info", "image_raw", "~/endpoints"),
+    publish=(*_HEALTH, CLOCK, "camera_info", "image_raw", "temperature", "~/endpoints"),
     reply=("~/power", "~/trigger"),
 )
 

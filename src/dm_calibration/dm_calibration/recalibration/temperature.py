@@ -1,0 +1,68 @@
+"""The topic `temperature`: what it said when a map was taken, and whether it still comes."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable
+
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Temperature
+
+from dm_common.messages import seconds
+
+#: Readings kept: an hour of one a second.
+KEPT = 3600
+#: A change that is worth publishing what depends on it anew, K.
+WARMED_K = 0.05
+#: What a thermometer may say, degC; anything else is a fault of it.
+POSSIBLE = (-100.0, 200.0)
+
+
+class TemperatureLog:
+    """Readings in the order of their stamps.
+
+    Args:
+        node: listens on the topic `temperature`.
+        silent_after: asked each time: s without a reading from which on the temperature is not known.
+    """
+
+    def __init__(self, node: Node, silent_after: Callable[[], float]) -> None:
+        self._node, self._silent_after = node, silent_after
+        self._readings: deque[tuple[float, float]] = deque(maxlen=KEPT)
+        self._published = math.nan
+        node.create_subscription(Temperature, "temperature", self._on_reading, qos_profile_sensor_data)
+
+    def _on_reading(self, message: Temperature) -> None:
+        now = 1e-9 * self._node.get_clock().now().nanoseconds
+        stamp = seconds(message.header.stamp) or now
+        # One that a clock set back or a torn driver has spoilt is none.
+        if POSSIBLE[0] <= message.temperature <= POSSIBLE[1] and stamp <= now + self._silent_after():
+            if self._readings and stamp < self._readings[-1][0]:
+                self._readings.clear()
+            self._readings.append((stamp, message.temperature))
+
+    def at(self, time: float) -> float:
+        """degC at `time` (s): the last reading before it; NaN when there is none that is recent enough."""
+        readings = list(self._readings)
+        place = bisect_right(readings, (time, math.inf)) - 1
+        if place < 0 or time - readings[place][0] > self._silent_after():
+            return math.nan
+        return readings[place][1]
+
+    def now(self) -> float:
+        """degC now; NaN = not known."""
+        return self.at(1e-9 * self._node.get_clock().now().nanoseconds)
+
+    def published(self) -> float:
+        """The same, of something that is published now."""
+        self._published = self.now()
+        return self._published
+
+    @property
+    def changed(self) -> bool:
+        """Whether it differs from what was published last, came back or stays away."""
+        now, before = self.now(), self._published
+        return not abs(now - before) < WARMED_K and not (math.isnan(now) and math.isnan(before))
