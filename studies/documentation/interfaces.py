@@ -152,8 +152,8 @@ def nodes_and_offers() -> dict[str, list[Offer]]:
         rclpy.init(args=["--ros-args", "--params-file", str(folder / "config.yaml")], domain_id=domain)
         for entry in NODES:
             node = entry.load_class()()
-            if entry.name == "interferometer":
-                node.trigger_configure()  # its publishers come with it
+            if entry.name in ("interferometer", "autofocus"):
+                node.trigger_configure()  # what they publish or hear comes with it
             result[entry.name] = offers_of(node)
             if hasattr(node, "make_safe"):
                 node.make_safe()
