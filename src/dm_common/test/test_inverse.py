@@ -62,9 +62,7 @@ def test_actuators_that_turn_do_not_keep_the_search_from_the_nearest_legal_shape
     law = HysteresisModel(
         np.array([0.0, 0.02, 0.1, 0.3]), np.array([[0.65], [0.1], [0.1], [0.1]]), np.zeros(0), 0.0, 0.0, np.zeros(0)
     )
-    axis = np.arange(-3, 4)
-    x, y = np.array([(a + b / 2, b * 0.75**0.5) for a in axis for b in axis if abs(a + b) <= 3]).T / 3
-    pairs = np.argwhere(np.triu(np.hypot(x[:, None] - x, y[:, None] - y) < 0.4, 1))
+    x, y, pairs = _hexagon()
     matrix, ridge = _smooth_rows(x, y)
     limits = Limits(-1.0, 1.0, pairs, 0.5)
     programme, inverse = BoundedProgramme(matrix, limits, ridge=ridge), ConstrainedInverse(law, limits, matrix, ridge)
@@ -78,6 +76,32 @@ def test_actuators_that_turn_do_not_keep_the_search_from_the_nearest_legal_shape
         left = [np.linalg.norm(matrix @ one.effective - rows) for one in found]
         assert number < move or max(left) < 0.06
         state = law.move(state, found[0].signals, 0.0)
+
+
+def test_where_few_limits_bind_nothing_goes_far_for_what_the_surface_does_not_show() -> None:
+    """Piston costs nothing. All the way to another one the law is not straight, and rounds that went there led astray:
+    a sphere in the middle of the range came out 50 nm off.
+    """
+    x, y, pairs = _hexagon()
+    matrix, ridge = _smooth_rows(x, y)
+    matrix -= matrix.mean(axis=1, keepdims=True)  # piston moves no row
+    inverse = ConstrainedInverse(rich(), Limits(-1.0, 1.0, pairs, 0.3), matrix, 1e-4 * ridge)
+    state = rich().demagnetised(len(x), 0.0)
+    for turn in (-0.9, 0.7):
+        state = rich().move(state, np.full(len(x), turn), 0.0)
+    wanted = 0.6 * (x**2 + y**2) - 0.3
+    start = invert(rich(), state, wanted, -1.0, 1.0).signals
+    assert 0.3 < np.abs(start[pairs[:, 0]] - start[pairs[:, 1]]).max() < 0.35
+    found = inverse.solve(state, matrix @ wanted, 0.0, start)
+    assert np.abs(found.signals - start).max() < 0.05
+    assert np.linalg.norm(matrix @ (found.effective - wanted)) < 1e-2
+
+
+def _hexagon() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places of 37 actuators, and the pairs of neighbours."""
+    axis = np.arange(-3, 4)
+    x, y = np.array([(a + b / 2, b * 0.75**0.5) for a in axis for b in axis if abs(a + b) <= 3]).T / 3
+    return x, y, np.argwhere(np.triu(np.hypot(x[:, None] - x, y[:, None] - y) < 0.4, 1))
 
 
 def _smooth_rows(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:

@@ -4,11 +4,10 @@ On a straight way the play operators set in one after another, and between two o
 in the signal. Its value at all places tells the piece that holds the solution, Newton's method finds it there. The work
 grows with actuators times operators.
 
-Where limits bind, they are those of the signals, and the shape is that of the effective signals. A limit on signals is
-another one on effective signals for every state, so the programme is solved for signals, with the model taken as
-straight about the last solution (sequential quadratic programming), or, where that led further away, on the way to it:
-a few rounds end where the next one changes nothing. Each ends inside the limits: what comes out is the nearest legal
-shape, not a part of the way to one that is not legal.
+Where limits bind, they are those of the signals, and the shape is that of the effective signals. So the programme is
+solved for signals, with the model taken as straight about the last solution (sequential quadratic programming), or,
+where that led further away, on the way to it, until a round gains nothing. Changes weigh a little, which is gone where
+they end: else signals go far for what the surface hardly shows, such as piston. Each round ends inside the limits.
 """
 
 from __future__ import annotations
@@ -37,8 +36,10 @@ LAG_ROUNDS = 2
 SLOPE_MIN = 1e-3
 #: What neighbours stay below their limit: one step of a 16-bit DAC, since each of the two is rounded.
 DAC_STEP = 2.0**-15
-#: Rounds of the programme, and the change of a signal at which it ends.
-ROUNDS, CONVERGED = 8, 1e-6
+#: Rounds of the programme; the change of a signal, and the share of what is missed that is gained, at which it ends.
+ROUNDS, CONVERGED, GAINED = 8, 1e-6, 0.003
+#: Weight of changes, as a share of what signals do at most; its factors after a round that gained nothing, and others.
+NEAR, NEARER, LESS_NEAR = 0.003, 10.0, 0.3
 #: Half the step that the slope of the law is taken over.
 SLOPE_STEP = 1e-4
 
@@ -226,6 +227,7 @@ class ConstrainedInverse:
         self._law, self._limits = law, limits
         stacked = np.vstack((matrix, np.sqrt(ridge) * np.eye(matrix.shape[1])))
         orthogonal, self._root = np.linalg.qr(stacked)
+        self._near = NEAR * float(np.linalg.norm(self._root, 2)) * np.eye(matrix.shape[1])
         self._project = orthogonal[: len(matrix)].T
 
     def solve(self, at: HysteresisState, rows: Floats, ahead: float, start: Floats) -> Constrained:
@@ -248,12 +250,14 @@ class ConstrainedInverse:
 
         signals = np.clip(start, limits.low, limits.high)
         effective, slope = reached(signals), rise(signals)
-        least = np.inf  # where it begins need not be legal
+        least, near = np.inf, self._near  # where it begins need not be legal
         for _ in range(ROUNDS):
-            programme = BoundedProgramme(self._root * slope, limits)
-            found = programme.solve(wanted - self._root @ (effective - slope * signals))
+            programme = BoundedProgramme(np.vstack((self._root * slope, near)), limits)
+            straight = wanted - self._root @ (effective - slope * signals)
+            found = programme.solve(np.concatenate((straight, near @ signals)))
             step, there = found - signals, reached(found)
-            if missed(there) < least:
+            gained = least - missed(there)
+            if gained > 0.0:
                 signals, effective = found, there
                 slope = rise(signals)
             else:
@@ -262,8 +266,8 @@ class ConstrainedInverse:
                 half = signals + 0.5 * step
                 if missed(reached(half)) < least:
                     signals, effective = half, reached(half)
-            least = missed(effective)
-            if np.abs(step).max() <= CONVERGED:
+            least, near = missed(effective), near * (LESS_NEAR if gained > 0.0 else NEARER)
+            if np.abs(step).max() <= CONVERGED or 0.0 < gained < GAINED * least:
                 break
         return Constrained(signals, effective)
 
