@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from dm_autofocus.sharpness import check_region, cut
-from dm_tools.demo.demo_camera import Approach, Focused, Shot, Sweep, camera_config, regions
+from dm_tools.demo.camera_runs import Approach, Focused, Shot, Sweep
+from dm_tools.demo.demo_camera import camera_config, regions
 from dm_tools.demo.pictures import HOLD, save_animation, save_contact_sheet
 
 pytestmark = pytest.mark.slow
@@ -33,7 +34,7 @@ def found() -> list[Focused]:
 
 def test_the_animation_shows_every_image_and_rests_on_the_last(found: list[Focused], tmp_path: Path) -> None:
     shots = found[0].shots
-    sweep = Sweep(shots, 0.2, shots[0].image, np.full((24, 32), 7.0, np.float32), 1.2)
+    sweep = Sweep(shots, shots[0].image, np.full((24, 32), 7.0, np.float32), 1.2)
     approach = Approach(shots[:3], [6.0, 5.5, 5.0])
     file = save_animation(found, sweep, approach, tmp_path / "a.gif", "two objects", frames_per_second=10)
     with Image.open(file) as animation:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
@@ -86,15 +88,25 @@ class CameraFocusClient(DeformableMirrorClient):
         self,
         seconds: float,
         region: Sequence[float] = (),
+        *,
         on_feedback: Callable[[Any], None] = lambda feedback: None,
+        timeout_s: float = 60.0,
         **claim: Unpack[Claim],
     ) -> None:
-        """Search the sharpest focus in a region as `autofocus`, and stay on it; ends after so many seconds in all."""
+        """Search the sharpest focus in a region as `autofocus`, and stay on it for so many seconds."""
         goal = Autofocus.Goal(region=[float(value) for value in region], track=True, **claim)
+        ends = math.inf
+
+        def follow(feedback: Any) -> None:
+            nonlocal ends
+            if feedback.phase == AutofocusState.PHASE_TRACK:
+                ends = min(ends, time.monotonic() + seconds)
+            on_feedback(feedback)
+
         try:
-            self.run_action("autofocus", goal, on_feedback, seconds)
-        except DeformableMirrorError as error:
-            if error.error_code != ErrorCode.TIMEOUT:
+            self.run_action("autofocus", goal, follow, timeout_s + seconds, lambda: time.monotonic() > ends)
+        except DeformableMirrorError:
+            if time.monotonic() < ends:
                 raise
 
     def focus_stack(

@@ -184,6 +184,10 @@ def test_images_of_another_size_are_swept(model: DefocusModel) -> None:
     search = FocusSearch(CONFIG, model, 0.0)
     search.feed(1.0, (np.ones((10, 10)),))
     assert "size" in search.reason
+    while not search.current.done:
+        off = search.current.step.curvature - 0.0123
+        search.feed(1 / (1 + (off / 0.01) ** 2), (np.ones((10, 10)),))
+    assert search.current.peak is not None and search.fitting_scale() == 1
 
 
 def test_without_optics_or_a_mirror_to_trust_every_sweep_begins_below(model: DefocusModel) -> None:

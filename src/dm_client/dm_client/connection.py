@@ -168,8 +168,17 @@ class Connection:
             code = UNAVAILABLE.get(self._servers[name].name, ErrorCode.TIMEOUT)
             raise DeformableMirrorError(code, f"{name}: {text}")
 
-    def run_action(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float) -> Any:
+    def run_action(
+        self,
+        name: str,
+        goal: Any,
+        on_feedback: Callable[[Any], None],
+        timeout_s: float,
+        enough: Callable[[], bool] = lambda: False,
+    ) -> Any:
         """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
+
+        Once `enough()` it is cancelled as after `timeout_s`.
 
         Ctrl-C cancels it first, so that the mirror is left safe.
         """
@@ -187,7 +196,7 @@ class Connection:
             if not accepted.result().accepted:
                 raise DeformableMirrorError(ErrorCode.BUSY, f"{name}: refused, another goal is running")
             finished = accepted.result().get_result_async()
-            self.wait(lambda: finished.done() or gone(), timeout_s)
+            self.wait(lambda: finished.done() or gone() or enough(), timeout_s)
             if not finished.done():
                 self._check(name, gone)
                 raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: not finished within {timeout_s:g} s")

@@ -72,7 +72,7 @@ class FocusSearch:
 
     def fitting_scale(self) -> float:
         """How many times as large the focal length should be to explain the images; 1 = as it is, or not known."""
-        if isinstance(self._model, str) or self.current.peak is None:
+        if isinstance(self._model, str) or self.current.peak is None or not self._seen:
             return 1.0
         places, powers = (np.array(part) for part in zip(*self._seen, strict=True))
         return self._model.fitting_scale(self.current.peak.curvature, places, powers)

@@ -11,11 +11,14 @@ import matplotlib
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+
+from dm_autofocus.sharpness import check_region, cut
 
 #: Okabe-Ito, one per object.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -87,7 +90,7 @@ def save_animation(
     """
     figure: Figure = plt.figure(figsize=(8.4, 3.8), layout="constrained")
     figure.suptitle(title, fontsize=8, color="gray")
-    left, right, below = figure.subplots(1, 3, width_ratios=(1, 1, 0.04))
+    left, right = figure.subplots(1, 2)
     picture, frame = _draw_image(left, found[0].shots[0].image, found[0].region, COLOURS[0])
     _sharpness_axes(right, found)
     clouds = [right.plot([], [], "o", color=colour, markersize=3)[0] for colour in COLOURS[: len(found)]]
@@ -96,8 +99,13 @@ def save_animation(
     cross = [line(0, color="#F0E442", linewidth=0.8, visible=False) for line in (left.axhline, left.axvline)]
     depth = right.inset_axes((0, 0, 1, 1))
     depth.set(visible=False, xticks=[], yticks=[])
-    metres = depth.imshow(sweep.depth, cmap="viridis_r", norm=LogNorm(4, 150), interpolation="nearest")
-    figure.colorbar(metres, cax=below, ticks=[5, 10, 20, 50, 100], format="%g").ax.set_visible(False)
+    depth.imshow(sweep.depth, cmap="viridis_r", norm=LogNorm(4, 150), interpolation="nearest", aspect="auto")
+    height, width = sweep.depth.shape
+    for item in found:
+        middle = np.nanmedian(cut(sweep.depth, check_region(item.region)))
+        across, along = item.region[0] + item.region[2] / 2, item.region[1] + item.region[3] / 2
+        box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none"}
+        depth.text(across * width, along * height, f"{middle:.1f} m", ha="center", bbox=box)
 
     def show(shot: Any, text: str, colour: str, region: Sequence[float] | None = None) -> None:
         height, width = shot.image.shape
@@ -123,20 +131,21 @@ def save_animation(
         for line, centre in zip(cross, shot.image.shape, strict=True):
             line.set(visible=True)
             (line.set_ydata if line is cross[0] else line.set_xdata)([centre / 2, centre / 2])
-        show(shot, f"2  The picture stands still: {sweep.drift:.1f} px over the whole sweep", "black")
+        show(shot, "2  The picture stands still while the focus sweeps", "black")
 
     def everything(_shown: int) -> None:
         for line in cross:
             line.set(visible=False)
         picture.set_data(sweep.sharp)
         depth.set(visible=True)
-        below.set_visible(True)
-        left.set_title(f"3  All sharp, and depth: a stack of {sweep.seconds:.1f} s", color="black", fontsize=9)
-        depth.set_title("distance [m]", fontsize=9)
+        left.set_title(
+            f"3  All sharp, and how far away: {len(sweep.shots)} images, {sweep.seconds:.1f} s",
+            color="black",
+            fontsize=9,
+        )
 
     def track(shown: int) -> None:
         depth.set(visible=False)
-        below.set_visible(False)
         text = f"4  Tracking: the object comes nearer, {approach.distances[shown]:.1f} m"
         show(approach.shots[shown], text, COLOURS[0], found[0].region)
 
