@@ -201,8 +201,8 @@ class FocusControllerNode(ManagedNode):
             else:
                 self.get_logger().error(effect.text)
         self._publish_estimate(now)
-        # Tick quickly only while something can be due soon.
-        if not self._controller.quick_ticks(now):
+        # Tick quickly only while something can be due soon: a lost driver counts as dead within 2 s.
+        if not (self._controller.quick_ticks(now) or (self._driver.lost and not self._driver.missing())):
             self._quick.cancel()
         elif self._quick.is_canceled():
             self._quick.reset()
