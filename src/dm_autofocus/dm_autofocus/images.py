@@ -54,8 +54,9 @@ ENCODINGS: dict[str, _Layout] = {
 CLIPPED = 0.2
 
 
-#: Encodings of the modes that Pillow decodes images to; others are turned to colours.
-MODES = {"L": "mono8", "I;16": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
+#: Encodings of the modes that Pillow decodes images to, "I" for 16 bits before its version 10.3; others are turned to
+#: colours.
+MODES = {"L": "mono8", "I;16": "mono16", "I": "mono16", "RGB": "rgb8", "RGBA": "rgba8"}
 
 
 class ImageError(ValueError):
@@ -78,6 +79,8 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
         with Image.open(io.BytesIO(data)) as image:
             decoded = image if image.mode in MODES else image.convert("RGB")
             pixels, encoding = np.asarray(decoded), MODES[decoded.mode]
+            if decoded.mode == "I":
+                pixels = pixels.astype(np.uint16)
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ImageError(f"an image of the format {image_format!r} that cannot be decoded: {error}") from error
     mosaic = image_format.partition(";")[0].strip()

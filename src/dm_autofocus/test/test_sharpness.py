@@ -122,6 +122,7 @@ def test_of_a_bayer_pattern_the_green_pixels_count(pattern: str, bits: int) -> N
     [
         ("u1", "PNG", "mono8; png compressed ", "mono8"),
         ("u2", "PNG", "mono16; png compressed ", "mono16"),
+        ("i4", "TIFF", "mono16; tiff compressed ", "mono16"),  # decoded as a PNG of 16 bits is by older Pillow
         ("u1", "JPEG", "jpeg", "mono8"),
         ("u1", "PNG", "bayer_grbg8; png compressed", "bayer_grbg8"),
         ("3u1", "JPEG", "bgr8; jpeg compressed bgr8", "rgb8"),
@@ -129,12 +130,13 @@ def test_of_a_bayer_pattern_the_green_pixels_count(pattern: str, bits: int) -> N
     ],
 )
 def test_compressed_images_give_their_pixels(kind: str, file: str, image_format: str, encoding: str) -> None:
-    smooth = np.add.outer(np.arange(16), np.arange(24)) * (1000 if kind == "u2" else 3)
+    smooth = np.add.outer(np.arange(16), np.arange(24)) * (1000 if encoding == "mono16" else 3)
     pixels = np.broadcast_to(smooth[..., None], (16, 24, int(kind[0]))) if len(kind) == 3 else smooth
     written = io.BytesIO()
     Image.fromarray(pixels.astype(kind[-2:])).save(written, file)
     read, name = decompressed(written.getvalue(), image_format)
     assert name == encoding and read.shape == pixels.shape
+    assert read.dtype == (np.uint16 if encoding == "mono16" else np.uint8)
     np.testing.assert_allclose(read, pixels, atol=4 if file == "JPEG" else 0)
     if file == "PNG":
         for broken in (written.getvalue()[:45], b"", b"nothing"):
