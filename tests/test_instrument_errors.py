@@ -16,12 +16,14 @@ from typer.testing import CliRunner
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import SurfaceMap
+from dm_calibration.map_files.fits import fits_bytes
 from dm_calibration.optics.orientation import Orientation
 from dm_common.optics.zernike import PISTON_TILT
 from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_tools.cli import make_app
+from dm_tools.verbs.measure import _table
 
 PIXELS, FIELD = 200, 0.022
 SETTINGS = IngestSettings(aperture_radius=0.0095, pitch=FIELD / PIXELS)
@@ -112,6 +114,31 @@ def test_the_reference_that_flats_give_is_one_that_the_interferometer_takes(tmp_
     assert run("flats", table, "--write", target)["reference_surface"] == str(target)
     reference = load_reference(str(target), "", 632.8e-9, 1e-12)
     assert Ingest().read(file, replace(SETTINGS, reference=reference))[1].reference_surface.startswith("flat.fits, SHA")
+
+
+def test_tables_with_gaps_and_files_too_many_are_refused(tmp_path: Path) -> None:
+    table = tmp_path / "grid.csv"
+    table.write_text("\ufeffcolumn, row, x, y\n1, 2, 0.1, 0.2\n\n3, 4, 0.3\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"grid\.csv: row 2 below the headings has no y"):
+        _table(table, "column", "row", "x", "y")
+    table.write_text("file, reference, part\na.dat, A, B\n")
+    with pytest.raises(ValueError, match="has no column row"):
+        _table(table, "file", "row")
+    assert _table(table, "file", "reference", "part", "degrees") == [["a.dat", "A", "B", "0"]]
+    for files in ((table, table, "--write", tmp_path / "flat.fits"), (table,)):
+        refused = CliRunner().invoke(make_app(), ["instrument", "flats" if files[1:] else "grid", *map(str, files)])
+        assert refused.exit_code == 2 and f"{len(files[:2])} files: must be" in " ".join(refused.output.split())
+
+
+def test_numbers_that_are_found_are_numbers_in_a_parameter_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a point, 5e-09 is a text in YAML."""
+    found = np.array([5e-9, 0.25, *np.zeros(34)])
+    monkeypatch.setattr("dm_calibration.optics.instrument.find_retrace", lambda _maps: (found, 0.0, 0.0))
+    file = tmp_path / "flat.fits"
+    file.write_bytes(fits_bytes(SurfaceMap(np.zeros((20, 20)), 632.8e-9, None, "array"), "a test"))
+    assert run("retrace", file)["retrace"] == found.tolist()
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.41e-3, -0.73e-3), (-1.5e-3, 0.2e-3)])

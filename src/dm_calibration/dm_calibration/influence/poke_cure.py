@@ -91,5 +91,7 @@ def parameter_text(changes: Changes) -> str:
 def _literal(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(_literal, value))}]"
     # Always with a point and without an exponent: else YAML 1.1 makes a string, or ROS 2 an integer, of it.
     return np.format_float_positional(value, precision=12, min_digits=6) if isinstance(value, float) else str(value)

@@ -111,6 +111,7 @@ def instrument(
     json: JsonOption = None,
 ) -> None:
     """Find the errors of the interferometer itself from files, as parameters to paste. Needs no nodes."""
+    from dm_calibration.influence.poke_cure import parameter_text
     from dm_calibration.map_files import MapFileError, read_map
 
     def read(path: Path) -> Any:
@@ -118,21 +119,19 @@ def instrument(
 
     if (write is not None) != (procedure is Procedure.FLATS):
         raise typer.BadParameter("--write FILE.fits: flats need it, the others leave no file")
+    wanted = {Procedure.FLATS: (1, "one table of maps"), Procedure.GRID: (2, "the table of marks and one map")}
+    if procedure in wanted and len(files) != wanted[procedure][0]:
+        raise typer.BadParameter(f"{len(files)} files: must be {wanted[procedure][1]}")
     try:
-        if procedure is Procedure.FLATS:
-            assert write is not None
+        if write is not None:
             found = _flats(files[0], write, read)
         elif procedure is Procedure.RETRACE:
             found = _retrace([read(file).sag for file in files])
-        elif len(files) == 2:
-            found = _grid(files[0], read(files[1]).sag.shape)
         else:
-            raise ValueError(f"{len(files)} files: must be the table of marks and one map")
+            found = _grid(files[0], read(files[1]).sag.shape)
     except (MapFileError, ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from error
-    console.print("/**/interferometer:\n  ros__parameters:", soft_wrap=True)
-    for name, value in found.items():
-        console.print(f"    {name}: {value}", soft_wrap=True, markup=False, highlight=False)
+    console.print(parameter_text({"interferometer": found}), soft_wrap=True, markup=False, highlight=False)
     write_json(json, {"instrument": found})
     next_step("put the parameters into the parameter file; `instrument_error` is the bound on what is left")
 
@@ -196,13 +195,22 @@ def _grid(table: Path, shape: tuple[int, int]) -> dict[str, Any]:
 
 
 def _table(path: Path, *names: str) -> list[list[str]]:
-    """The rows of a CSV file with these headings, in any order; `degrees` may be missing and is 0 then."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file, skipinitialspace=True))
-    missing = [name for name in names if name != "degrees" and (not rows or rows[0].get(name) is None)]
+    """The rows of a CSV file with these headings, in any order; `degrees` may be missing and is 0 then.
+
+    Raises:
+        ValueError: naming the file, and the line that lacks a value.
+    """
+    with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading
+        rows = list(csv.DictReader(file, restval="", skipinitialspace=True))
+    missing = [name for name in names if name != "degrees" and (not rows or name not in rows[0])]
     if missing:
         raise ValueError(f"{path}: has no column {', '.join(missing)}; the first line must name {', '.join(names)}")
-    return [[(row.get(name) or "0").strip() for name in names] for row in rows]
+    default = {"degrees": "0"}
+    table = [[row.get(name, "").strip() or default.get(name, "") for name in names] for row in rows]
+    for number, values in enumerate(table, start=1):
+        if "" in values:
+            raise ValueError(f"{path}: row {number} below the headings has no {names[values.index('')]}")
+    return table
 
 
 def check(
