@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 from mcap.writer import CompressionType, Writer
 
+from dm_tools.recording.bag import Topic
 from dm_tools.recording.bag_reader import Message
 
 _TABLES = """
@@ -27,46 +28,45 @@ CREATE INDEX timestamp_idx ON messages (timestamp ASC);
 
 
 def write_rosbag2(folder: Path, messages: Sequence[Message], storage: str) -> None:
-    """A recording split into two files, as with `--max-bag-size`."""
+    """A recording split into two files, as with `--max-bag-size`, and a third that was begun when it ended."""
     folder.mkdir()
     write, suffix = {"mcap": (_write_mcap, "mcap"), "sqlite3": (_write_sqlite, "db3")}[storage]
-    names = [f"{folder.name}_{number}.{suffix}" for number in (0, 1)]
+    names = [f"{folder.name}_{number}.{suffix}" for number in (0, 1, 2)]
     half = len(messages) // 2
-    for name, part in zip(names, (messages[:half], messages[half:]), strict=True):
-        write(folder / name, part)
+    topics = list({message.topic.name: message.topic for message in messages}.values())
+    for name, part in zip(names, (messages[:half], messages[half:], ()), strict=True):
+        write(folder / name, topics, part)
     information: dict[str, Any] = {"version": 9, "storage_identifier": storage, "relative_file_paths": names}
     (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": information}))
 
 
-def _write_mcap(file: Path, messages: Sequence[Message]) -> None:
+def _write_mcap(file: Path, topics: Sequence[Topic], messages: Sequence[Message]) -> None:
     """No compression, as is the default; no sequence numbers; no definition of types that rosbag2 finds none of."""
     with file.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.NONE)
         writer.start(profile="ros2", library="rosbag2_storage_mcap")
         schemas: dict[str, int] = {}
         channels: dict[str, int] = {}
-        for message in messages:
-            name, kind = message.topic.name, message.topic.type_name
+        for topic in topics:
+            kind = topic.type_name
             if kind not in schemas:
                 schemas[kind] = writer.register_schema(kind, "", b"")
-            if name not in channels:
-                qos = {"offered_qos_profiles": yaml.safe_dump(list(map(dict, message.topic.qos)))}
-                channels[name] = writer.register_channel(name, "cdr", schemas[kind], qos)
-            writer.add_message(channels[name], message.log_time, message.data, message.publish_time, 0)
+            qos = {"offered_qos_profiles": yaml.safe_dump(list(map(dict, topic.qos)))}
+            channels[topic.name] = writer.register_channel(topic.name, "cdr", schemas[kind], qos)
+        for message in messages:
+            writer.add_message(channels[message.topic.name], message.log_time, message.data, message.publish_time, 0)
         writer.finish()
 
 
-def _write_sqlite(file: Path, messages: Sequence[Message]) -> None:
+def _write_sqlite(file: Path, topics: Sequence[Topic], messages: Sequence[Message]) -> None:
     with closing(sqlite3.connect(file)) as database:
         database.executescript(_TABLES)
-        numbers: dict[str, int] = {}
+        numbers = {topic.name: number for number, topic in enumerate(topics, start=1)}
+        for topic in topics:
+            qos = yaml.safe_dump(list(map(dict, topic.qos)))
+            row = (numbers[topic.name], topic.name, topic.type_name, "cdr", qos, topic.type_hash)
+            database.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)", row)
         for message in messages:
-            topic = message.topic
-            if topic.name not in numbers:
-                numbers[topic.name] = len(numbers) + 1
-                qos = yaml.safe_dump(list(map(dict, topic.qos)))
-                row = (numbers[topic.name], topic.name, topic.type_name, "cdr", qos, topic.type_hash)
-                database.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)", row)
-            data = (numbers[topic.name], message.log_time, message.data)
+            data = (numbers[message.topic.name], message.log_time, message.data)
             database.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", data)
         database.commit()

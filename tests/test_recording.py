@@ -130,6 +130,7 @@ def test_a_recording_of_rosbag2_gives_the_same_calibration(
     assert theirs.counts == ours.counts and theirs.messages == ours.messages
     assert theirs.duration_s == ours.duration_s and theirs.topics.keys() == ours.topics.keys()
     assert theirs.topics["/zernike"].qos == [RELIABLE]
+    assert theirs.file.stem == "theirs_0"
     assert [message.data for message in theirs.read(["/zernike"])] == [m.data for m in ours.read(["/zernike"])]
     session = read_session(theirs)
     assert "does not hold the parameters" in session.remarks[0]  # which rosbag2 does not ask for

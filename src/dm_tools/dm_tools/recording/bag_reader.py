@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -49,6 +50,7 @@ class BagReader:
             BagError: no recording there, or none that can be read.
         """
         self._parts: list[_McapPart | _SqlitePart] = [_PARTS[file.suffix](file) for file in _files(path)]
+        self._parts.sort(key=lambda part: part.span[0] or math.inf)  # empty ones last
         self.file = self._parts[0].file
         self.topics: dict[str, Topic] = {}
         counted: Counter[str] = Counter()
@@ -57,7 +59,7 @@ class BagReader:
             counted.update(part.counts)
         self.counts = {name: counted[name] for name in self.topics}
         self.messages = sum(self.counts.values())
-        spans = [part.span for part in self._parts if part.counts]
+        spans = [part.span for part in self._parts if any(part.counts.values())]
         self.duration_s = 1e-9 * (max(end for _, end in spans) - min(start for start, _ in spans)) if spans else 0.0
 
     @property
@@ -118,7 +120,8 @@ class _SqlitePart:
             # The hash of the type came in version 4 of the tables.
             rows = database.execute("SELECT id, name, type, offered_qos_profiles FROM topics").fetchall()
             counted = dict(database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
-            self.span = database.execute("SELECT MIN(timestamp), MAX(timestamp) FROM messages").fetchone()
+            first_last = "SELECT IFNULL(MIN(timestamp), 0), IFNULL(MAX(timestamp), 0) FROM messages"
+            self.span = database.execute(first_last).fetchone()
         self.topics = {number: Topic(name, kind, yaml.safe_load(qos) or []) for number, name, kind, qos in rows}
         self.counts = {topic.name: counted.get(number, 0) for number, topic in self.topics.items()}
 
@@ -138,7 +141,7 @@ _PARTS: dict[str, type[_McapPart] | type[_SqlitePart]] = {SUFFIX: _McapPart, ".d
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a recording in their order."""
+    """The files of a recording."""
     if not path.is_dir():
         found = [path]
     elif (described := path / METADATA_FILE).is_file():
@@ -147,7 +150,7 @@ def _files(path: Path) -> list[Path]:
         except (yaml.YAMLError, KeyError, TypeError, OSError, UnicodeDecodeError) as error:
             raise BagError(f"{described}: cannot be read: {error!r}") from error
     else:
-        found = sorted(path.glob(f"*{SUFFIX}"))
+        found = list(path.glob(f"*{SUFFIX}"))
     if not found or not all(file.is_file() and file.suffix in _PARTS for file in found):
         named = ", ".join(file.name for file in found) or "no file"
         raise BagError(f"{path}: {named}: a recording has files {' or '.join(_PARTS)}, not compressed as a whole")

@@ -97,8 +97,10 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
     missing = [name for name in TOPICS if prefix + name not in bag.topics]
     if missing:
-        text = f"{bag.file}: no topic {', '.join(prefix + name for name in missing)}: record them all"
-        raise RecordingError(text + " (`ros2 bag record` with --include-hidden-topics)" * (FEEDBACK in missing))
+        hint = " (`ros2 bag record` with --include-hidden-topics)" if FEEDBACK in missing else ""
+        raise RecordingError(
+            f"{bag.file}: no topic {', '.join(prefix + name for name in missing)}: record them all{hint}"
+        )
     received: dict[str, list[tuple[int, Any]]] = {name: [] for name in TOPICS}
     for message in bag.read([prefix + name for name in TOPICS]):
         received[message.topic.name.removeprefix(prefix)].append((message.log_time, _decode(message)))
