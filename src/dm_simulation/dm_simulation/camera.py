@@ -101,20 +101,23 @@ class SceneCamera:
         self._aperture = self._inside.astype(np.float32)
         self._half_square = (squares / 2).astype(np.float32)
         self._textures = [fft.rfft2(part) for part in self._scene(scene_rng)]
+        self._last: tuple[Array, Array, NDArray[np.float32]] | None = None  # defocus, surface and its image
         self.place(config.distances)
 
-    def place(self, distances: Sequence[float]) -> None:
-        """Put the objects at other distances [m].
+    def left_to_focus(self, distances: Sequence[float]) -> Array:
+        """For each object at these distances [m], as dioptre at the mirror: lens at rest minus object.
 
         Raises:
             ValueError: there are more or fewer objects.
         """
         if len(distances) != len(self.config.distances):
             raise ValueError(f"camera.distances = {list(distances)}: must stay {len(self.config.distances)} distances")
-        # What is left to focus for each object, as dioptre at the mirror: lens at rest minus object.
         at_mirror = [(1 / distance if distance else 0.0) for distance in (self.config.rest_distance, *distances)]
-        self._defocus = (at_mirror[0] - np.array(at_mirror[1:])) / self.config.relay_magnification**2
-        self._last: tuple[Array, NDArray[np.float32]] | None = None
+        return np.asarray((at_mirror[0] - np.array(at_mirror[1:])) / self.config.relay_magnification**2)
+
+    def place(self, distances: Sequence[float]) -> None:
+        """Put the objects at other distances [m]. Raises ValueError as `left_to_focus` does."""
+        self._defocus = self.left_to_focus(distances)
 
     def _scene(self, rng: np.random.Generator) -> list[NDArray[np.float32]]:
         """One textured strip per object, side by side on the periodic plane: mean about 1, detail at all scales."""
@@ -147,9 +150,10 @@ class SceneCamera:
 
     def expose(self, surface: Array) -> NDArray[np.uint8]:
         """An image (height, width) of the scene by a mirror of this surface (see `wavefronts`), 8 bit."""
-        if self._last is None or 4 * np.abs(surface - self._last[0]).sum() > SAME_SURFACE:
-            self._last = (surface, self._render(surface))
-        ideal = self._last[1]
+        defocus, last = self._defocus, self._last  # objects may be moved meanwhile
+        if last is None or last[0] is not defocus or 4 * np.abs(surface - last[1]).sum() > SAME_SURFACE:
+            last = self._last = (defocus, surface, self._render(surface))
+        ideal = last[2]
         noise = self._noise.standard_normal(ideal.shape, dtype=np.float32)
         noisy = ideal + np.sqrt(ideal / np.float32(self.config.photons)) * noise
         return np.clip(np.float32(MEAN_GREY) * noisy + 0.5, 0, 255).astype(np.uint8)

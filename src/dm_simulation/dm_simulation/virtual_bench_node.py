@@ -28,7 +28,7 @@ from std_srvs.srv import SetBool, Trigger
 from dm_common.ros import qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Diagnostics, Health
-from dm_common.ros.parameters import declare
+from dm_common.ros.parameters import ParameterError, declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
 from dm_simulation.camera import camera_matrix
@@ -59,7 +59,7 @@ class VirtualBenchNode(Node):
 
     def __init__(self) -> None:
         super().__init__("virtual_bench")
-        values = declare(self, PARAMETERS, self._on_change)
+        values = declare(self, PARAMETERS, self._on_change, check=self._check_change)
         speed = values["clock.speed"]
         self._fast_clock = FastClock(speed) if speed > 0 else None
         self._stop = threading.Event()
@@ -98,12 +98,16 @@ class VirtualBenchNode(Node):
         pace = f"{speed:g} times as fast as real time" if speed > 0 else "in real time"
         self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; {pace}")
 
-    def _on_change(self, changes: Mapping[str, Any]) -> None:
+    def _check_change(self, changes: Mapping[str, Any]) -> None:
         if self.bench.camera is not None and "camera.distances" in changes:
             try:
-                self.bench.camera.place(changes["camera.distances"])
+                self.bench.camera.left_to_focus(changes["camera.distances"])
             except ValueError as error:
-                self.get_logger().error(str(error))
+                raise ParameterError(str(error)) from error
+
+    def _on_change(self, changes: Mapping[str, Any]) -> None:
+        if self.bench.camera is not None and "camera.distances" in changes:
+            self.bench.camera.place(changes["camera.distances"])
 
     def _now(self) -> float:
         if self._fast_clock is not None:

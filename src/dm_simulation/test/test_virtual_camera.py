@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dm_common.ros.parameters import ParameterError
 from dm_simulation.camera import CameraConfig, SceneCamera
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.mirror.plate import Plate, PlateConfig
+from dm_simulation.virtual_bench_node import VirtualBenchNode
 
 PUPIL = 0.022
 DISTANCES = (6.0, 15.0, 0.0)
@@ -64,6 +68,25 @@ def test_objects_can_be_moved_and_their_number_stays() -> None:
     assert detail(camera.expose(sphere(focusing(5.0))), 0) > 2 * detail(blurred, 0)
     with pytest.raises(ValueError, match="must stay 3 distances"):
         camera.place((5.0,))
+    node: Any = SimpleNamespace(bench=SimpleNamespace(camera=camera))
+    VirtualBenchNode._check_change(node, {"camera.distances": [5.0, 15.0, 1.0]})
+    with pytest.raises(ParameterError, match="must stay 3 distances"):
+        VirtualBenchNode._check_change(node, {"camera.distances": [5.0]})
+
+
+def test_an_object_that_is_moved_during_an_exposure_is_moved_in_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = make()
+    render = camera._render
+
+    def moved_meanwhile(surface: NDArray[np.float64]) -> NDArray[np.float32]:
+        image = render(surface)
+        camera.place((5.0, 15.0, 0.0))
+        return image
+
+    with monkeypatch.context() as during:
+        during.setattr(camera, "_render", moved_meanwhile)
+        blurred = camera.expose(sphere(focusing(5.0)))
+    assert detail(camera.expose(sphere(focusing(5.0))), 0) > 2 * detail(blurred, 0)
 
 
 def test_a_relay_squares_the_reach() -> None:
