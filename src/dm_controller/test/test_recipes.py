@@ -211,6 +211,8 @@ def test_nothing_is_extrapolated_and_far_from_all_recipes_there_is_none() -> Non
     )
     with pytest.raises(RecipeError, match=rf"curvature = \+0\.0510 1/m: nothing is extrapolated; {there}"):
         Corrections(alone, PLANNER).find(FocusTarget(0.051))
+    edge = FocusTarget(float(np.nextafter(-0.02, 0.0)), -2.0)  # the range ends with the shape, not with the last digit
+    assert Corrections(alone, PLANNER).find(edge).interpolated
     with pytest.raises(RecipeError, match=rf"curvature = -0\.0250 1/m: no recipe is near this shape; {there}"):
         Corrections(alone, PLANNER).find(FocusTarget(-0.025, 3000.0))
 

@@ -98,8 +98,9 @@ class Corrections:
         if not book.recipes:
             raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
         self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
-        self._shapes = [FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike) for recipe in recipes]
-        self._own = np.array([planner.mirror.command(shape)[0] for shape in self._shapes])
+        shapes = [FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike) for recipe in recipes]
+        self._surfaces = np.array([self._surface(shape) for shape in shapes])
+        self._own = np.array([planner.mirror.command(shape)[0] for shape in shapes])
         self._corrections = np.array([recipe.effective for recipe in recipes]) - self._own
         self._measured = np.array([recipe.max_zernike for recipe in recipes])
         self._kriging = Kriging(self._own, np.full(len(recipes), NUGGET))
@@ -113,6 +114,10 @@ class Corrections:
         self.amplitude = max(promised, shown * (1.0 + 2.0 / len(recipes)))
         self._repeat = REPEAT_SHARE * promised
 
+    def _surface(self, target: FocusTarget) -> Floats:
+        """Coefficients beyond tilt, m."""
+        return target.coefficients(self._mirror.model.aperture_radius)[PISTON_TILT:]
+
     def _bound(self, measured: float, left: float) -> float:
         """m, for shapes near recipes that were re-measured with that error (m), which leave that variance."""
         return measured + math.hypot(self.amplitude * math.sqrt(left), self._repeat)
@@ -124,12 +129,14 @@ class Corrections:
 
     def find(self, target: FocusTarget) -> FoundRecipe:
         """What makes `target`. Raises RecipeError when it is beyond all curvatures there are, or no recipe is near."""
-        radius = self._mirror.model.aperture_radius
-        for recipe, shape in zip(self._recipes, self._shapes, strict=True):
-            if shape.deviation(target, radius) <= SAME_SHAPE:
-                return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0), False)
+        surface = self._surface(target)
+        apart = np.abs(self._surfaces - surface).max(axis=1)
+        if apart.min() <= SAME_SHAPE:
+            recipe = self._recipes[int(apart.argmin())]
+            return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0), False)
         curvatures = [recipe.curvature for recipe in self._recipes]
-        if not min(curvatures) <= target.curvature <= max(curvatures):
+        inside = target.with_curvature(float(np.clip(target.curvature, min(curvatures), max(curvatures))))
+        if np.abs(self._surface(inside) - surface).max() > SAME_SHAPE:
             raise RecipeError(f"curvature = {shape_text(target)}: nothing is extrapolated; there are {self._there()}")
         own = self._mirror.command(target)[0]
         weights, left = self._kriging.at(own)
