@@ -315,7 +315,9 @@ def test_ended_in_the_middle_the_mirror_still_goes_back(
     assert "Traceback" not in process.output, process.output
 
 
-def test_another_folder_or_name_takes_effect_with_the_next_activation(observer: Observer, tmp_path: Path) -> None:
+def test_another_folder_or_name_takes_effect_with_the_next_activation(
+    observer: Observer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run, outcome = recorded(PlanKind.POKES, PlanOptions())
     folders = {"first": ("a", "b"), "other": ("c",)}
     for name, identifiers in folders.items():
@@ -340,6 +342,10 @@ def test_another_folder_or_name_takes_effect_with_the_next_activation(observer: 
     activate("a")  # nothing changed: what is in use stays
     activate("c", calibration_folder=str(tmp_path / "other"), load_on_start="newest")
     activate("c", load_on_start="")
+    sent: list[Any] = []  # what others judge by reaches them at once
+    monkeypatch.setattr(node._publisher, "publish", sent.append)
+    assert node.set_parameters([Parameter("aperture_tolerance", value=0.05)])[0].successful
+    assert (sent[-1].id, sent[-1].aperture_tolerance) == ("c", 0.05)
     node.trigger_shutdown()
     assert manager.in_use is None
     node.destroy_node()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ class CalibrationNode(ManagedNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("calibration", PARAMETERS, hardware_id="calibration")
+        super().__init__("calibration", PARAMETERS, self._on_parameters, hardware_id="calibration")
         self._frame_id = ""
         self._start_pending = False
         self._loaded_by = ""  # what `load_on_start` was when it was carried out last
@@ -80,6 +80,10 @@ class CalibrationNode(ManagedNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._ticker = self.create_timer(PUBLISH_PERIOD_S, self._listener.tick, clock=steady)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
+
+    def _on_parameters(self, changes: Mapping[str, Any]) -> None:
+        if {"aperture_tolerance", "calibrated_error_max"} & set(changes):
+            self._manager.publish_again()  # others judge by them
 
     def configure(self) -> None:
         folder = Path(self._values["calibration_folder"]).expanduser()
