@@ -18,6 +18,7 @@ from dm_calibration.recalibration.check_log import read_checks
 from dm_calibration.recalibration.drift import Drift, DriftRates
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions, Verdict
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_calibration.store.hdf5_image import HASH, read_image, write_image
 from dm_common.atomic_write import StoreError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
@@ -392,6 +393,25 @@ def test_updates_are_there_again_and_the_calibration_file_is_as_it_was(
     assert np.array_equal(changed_fit(again).influence_sag, changed_fit(updates).influence_sag)
     assert file.read_bytes() == content
     assert [entry.remark for entry in CalibrationStore(tmp_path).entries()] == [""]
+
+
+def test_updates_of_before_temperatures_were_kept_are_read(
+    bench: SteadyMirror, made: Made, updates: RecalibrationManager, tmp_path: Path
+) -> None:
+    """What was known of gains and figure is known, and of the temperature as much as at the start."""
+    updates.take(bench.measure("check", days=1.0), bench.settled())
+    stored, (file,) = known(updates), tmp_path.glob("*.updates.hdf5")
+    columns, attributes = read_image(file)
+    size = stored.gain.size + stored.offset.size
+    before = {"gain": stored.gain, "offset": stored.offset, "covariance": stored.covariance[:size, :size]}
+    kept = {name: value for name, value in attributes.items() if name not in ("warm_foretold", "warm_borne_out", HASH)}
+    file.write_bytes(write_image({**before, "stuck": columns["stuck"]}, kept))
+    read = known(begun(made, tmp_path))
+    assert read.revision == 1 and np.array_equal(read.gain, stored.gain)
+    assert np.array_equal(read.covariance[:size, :size], before["covariance"])
+    assert not read.thermal.any() and np.diag(read.covariance)[size:].all() and read.thermal_trust == 0.0
+    file.write_bytes(write_image({**before, "covariance": before["covariance"][None]}, kept))
+    assert known(begun(made, tmp_path, remark="finite numbers")).revision == 0
 
 
 def test_forgotten_updates_are_gone(

@@ -79,7 +79,8 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         if not isinstance(number, int) or number < 0:
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a whole number from 0")
     arrays = {name: columns.get(name) for name in _ARRAYS}
-    if "thermal" not in columns and isinstance(covariance := arrays["covariance"], np.ndarray):
+    covariance = arrays["covariance"]
+    if "thermal" not in columns and isinstance(covariance, np.ndarray) and covariance.ndim == 2:
         size = len(like.covariance) - len(like.thermal)
         arrays |= {"thermal": like.thermal, "covariance": block_diag(covariance, like.covariance[size:, size:])}
     for name, value in arrays.items():
@@ -87,15 +88,14 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
         if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():
             raise UpdatesFileError(f"{path.name}: {name} must be {shape} finite numbers")
     # Before these were kept all actuators moved, and nothing was known of the temperature.
-    stuck = columns.get("stuck", like.stuck)
-    temperatures = np.asarray(columns.get("temperatures", like.temperatures), dtype=np.float64)
-    if temperatures.shape != (3,):
-        raise UpdatesFileError(f"{path.name}: temperatures must be (3,) numbers")
-    if not isinstance(stuck, np.ndarray) or stuck.shape != like.stuck.shape or np.isinf(stuck).any():
-        raise UpdatesFileError(f"{path.name}: stuck must be {like.stuck.shape} numbers, NaN where an actuator moves")
+    for name, meaning in (("stuck", "an actuator moves"), ("temperatures", "it is not known")):
+        arrays[name] = value = columns.get(name, getattr(like, name))
+        shape = getattr(like, name).shape
+        if not isinstance(value, np.ndarray) or value.shape != shape or np.isinf(value).any():
+            raise UpdatesFileError(f"{path.name}: {name} must be {shape} numbers, NaN where {meaning}")
     evidence = {name: attributes.get(name, before) for name, before in _EVIDENCE.items()}
     for name, number in evidence.items():
         if not isinstance(number, float) or not np.isfinite(number):
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")
-    found: dict[str, Any] = {**arrays, **numbers, **evidence, "stuck": stuck, "temperatures": temperatures}
+    found: dict[str, Any] = {**arrays, **numbers, **evidence}
     return Drift(**found)
