@@ -319,6 +319,11 @@ def test_an_estimate_survives_its_message() -> None:
     for item in fields(sent):
         assert np.array_equal(getattr(found.state, item.name), getattr(sent, item.name)), item.name
     assert estimate_from(ActuatorEstimate(message="no report")) == (None, "no report")
+    for name in ("position", "fading", "crept", "crept_sigma"):
+        torn = estimate_message(observer)
+        getattr(torn, name).append(0.0)
+        with pytest.raises(ValueError, match="reshape"):
+            estimate_from(torn)
 
 
 def test_a_console_that_comes_late_knows_what_stands() -> None:

@@ -214,6 +214,8 @@ def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
     values = {name: np.array(getattr(message, name), dtype=np.float64) for name in _STATE}
     for name in ("play", "crept", "lagged"):
         values[name] = values[name].reshape(count, -1)
+    for name, size in (("position", count), ("fading", count), ("crept_sigma", values["crept"].shape[1])):
+        values[name] = values[name].reshape(size)
     return ActuatorEstimate(HysteresisState(seconds(message.header.stamp), **values), message.message)
 
 
