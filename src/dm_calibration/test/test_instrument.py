@@ -13,7 +13,14 @@ SIZE = 120
 X, Y = np.meshgrid(*((np.arange(SIZE) - 0.5 * (SIZE - 1)) * step / (0.5 * SIZE) for step in (1.0, -1.0)))
 DISC = np.hypot(X, Y) <= 0.97
 RNG = np.random.default_rng(5)
+BEGINNING = RNG.bit_generator.state
 FLATS = {name: RNG.normal(0.0, 10e-9, len(TERMS)) * (np.arange(len(TERMS)) >= PISTON_TILT) for name in "ABC"}
+
+
+@pytest.fixture(autouse=True)
+def same_numbers() -> None:
+    """Whichever tests ran before."""
+    RNG.bit_generator.state = BEGINNING
 
 
 def against(reference: str, part: str, degrees: float = 0.0) -> FlatTest:
