@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.report.content import length, utc
+from dm_calibration.report.content import NM, length, utc
 from dm_calibration.report.document import BLUE, GREEN, GREY, ORANGE, VERMILION, Picture, Section, Table
 from dm_common.hysteresis.law_shape import branch, closed_cycle, opening, turned
 from dm_common.hysteresis.model import HysteresisModel
@@ -15,7 +15,6 @@ from dm_common.recipes import RecipeBook, terms_text
 
 Floats = NDArray[np.float64]
 
-NM = 1e9
 #: Minor loops: from the falling branch, down to each of these and back.
 MINOR_TURNS = (0.6, 0.2, -0.2, -0.6)
 MINOR_DEPTH = 0.5
@@ -115,14 +114,14 @@ def hysteresis(calibration: Calibration) -> Section:
             ],
         )
     law, wavelength = hysteresis.law, calibration.wavelength
-    opening = loop_opening(law)
-    spread = f", {opening.min():.1%} to {opening.max():.1%} over the actuators" if law.actuators else ""
+    openings = loop_opening(law)
+    spread = f", {openings.min():.1%} to {openings.max():.1%} over the actuators" if law.actuators else ""
     shared = "the mean over actuators, whose laws are their own" if law.actuators else "all actuators share it"
     hour, day = 100 * (step_response(law, np.array([3600.0, 86400.0])) - 1.0)
     rows = [
         ("class of law", hysteresis.name),
         ("maps it was identified from", str(hysteresis.maps)),
-        ("opening of the full loop", f"{opening.mean():.1%} of the span{spread}"),
+        ("opening of the full loop", f"{openings.mean():.1%} of the span{spread}"),
         ("creep", f"{law.creep_rate:.2%} of a step per decade of time"),
         ("growth of a step from 1 s to 1 h", f"{hour:.2f} %"),
         ("growth of a step from 1 s to 1 day", f"{day:.2f} %"),

@@ -96,11 +96,13 @@ def save_animation(
     clouds = [right.plot([], [], "o", color=colour, markersize=3)[0] for colour in COLOURS[: len(found)]]
     cursor = right.axvline(0.0, color="black", linewidth=0.8)
     # What stands still: a cross on the middle of the picture.
-    cross = [line(0, color="#F0E442", linewidth=0.8, visible=False) for line in (left.axhline, left.axvline)]
+    height, width = sweep.sharp.shape
+    cross = left.axhline(height / 2), left.axvline(width / 2)
+    for line in cross:
+        line.set(color="#F0E442", linewidth=0.8, visible=False)
     depth = right.inset_axes((0, 0, 1, 1))
     depth.set(visible=False, xticks=[], yticks=[])
     depth.imshow(sweep.depth, cmap="viridis_r", norm=LogNorm(4, 150), interpolation="nearest", aspect="auto")
-    height, width = sweep.depth.shape
     for item in found:
         middle = np.nanmedian(cut(sweep.depth, check_region(item.region)))
         across, along = item.region[0] + item.region[2] / 2, item.region[1] + item.region[3] / 2
@@ -127,11 +129,9 @@ def save_animation(
         show(item.final if done else item.shots[shown], f"1  Few images. {text}", colour, item.region)
 
     def stand(shown: int) -> None:
-        shot = sweep.shots[shown]
-        for line, centre in zip(cross, shot.image.shape, strict=True):
+        for line in cross:
             line.set(visible=True)
-            (line.set_ydata if line is cross[0] else line.set_xdata)([centre / 2, centre / 2])
-        show(shot, "2  The picture stands still while the focus sweeps", "black")
+        show(sweep.shots[shown], "2  The picture stands still while the focus sweeps", "black")
 
     def everything(_shown: int) -> None:
         for line in cross:
