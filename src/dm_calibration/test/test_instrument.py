@@ -40,7 +40,7 @@ def error_of(tests: list[FlatTest]) -> tuple[float, float, tuple[int, ...]]:
     left = (found.sag - basis(X, Y) @ FLATS[tests[0].reference])[DISC & np.isfinite(found.sag)]
     inside = DISC & np.isfinite(found.sag)
     coefficients = np.linalg.lstsq(basis(X[inside], Y[inside]), left, rcond=None)[0]
-    return float(np.abs(coefficients[PISTON_TILT:]).max()), 2.0 * found.sigma, found.open_orders
+    return float(np.abs(coefficients[PISTON_TILT:]).max()), found.bound, found.open_orders
 
 
 def test_three_flats_of_which_one_was_turned() -> None:

@@ -24,6 +24,8 @@ ORDER = 12
 FITTED = 20_000
 #: Directions of the equations weaker than this are left open by the maps: turns that are almost alike.
 DETERMINED = 0.1
+#: Standard deviations that the largest error of the 18 coefficients of a calibration stays within in 95 % of cases.
+LARGEST_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -49,13 +51,13 @@ class FlatError:
 
     Attributes:
         sag: (height, width) m, as the instrument shows it; NaN outside the aperture.
-        sigma: m, of its worst-known coefficient; NaN where the maps do not check each other.
+        bound: m, 95 % bound on the largest error of its coefficients; NaN where the maps do not check each other.
         left: m rms, what the maps say beyond it and the other flats, up to the order.
         open_orders: angular orders that the maps do not tell, and which are left out.
     """
 
     sag: Floats
-    sigma: float
+    bound: float
     left: float
     open_orders: tuple[int, ...]
 
@@ -103,7 +105,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         raise ValueError(f"{len(tests)} maps of {', '.join(flats)} tell no flat from another: exchange or turn them")
     sigma = np.sqrt(squares / freedom) if freedom else np.nan
     left = np.sqrt(squares / len(tests))
-    return FlatError(sag, float(worst * sigma), float(left), tuple(sorted(open_orders)))
+    return FlatError(sag, float(LARGEST_SIGMAS * worst * sigma), float(left), tuple(sorted(open_orders)))
 
 
 def _term(place: NDArray[np.complex128], n: int, m: int) -> NDArray[np.complex128]:

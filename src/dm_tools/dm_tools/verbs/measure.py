@@ -162,8 +162,8 @@ def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, 
             "the flats, or turn one by an angle of no simple share of a turn",
             soft_wrap=True,
         )
-    known = not found.open_orders and math.isfinite(found.sigma)
-    return {"reference_surface": str(target.absolute())} | ({"instrument_error": 2.0 * found.sigma} if known else {})
+    known = not found.open_orders and math.isfinite(found.bound)
+    return {"reference_surface": str(target.absolute())} | ({"instrument_error": found.bound} if known else {})
 
 
 def _retrace(maps: list[Any]) -> dict[str, Any]:
