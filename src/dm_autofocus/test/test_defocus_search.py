@@ -180,8 +180,11 @@ def test_things_at_several_distances_that_the_optics_do_not_explain_are_swept(
     assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.0123, abs=DEPTH)
 
 
-def test_images_of_another_size_are_swept(model: DefocusModel) -> None:
-    search = FocusSearch(CONFIG, model, 0.0)
+@pytest.mark.parametrize("before", [0, 1])
+def test_images_of_another_size_are_swept(model: DefocusModel, before: int) -> None:
+    search = FocusSearch(CONFIG, model, LOW)
+    for _image in range(before):
+        search.feed(1.0, (DefocusedCamera(clouds(), 0.0123).expose(LOW),))
     search.feed(1.0, (np.ones((10, 10)),))
     assert "size" in search.reason
     while not search.current.done:

@@ -114,7 +114,7 @@ class DefocusModel:
         """How many times as large the focal length would have to be for the optics to explain images; 1 = they do.
 
         Between 0.35 and 2 it is 1: aberrations that blur an image at every focus look like a shorter focal length, and
-        errors of that size cost images, not accuracy.
+        errors of that size cost images, not accuracy. So it is where fewer than two images are near the focus.
 
         Args:
             focus: where the object is [1/m].
@@ -122,6 +122,8 @@ class DefocusModel:
             powers: of the images, (I, K).
         """
         near = np.abs(places - focus) < FITTED * self._step
+        if near.sum() < 2:  # only ratios between images count
+            return 1.0
         grid = np.linspace(focus - 4 * self._step, focus + 4 * self._step, 9)
         other, misfits = copy(self), {}
         for scale in SCALES:
