@@ -338,7 +338,8 @@ def test_a_console_that_comes_late_knows_what_stands() -> None:
     assert observer.at(1.4).effective == pytest.approx([0.5] * COUNT)
     assert observer.now(9.0).effective == pytest.approx([-0.5] * COUNT)
     assert observer.at(0.5).effective is None and observer.at(0.5).doubt
-    observer.use(message)  # published again
+    message.revision += 1  # published again with what a map has shown
+    observer.use(message)
     assert observer.at(1.5).effective == pytest.approx([0.5] * COUNT)
 
 

@@ -50,8 +50,8 @@ class StateObserver:
 
     def __init__(self) -> None:
         self.law, self.fault = HysteresisModel.linear(), ""
-        self._calibration = ("", 0)
-        self._estimates: deque[tuple[tuple[str, int], ActuatorEstimate]] = deque(maxlen=ESTIMATES_KEPT)
+        self._calibration = ""  # its id: later maps make a new revision, and leave the law as it is
+        self._estimates: deque[tuple[str, ActuatorEstimate]] = deque(maxlen=ESTIMATES_KEPT)
         self._reported: Any = None
 
     def use(self, calibration: Any) -> None:
@@ -61,7 +61,7 @@ class StateObserver:
         except ValueError as error:
             law, self.fault = None, str(error)
         self.law = law if law is not None else HysteresisModel.linear()
-        self._calibration = calibration.id, calibration.revision
+        self._calibration = calibration.id
 
     def take(self, message: Any) -> None:
         """Take the controller's next dm_msgs/ActuatorEstimate."""
@@ -69,7 +69,7 @@ class StateObserver:
             estimate = estimate_from(message)
         except ValueError as error:
             estimate = ActuatorEstimate(None, f"actuator_estimate: {error}")
-        self._estimates.append(((message.calibration_id, message.revision), estimate))
+        self._estimates.append((message.calibration_id, estimate))
 
     def observe(self, message: Any) -> None:
         """Take the driver's next dm_msgs/ActuatorState."""
