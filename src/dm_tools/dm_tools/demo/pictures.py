@@ -138,6 +138,7 @@ def save_animation(
             line.set(visible=False)
         picture.set_data(sweep.sharp)
         depth.set(visible=True)
+        right.set_axis_off()
         left.set_title(
             f"3  All sharp, and how far away: {len(sweep.shots)} images, {sweep.seconds:.1f} s",
             color="black",
@@ -146,6 +147,7 @@ def save_animation(
 
     def track(shown: int) -> None:
         depth.set(visible=False)
+        right.set_axis_on()
         text = f"4  Tracking: the object comes nearer, {approach.distances[shown]:.1f} m"
         show(approach.shots[shown], text, COLOURS[0], found[0].region)
 
