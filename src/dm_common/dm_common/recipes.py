@@ -116,8 +116,8 @@ def terms_text(zernike: Sequence[float]) -> str:
 
 def shape_text(shape: Any) -> str:
     """The shape of a recipe, a target or a message of these, for people."""
-    terms = terms_text(shape.zernike)
-    return f"{shape.curvature:+.4f} 1/m{' with ' * bool(terms)}{terms}"
+    curvature, terms = f"{shape.curvature:+.4f} 1/m", terms_text(shape.zernike)
+    return f"{curvature} with {terms}" if terms else curvature
 
 
 NO_RECIPES = RecipeBook((), 0, 0.0, 0)

@@ -136,7 +136,7 @@ class Corrections:
             return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0), False)
         curvatures = [recipe.curvature for recipe in self._recipes]
         inside = target.with_curvature(float(np.clip(target.curvature, min(curvatures), max(curvatures))))
-        if np.abs(self._surface(inside) - surface).max() > SAME_SHAPE:
+        if inside.deviation(target, self._mirror.model.aperture_radius) > SAME_SHAPE:
             raise RecipeError(f"curvature = {shape_text(target)}: nothing is extrapolated; there are {self._there()}")
         own = self._mirror.command(target)[0]
         weights, left = self._kriging.at(own)
@@ -160,9 +160,10 @@ class Corrections:
 
     def _there(self) -> str:
         """The recipes there are, in words."""
-        ranges = groupby(self._recipes, lambda recipe: recipe.series)
-        return ", ".join(
-            f"{len(of)} from {of[0]:+.4f} to {of[-1]:+.4f} 1/m with conic_constant = {conic:g}"
-            f"{', ' * bool(terms)}{terms_text(terms)}"
-            for (conic, terms), of in ((series, [recipe.curvature for recipe in those]) for series, those in ranges)
-        )
+        ranges = []
+        for (conic, terms), alike in groupby(self._recipes, lambda recipe: recipe.series):
+            curvatures = [recipe.curvature for recipe in alike]
+            text = f"{len(curvatures)} from {curvatures[0]:+.4f} to {curvatures[-1]:+.4f} 1/m"
+            text += f" with conic_constant = {conic:g}"
+            ranges.append(f"{text}, {terms_text(terms)}" if terms else text)
+        return ", ".join(ranges)
