@@ -16,12 +16,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, Temperature
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 import dm_simulation.interferometer.trigger
 from dm_common.ros import qos
+from dm_simulation.virtual_bench_node import READING_S
 from support import NodeProcess, Observer, wait_until
 
 Start = Callable[..., NodeProcess]
@@ -104,8 +105,12 @@ def test_trigger_power_and_diagnostics(start: Start, observer: Observer, tmp_pat
 
 def test_fast_clock(start: Start, observer: Observer) -> None:
     ticks: list[Clock] = observer.record(Clock, "/clock")
-    process = start("dm_simulation", "virtual_bench", {**SMALL, "clock.speed": 50.0})
+    readings: list[Temperature] = observer.record(Temperature, "temperature", qos_profile_sensor_data)
+    process = start("dm_simulation", "virtual_bench", {**SMALL, "clock.speed": 50.0, "use_sim_time": True})
     wait_until(lambda: len(ticks) > 200, 60, "ticks of /clock")
+    wait_until(lambda: len(readings) > 5, 60, "readings of the thermometer")
+    read = [Time.from_msg(reading.header.stamp).nanoseconds * 1e-9 for reading in readings]
+    assert (read[-1] - read[0]) / (len(read) - 1) > 0.5 * READING_S
     times = [tick.clock.sec + tick.clock.nanosec * 1e-9 for tick in ticks]
     assert times == sorted(times)
     # 200 periods of at least 2 ms wall time each, 50 times as fast.

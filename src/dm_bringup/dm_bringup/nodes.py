@@ -118,6 +118,9 @@ def node_environment(config_folder: Path) -> dict[str, str]:
     }
 
 
+#: What launch puts before the command of a node: signals wait until the node can end in order (`run_node` lets them
+#: in), instead of ending in tracebacks of what it imports.
+HELD_SIGNALS = "env --block-signal=INT --block-signal=TERM"
 #: Value of the launch argument `autostart`: nodes are configured and activated from outside.
 BY_EVENTS = "events"
 #: Arguments of the launch files: name, default (None = `config` must be given) and description.

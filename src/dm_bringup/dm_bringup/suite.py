@@ -147,7 +147,7 @@ class Suite:
         self._restarts.setdefault(name, _Restarts(time.monotonic())).started = time.monotonic()
 
     def _process(self, name: str, arguments: list[str]) -> subprocess.Popen[bytes]:
-        """A node with these command-line arguments, started."""
+        """A node with these command-line arguments, started; it ends by itself when this process is killed."""
         with contextlib.ExitStack() as stack:
             mode = "ab" if name in self._restarts else "wb"
             output = None if self._echo else stack.enter_context(self.log(name).open(mode))
@@ -159,7 +159,7 @@ class Suite:
                 [sys.executable, "-m", MODULES[name], *arguments],
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=self._environment,
+                env={**self._environment, "DM_SUPERVISOR": str(os.getpid())},
                 start_new_session=True,
             )
 

@@ -20,7 +20,15 @@ from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState
 from lifecycle_msgs.msg import Transition
 
-from dm_bringup.nodes import BY_EVENTS, LAUNCH_ARGUMENTS, arguments_of, companions_of, node_environment, nodes_of
+from dm_bringup.nodes import (
+    BY_EVENTS,
+    HELD_SIGNALS,
+    LAUNCH_ARGUMENTS,
+    arguments_of,
+    companions_of,
+    node_environment,
+    nodes_of,
+)
 from dm_bringup.suite import load_config
 from launch import LaunchDescription
 
@@ -31,10 +39,18 @@ DISCOVERY_S = 3.0
 def start_nodes(context):
     """One action a node; the virtual bench and the autofocus only where the file has a section for them."""
     values = {name: LaunchConfiguration(name).perform(context) for name, _default, _text in LAUNCH_ARGUMENTS}
+    # A debugger or the like that the user puts before the commands comes with a filter of its own.
+    prefix = None if LaunchConfiguration("launch-prefix", default="").perform(context) else HELD_SIGNALS
     actions = []
     for node in nodes_of(load_config(Path(values["config"]))):
         action = (LifecycleNode if node.lifecycle else Node)(
-            package=node.package, executable=node.name, name=node.name, output="screen", **arguments_of(node, values)
+            package=node.package,
+            executable=node.name,
+            name=node.name,
+            exec_name=node.name,
+            output="screen",
+            prefix=prefix,
+            **arguments_of(node, values),
         )
         if node.lifecycle and values["autostart"] == BY_EVENTS:
             actions += brought_up(action)

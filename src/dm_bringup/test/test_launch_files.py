@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import runpy
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -11,7 +14,7 @@ from unittest.mock import MagicMock
 import pytest
 import yaml
 
-from dm_bringup.nodes import LAUNCH_ARGUMENTS, NAMES, NODES, arguments_of, companions_of, nodes_of
+from dm_bringup.nodes import HELD_SIGNALS, LAUNCH_ARGUMENTS, NAMES, NODES, arguments_of, companions_of, nodes_of
 from dm_bringup.suite import ConfigError, load_config
 
 SHARE = Path(__file__).resolve().parents[1]
@@ -27,7 +30,7 @@ class _Recorded:
         self.arguments, self.keywords = arguments, keywords
 
     def perform(self, context: dict[str, str]) -> str:
-        return context[self.arguments[0]]
+        return context.get(self.arguments[0], self.keywords.get("default", ""))
 
 
 def _brought_up(start: _Recorded, transition: _Recorded) -> tuple[Any, Any]:
@@ -72,6 +75,9 @@ def test_launch_files_start_what_up_starts(
     assert tuple(action.keywords["executable"] for action in actions) == nodes
     assert tuple(node.name for node in nodes_of(load_config(path))) == nodes
     assert {action.keywords["parameters"][0] for action in actions} == {str(path)}
+    assert {action.keywords["prefix"] for action in actions} == {HELD_SIGNALS}
+    debugged = start_nodes(DEFAULTS | {"config": str(path), "launch-prefix": "gdb --args"})
+    assert {action.keywords["prefix"] for action in debugged} == {None}  # launch puts it there by itself
     managed = [action.keywords["executable"] for action in actions if isinstance(action, _Managed)]
     assert managed == [name for name in nodes if name != "virtual_bench"]
     # By events: a handler of its start and one of its configuration before each of them.
@@ -83,6 +89,15 @@ def test_launch_files_start_what_up_starts(
     assert asks(None) and goes_on(None) and goes_on(None) == []
     with pytest.raises(ConfigError, match=r"none\.yaml: No such file"):
         start_nodes(DEFAULTS | {"config": str(tmp_path / "none.yaml")})
+
+
+def test_a_signal_waits_until_a_node_has_imported_what_it_needs(domain: int) -> None:
+    script = "import time; time.sleep(0.5); from dm_common.ros.executor import run_node; run_node(lambda: 1 / 0)"
+    command = [*HELD_SIGNALS.split(), sys.executable, "-c", script]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=60.0)[1] == "" and process.returncode == 0
 
 
 def test_the_health_of_every_node_has_its_place_in_the_aggregator() -> None:

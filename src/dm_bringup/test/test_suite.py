@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +16,7 @@ from rclpy.node import Node
 
 from dm_bringup import suite as suite_module
 from dm_bringup.suite import RESTART_S, Suite, load_config, save_config
+from dm_common.ros.domains import own_domain
 
 
 @pytest.fixture
@@ -21,7 +25,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Suite]
 
     def run(code: str, **arguments: Any) -> Suite:
         (tmp_path / "node_of_a_test.py").write_text(code)
-        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
         monkeypatch.setitem(suite_module.MODULES, "calibration", "node_of_a_test")
         return Suite({"calibration": {}}, tmp_path / "run", nodes=("calibration",), **arguments)
 
@@ -98,3 +102,40 @@ def test_the_node_that_could_not_be_made_is_named_and_no_other(tmp_path: Path, m
             time.sleep(0.01)
         with pytest.raises(RuntimeError, match="focus_controller ended with status 1\nwrong"):
             suite.revive(lambda _text: None)
+
+
+NODE = """
+import rclpy.node
+from dm_common.ros.executor import run_node
+
+class Mine(rclpy.node.Node):
+    def __init__(self):
+        super().__init__("mine")
+        print("made", flush=True)
+
+    def make_safe(self):
+        print("safe", flush=True)
+
+run_node(Mine)
+"""
+KILLED_SUITE = """
+import os, pathlib, sys
+from dm_bringup import suite
+
+suite.MODULES["calibration"] = "node_of_a_test"
+with suite.Suite({"calibration": {}}, pathlib.Path(sys.argv[1]), nodes=("calibration",)) as running:
+    while "made" not in running.log("calibration").read_text():
+        pass
+    os.kill(os.getpid(), 9)
+"""
+
+
+def test_nodes_go_with_a_suite_that_is_killed(run: Callable[..., Suite], tmp_path: Path) -> None:
+    log = run(NODE).log("calibration")
+    with own_domain() as domain:
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
+        subprocess.run([sys.executable, "-c", KILLED_SUITE, str(log.parent)], env=environment, timeout=60.0)
+        deadline = time.monotonic() + 30.0
+        while log.read_text() != "made\nsafe\n" and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert log.read_text() == "made\nsafe\n"

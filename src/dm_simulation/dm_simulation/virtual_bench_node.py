@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from rclpy.clock import Clock as SteadyClock
+from rclpy.clock import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock
@@ -79,7 +81,9 @@ class VirtualBenchNode(Node):
             self._ticker.start()
         if isinstance(self.bench.actuators, PiezoActuators):
             self._temperature_publisher = self.create_publisher(Temperature, "temperature", qos_profile_sensor_data)
-            self.create_timer(max(READING_S / max(speed, 1.0), 0.01), self._read_temperature)
+            # By the wall clock: the time of this node is the bench's, or somebody else's that may stand still.
+            steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
+            self.create_timer(max(READING_S / (speed or 1.0), 0.01), self._read_temperature, clock=steady)
         self._camera_thread: threading.Thread | None = None
         if self.bench.camera is not None:
             # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.

@@ -44,6 +44,8 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKE_PERIOD_S = 1.0
 #: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
 SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
+#: Environment variable: process id of the parent that a node goes with, for one that is killed cannot stop its nodes.
+SUPERVISOR = "DM_SUPERVISOR"
 
 
 def make_executor(*nodes: Node) -> Executor:
@@ -200,7 +202,8 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
         # What is there now stays: a full collection through all modules would stall the node for 30 to 50 ms.
         gc.collect()
         gc.freeze()
-        spin(executor, until=lambda: signals.requested)
+        supervisor = os.environ.get(SUPERVISOR)
+        spin(executor, until=lambda: signals.requested or supervisor not in (None, str(os.getppid())))
         return 0
     except (ParameterException, ValueError, OSError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
