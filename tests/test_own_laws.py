@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -10,7 +12,9 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
+from dm_common.hysteresis import law_shape
 from dm_common.hysteresis.law_shape import slope_min, span
+from dm_common.hysteresis.model import HysteresisModel
 from linear_mirror import make_mirror
 
 pytestmark = pytest.mark.slow
@@ -91,3 +95,19 @@ def test_actuators_that_are_alike_lose_nothing() -> None:
 def test_laws_span_the_same_in_a_full_cycle() -> None:
     run, check = relay_run(0.2, 14, 120)
     assert span(identify(run, check, LAWS).fit.law) == pytest.approx(np.full(7, 2.0), rel=1e-9)
+
+
+def test_own_laws_that_cannot_be_inverted_are_tried_again_from_the_next_common_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run, check = relay_run(0.2, 14, 120)
+    begun = list[int]()
+
+    def slope(law: HysteresisModel, low: float, high: float) -> float:
+        begun.append(law.actuators)
+        return -1.0 if begun.count(7) == 1 and law.actuators else 1.0
+
+    monkeypatch.setattr(law_shape, "slope_min", slope)
+    coarser = replace(COMMON[1], name="coarser", plays=19)
+    found = identify(run, check, (COMMON[0], coarser, *LAWS[1:]))
+    assert found.fit.candidate.own and not found.refused and begun.count(7) == 2

@@ -131,14 +131,20 @@ def test_actuators_that_stick_are_named(
         assert verdict.comparison.probability[actuator] > 0.99
 
 
+@pytest.mark.parametrize("other", [0.0, 0.02])
 def test_one_map_of_an_actuator_that_sticks_widens_the_bound_for_every_other_shape(
-    bench: SteadyMirror, updates: RecalibrationManager
+    bench: SteadyMirror, updates: RecalibrationManager, other: float
 ) -> None:
-    """Where it is asked to stand nearly where it stays, the map shows little of what it does elsewhere."""
+    """Where it is asked to stand nearly where it stays, the map shows little of what it does elsewhere.
+
+    Nor is the bound larger than what it does at the far end where another one is off by little.
+    """
 
     def shown(wanted: Floats) -> Verdict:
         settled = replace(bench.settled(), effective=wanted)
-        bench.apply(np.where(np.arange(wanted.size) == 6, 0.2, wanted))
+        at = np.where(np.arange(wanted.size) == 6, 0.2, wanted)
+        at[11] += other
+        bench.apply(at)
         return updates.take(bench.measure("stuck"), settled)
 
     rng = np.random.default_rng(4)
@@ -148,7 +154,7 @@ def test_one_map_of_an_actuator_that_sticks_widens_the_bound_for_every_other_sha
     bound = updates.disagreement
     errors = [shown(wanted).comparison.max_zernike for wanted in shapes[1:]]
     assert max(errors) > 2.0 * first
-    assert max(errors) < bound < 12.0 * first
+    assert max(errors) < bound < 4.0 * max(errors)
 
 
 def test_it_goes_on_without_actuators_that_stick(bench: SteadyMirror, made: Made, tmp_path: Path) -> None:

@@ -108,6 +108,13 @@ def test_slope_min_is_below_every_slope_and_not_far(law: HysteresisModel) -> Non
     assert slope_min(law) > steepest - 0.15
 
 
+def test_slope_min_of_own_laws_is_that_of_the_steepest_loop_alone() -> None:
+    slopes, weights = np.tile([[[1.5, 0.0, 0.0]], [[0.5, 2.0, 0.0]]], (1, 2, 1)), np.array([-0.02, -0.3])
+    alone = [replace(rich(), duhem_slope=slopes[[k]], duhem_weight=weights[[k]]) for k in range(2)]
+    both = replace(rich(), duhem_slope=slopes, duhem_weight=weights)
+    assert slope_min(both) == pytest.approx(min(slope_min(law) for law in alone), abs=1e-12)
+
+
 def test_scaled_spans_two() -> None:
     law = rich()
     assert span(normalised(law)) == pytest.approx(2.0, rel=1e-9)

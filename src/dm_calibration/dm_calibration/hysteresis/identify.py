@@ -67,7 +67,8 @@ def identify(
     Args:
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
         candidates: in this order; the first has no hysteresis to invert. An own one counts where the best before has
-            hysteresis as it has, and begins with the best common one of its kind, if that comes near the best of all.
+            hysteresis as it has, and begins with the best common one of its kind that comes near the best of all, or,
+            where that leads to one that cannot be inverted, with the next.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
         slope_min: smallest slope of a law over the signals of the run.
@@ -86,7 +87,7 @@ def identify(
     part = np.zeros(len(usable), dtype=int)
     part[train] = np.arange(train.sum()) * folds * blocks // train.sum() % folds
     best: tuple[float, CandidateProblem | OwnLaws, LawFit, Floats] | None = None
-    common: dict[tuple[bool, bool], tuple[float, LawFit]] = {}  # the best of each kind
+    common: list[tuple[float, LawFit]] = []
     scores: dict[str, float] = {}
     refused: dict[str, str] = {}
     reach = float(run.signals.min()), float(run.signals.max())
@@ -107,16 +108,20 @@ def identify(
         scores[name] = float(np.sqrt(np.mean(np.square(held_out[train] / scatter))))
         if best is None or PARSIMONY * scores[name] < best[0]:
             best = (scores[name], problem, whole, held_out)
-        if not whole.candidate.own and scores[name] < common.get(whole.candidate.kind, (np.inf,))[0]:
-            common[whole.candidate.kind] = (scores[name], whole)
+        refused.pop(name, None)
+        if not whole.candidate.own:
+            common.append((scores[name], whole))
 
     for candidate in candidates:
         if not candidate.own:
             consider(preisach if candidate == PREISACH else CandidateProblem(run, candidate, scatter))
-        elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic and candidate.kind in common:
-            score, fit = common[candidate.kind]
-            if score < NEAR * min(near for near, _ in common.values()):
-                consider(OwnLaws(run, candidate, fit.law, scatter))
+        elif best is not None and best[1].candidate.hysteretic == candidate.hysteretic:
+            common.sort(key=lambda scored: scored[0])
+            for score, fit in common:
+                if fit.candidate.kind == candidate.kind and score < NEAR * common[0][0]:
+                    consider(OwnLaws(run, candidate, fit.law, scatter))
+                    if candidate.name not in refused:
+                        break
     assert best is not None  # the linear candidate can always be inverted
     score, problem, fitted, held_out = best
     if test.any():

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from dm_common.optics.zernike import PISTON_TILT
+
 Floats = NDArray[np.float64]
 
 #: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
@@ -93,17 +95,23 @@ def described(displaced: Mapping[int, float], probability: Mapping[int, float], 
     return f"{found}; ./dm check {without} goes on without what does not move"
 
 
-def worst_elsewhere(displaced: Mapping[int, float], probability: Mapping[int, float], expected: Floats) -> float:
-    """How many times the error that a map shows another shape may have, where actuators that do not follow make it.
+def worst_elsewhere(
+    displaced: Mapping[int, float], probability: Mapping[int, float], expected: Floats, zernike: Floats
+) -> float:
+    """Largest coefficient error of any other shape by actuators that stay where a map shows them, m.
 
     One that stays where it is errs by as much as it is asked to move: at the far end of the range by most.
 
     Args:
         displaced, probability: as :func:`displaced_actuators` finds them; those that are not sure do not count.
         expected: (N,) effective signals where actuators should stand, within about -1 .. +1.
+        zernike: (K, N) m per unit of effective signal.
     """
-    sure = {actuator: more for actuator, more in displaced.items() if probability[actuator] >= SURE and more}
-    return max((1.0, *((1.0 + abs(expected[actuator] + more)) / abs(more) for actuator, more in sure.items())))
+    furthest = np.zeros(len(expected))
+    for actuator, more in displaced.items():
+        if probability[actuator] >= SURE:
+            furthest[actuator] = 1.0 + abs(expected[actuator] + more)
+    return float((np.abs(zernike[PISTON_TILT:]) @ furthest).max())
 
 
 def _fault(signal: float, more: float) -> str:

@@ -206,7 +206,7 @@ class RecalibrationManager:
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
             found = comparison.displaced, comparison.probability, updates.standing(settled.effective)
-            worst = comparison.max_zernike * worst_elsewhere(*found)
+            worst = max(comparison.max_zernike, worst_elsewhere(*found, calibration.fit.influence_zernike))
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
                 reason += described(*found)

@@ -32,9 +32,6 @@ class DuhemOperator:
 
     Raises:
         ValueError: coefficients that are not finite, or a state that no table holds.
-
-    Attributes:
-        slope_range: smallest and largest f that is met, of all.
     """
 
     def __init__(self, slope: Floats) -> None:
@@ -58,7 +55,6 @@ class DuhemOperator:
         met = (np.arange(KNOTS) >= begin[:, None]) & (np.arange(KNOTS) <= end[:, None])
         if end.max() >= KNOTS - 1 or end.min() < middle + 1 or f[met].min() <= 0.0:
             raise ValueError(f"duhem_slope = {slope.tolist()}: the state does not stay within +-{REACH:g}")
-        self.slope_range = float(f[met].min()), float(f[met].max())
         # All tables in one, each moved out of the others' way, so that one look-up serves all actuators.
         self._apart = 2.0 * float(np.ptp(z))
         travel += 2.0 * np.abs(travel).max() * rows[:, None]

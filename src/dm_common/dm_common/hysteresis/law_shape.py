@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.hysteresis.duhem import DuhemOperator
+from dm_common.hysteresis.duhem import FULL_SWING, DuhemOperator
 from dm_common.hysteresis.inverse import certain_reach
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
@@ -35,12 +35,26 @@ def slope_min(law: HysteresisModel, low: float = -1.0, high: float = 1.0) -> flo
     for power in range(weight.shape[-1], 0, -1):
         slope = slope * value + power * weight[..., power - 1]
     slope = np.where(2.0 * radius <= behind, slope, 0.0)
-    smallest = np.cumsum(slope, axis=-1).min(axis=(-3, -2, -1))
+    smallest = np.cumsum(slope, axis=-1).min(axis=-2)  # (..., 2, R), of each number of operators that have set in
     if law.duhem_slope.size:
-        duhem = DuhemOperator(law.duhem_slope)
-        least, most = duhem.slope_range
-        smallest = smallest + np.minimum(law.duhem_weight * least, law.duhem_weight * most)
-    return float(np.min(smallest))
+        smallest = smallest + _fading_slope(law, 2.0 * radius)
+    return float(smallest.min())
+
+
+def _fading_slope(law: HysteresisModel, travelled: Floats) -> Floats:
+    """(N, 2, R) smallest slope of the fading part of each actuator, or of one, on both ways `travelled` (R,) after a
+    turn or later.
+    """
+    duhem, actuators = DuhemOperator(law.duhem_slope), law.actuators or 1
+    weight, share = np.reshape(law.duhem_weight, (-1, 1, 1)), np.linspace(0.0, 1.0, STEPS)
+    smallest = []
+    for way in (1.0, -1.0):
+        furthest = duhem.move(np.zeros(actuators), np.full(actuators, -FULL_SWING * way))[:, None]
+        since, end = (duhem.move(furthest, way * np.tile(far, (actuators, 1))) for far in (travelled, [FULL_SWING]))
+        met = since[..., None] + (end - since)[..., None] * share
+        rise = duhem.rise(met.reshape(actuators, -1), np.full((actuators, 1), way)).reshape(met.shape)
+        smallest.append((weight * rise).min(axis=-1))
+    return np.stack(smallest, axis=1)
 
 
 def span(law: HysteresisModel) -> Floats:
