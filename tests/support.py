@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from dm_calibration import calibrator
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.procedure import forecast
+from dm_simulation.interferometer import trigger
 from dm_tools.demo.demo_bench import bench_config
 from fault_injection.rigs.forked_node import ForkedNode, ForkedSuite
 from ros_fixtures import Observer
@@ -30,6 +32,7 @@ __all__ = [
     "bench_figures",
     "fast_bench",
     "only_common_laws",
+    "quick_trigger",
     "wait_until",
 ]
 
@@ -43,7 +46,13 @@ def fast_bench(folder: Path, seed: int, source: Path | None = None) -> dict[str,
     config = bench_config(folder, "off", 0.0, seed, 20.0, source)
     config["virtual_bench"] |= {"clock.period": 0.01, "interferometer.pixels": 472}
     config["calibration"]["write_report"] = False
+    quick_trigger(config)
     return config
+
+
+def quick_trigger(config: dict[str, dict[str, Any]]) -> None:
+    """Have the shipped trigger program run in half the time, as it runs once for every map."""
+    config["interferometer"]["trigger_command"][:3] = [sys.executable, "-S", "-I", str(trigger.__file__)]
 
 
 def only_common_laws(names: Collection[str] = ()) -> None:

@@ -12,7 +12,7 @@ from dm_msgs.action import Calibrate
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
-from support import CommonLawsSuite, Observer, wait_until
+from support import CommonLawsSuite, Observer, quick_trigger, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
 
@@ -28,6 +28,7 @@ def bench(folder: Path) -> Iterator[tuple[int, str]]:
     """ROS domain and address of the console of a bench of its own."""
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 5, 20.0)
     config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
+    quick_trigger(config)
     with own_domain() as domain, CommonLawsSuite(config, folder, domain) as suite, served(domain, folder) as address:
         yield domain, address
         suite.check()

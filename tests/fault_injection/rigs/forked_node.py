@@ -8,6 +8,7 @@ nodes, so they are forked off a server that has imported them all once. Nothing 
 from __future__ import annotations
 
 import atexit
+import gc
 import importlib
 import multiprocessing
 import os
@@ -123,6 +124,7 @@ def _run(
     prepare: Callable[[], None] | None,
 ) -> None:
     """What the forked process does."""
+    gc.freeze()  # what the server has imported is no garbage, and shared until somebody looks
     threading.Thread(target=_end_with_the_tests, daemon=True).start()
     os.setsid()
     os.chdir(folder)
