@@ -51,37 +51,41 @@ def influence_sheet(calibration: Calibration) -> Figure:
     maps = on_disc(fit.influence_sag.T, fit.points) * NM
     radius = calibration.aperture_radius * MM
     rows = -(-len(maps) // COLUMNS)
-    height = 1.45 * rows + 0.7
-    figure = Figure(figsize=(10.5, height))
-    # Finding a layout for so many axes would take longer than all the rest.
-    edges = {"left": 0.07, "right": 0.87, "bottom": 0.5 / height, "top": 1.0 - 0.25 / height, "hspace": 0.28}
-    grid = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False, gridspec_kw=edges)
+    # One pair of axes for all, a map beside the next: axes for each would take ten times as long as all the rest.
+    across, down = 2.2 * radius, 2.7 * radius
+    columns, lines = across * np.arange(COLUMNS), -down * np.arange(rows)
+    figure = Figure(figsize=(10.5, 1.45 * rows + 0.7), layout="constrained")
+    axes = figure.add_subplot()
     scale = Normalize(-np.nanmax(np.abs(maps)), np.nanmax(np.abs(maps)))
-    for number, axes in enumerate(grid.flat):
-        if number >= len(maps):
-            axes.set_visible(False)
-            continue
-        extent = (-radius, radius, -radius, radius)
-        image = axes.imshow(maps[number], origin="lower", extent=extent, cmap=DIVERGING, norm=scale)
-        axes.add_patch(Circle((0, 0), radius, fill=False, edgecolor=GREY, linewidth=0.6))
-        # An actuator outside the aperture lies beyond the axes: clipping would hide that it is there.
+    for number, sag in enumerate(maps):
+        centre = np.array([columns[number % COLUMNS], lines[number // COLUMNS]])
+        left, bottom, right, top = *(centre - radius), *(centre + radius)
+        image = axes.imshow(sag, origin="lower", extent=(left, right, bottom, top), cmap=DIVERGING, norm=scale)
+        axes.add_patch(Circle(tuple(centre), radius, fill=False, edgecolor=GREY, linewidth=0.6))
+        # Of an actuator outside the aperture, the direction shows.
         place = np.array([calibration.actuator_x[number], calibration.actuator_y[number]]) * MM
         distance = max(float(np.hypot(*place)), 1e-12)
         outside = distance > radius
-        marker = "o" if not outside else "x"
-        x, y = place if not outside else place * radius / distance
-        axes.plot(x, y, marker, color="black", markersize=3, markerfacecolor="none", clip_on=False)
-        grade = int(fit.grades[number])
-        axes.set_title(
-            f"{number + 1}: {GRADE_NAMES[grade]}",
+        x, y = centre + (place * radius / distance if outside else place)
+        axes.plot(x, y, "x" if outside else "o", color="black", markersize=3, markerfacecolor="none")
+        good = fit.grades[number] == GRADE_GOOD
+        axes.text(
+            centre[0],
+            top + 0.1 * radius,
+            f"{number + 1}: {GRADE_NAMES[fit.grades[number]]}",
             fontsize=8,
-            color="black" if grade == GRADE_GOOD else VERMILION,
-            fontweight="normal" if grade == GRADE_GOOD else "bold",
+            ha="center",
+            color="black" if good else VERMILION,
+            fontweight="normal" if good else "bold",
         )
-        axes.tick_params(labelsize=6.5, labelbottom=number + COLUMNS >= len(maps))
-    figure.supxlabel("x, mm", fontsize=9)
-    figure.supylabel("y, mm", fontsize=9)
-    figure.colorbar(image, cax=figure.add_axes((0.91, 0.3, 0.015, 0.4)), label="sag per unit signal, nm")
+    ticks = np.array([-0.5, 0.0, 0.5]) * radius
+    labels = [f"{tick:.3g}" for tick in ticks]
+    axes.set_xticks((columns[:, None] + ticks).ravel(), labels * COLUMNS, fontsize=6.5)
+    axes.set_yticks((lines[:, None] + ticks).ravel(), labels * rows, fontsize=6.5)
+    axes.set(xlim=(-1.1 * radius, columns[-1] + 1.1 * radius), ylim=(lines[-1] - 1.1 * radius, 1.6 * radius))
+    axes.set(xlabel="x, mm", ylabel="y, mm")
+    axes.spines[:].set_visible(False)
+    figure.colorbar(image, ax=axes, shrink=0.4, label="sag per unit signal, nm")
     return figure
 
 
