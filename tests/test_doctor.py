@@ -30,8 +30,8 @@ from dm_calibration.store.calibration_store import CalibrationStore
 from dm_simulation.interferometer.zygo_files import encode_dat
 from dm_tools.doctor import bench as doctor_bench
 from dm_tools.doctor import machine as doctor_machine
+from dm_tools.doctor.doctor import held_by_the_nodes
 from dm_tools.doctor.finding import Finding
-from dm_tools.verbs.doctor import held_by_the_nodes
 from dm_tools.verbs.up import shared_config
 from hysteretic_mirror import MIRROR
 from recorded_bench import recorded
@@ -75,6 +75,7 @@ def test_wrong_parameters_are_named(node: str, name: str, value: Any, words: str
 
 FRAMED = {"electronics.kind": "framed_serial", "electronics.serial_port": "/dev/ttyUSB0"}
 WIRING = list(range(1, 38))
+MONTH_S = 30 * 86400.0
 TWO_RINGS = {"mirror.actuators": 19, "mirror.wiring": "custom", "mirror.channels": WIRING[:19]}
 LINK = {"electronics.pty_link": "tty", "framed.channels": 40}
 
@@ -280,24 +281,25 @@ def test_disk_use_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_calibrations_old_foreign_damaged_or_missing(tmp_path: Path) -> None:
-    none = doctor_bench.stored_calibration(tmp_path, "T-1")
+    none = doctor_bench.stored_calibration(tmp_path, "T-1", MONTH_S)
     assert none is not None and none.note and "no calibration of the mirror T-1" in none.problem
     outcome = recorded(PlanKind.POKES, PlanOptions())[1]
     calibration = calibrate(outcome, mirror=MIRROR, options=FitOptions(), provenance=Provenance("PDM_1", 10**18, ""))
     CalibrationStore(tmp_path).save(calibration)
     serial = calibration.mirror_serial
-    foreign = doctor_bench.stored_calibration(tmp_path, "other")
+    foreign = doctor_bench.stored_calibration(tmp_path, "other", MONTH_S)
     assert foreign is not None and f"those there are of {serial}" in foreign.problem
     file = tmp_path / f"{calibration.id}.h5"
     now = time.time()
     os.utime(file, (now, now))
-    assert doctor_bench.stored_calibration(tmp_path, serial) is None
+    assert doctor_bench.stored_calibration(tmp_path, serial, MONTH_S) is None
     long_ago = calibration.created_ns * 1e-9
     os.utime(file, (long_ago, long_ago))
-    old = doctor_bench.stored_calibration(tmp_path, serial)
+    assert doctor_bench.stored_calibration(tmp_path, serial, 1e10) is None
+    old = doctor_bench.stored_calibration(tmp_path, serial, MONTH_S)
     assert old is not None and old.note and "days old" in old.problem and "./dm check" in old.cure
     file.write_bytes(b"nothing of that kind")
-    damaged = doctor_bench.stored_calibration(tmp_path, serial)
+    damaged = doctor_bench.stored_calibration(tmp_path, serial, MONTH_S)
     assert damaged is not None and not damaged.note and calibration.id in damaged.problem
 
 

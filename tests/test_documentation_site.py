@@ -15,11 +15,11 @@ from documentation import ELSEWHERE, PAGES, ROOT, classified
 
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text()
-#: Written from the code, whose lines are as long as its sentences.
-GENERATED = {"interfaces.md", "parameters.md"}
 #: Of the README, whose first screens are read by everybody.
 README_LINES_MAX = 130
 LINE_MAX = 120
+#: Of pages that are written from the code, whose sentences they take over.
+GENERATED_LINE_MAX = {"interfaces.md": 130, "parameters.md": 130}
 
 
 def nav() -> dict[str, list[str]]:
@@ -114,11 +114,11 @@ def test_the_image_is_made_as_the_hosted_checks_do() -> None:
     assert any(command.startswith("docker build") for command in ELSEWHERE)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.name not in GENERATED], ids=lambda path: path.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_lines_are_short(page: Path) -> None:
     """But rows of tables and commands, which cannot be broken."""
-    lines = enumerate(page.read_text().splitlines(), 1)
-    long = [number for number, line in lines if len(line) > LINE_MAX and not line.startswith(("|", "    "))]
+    lines, most = enumerate(page.read_text().splitlines(), 1), GENERATED_LINE_MAX.get(page.name, LINE_MAX)
+    long = [number for number, line in lines if len(line) > most and not line.startswith(("|", "    "))]
     assert not long, f"{page.name}: lines {long}"
 
 

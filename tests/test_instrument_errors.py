@@ -23,7 +23,7 @@ from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
 from dm_simulation.electronics.server import OFF, PortsConfig
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from dm_tools.cli import make_app
-from dm_tools.verbs.measure import _table
+from dm_tools.verbs.instrument import _table
 
 PIXELS, FIELD = 200, 0.022
 SETTINGS = IngestSettings(aperture_radius=0.0095, pitch=FIELD / PIXELS)

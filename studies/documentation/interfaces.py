@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -51,6 +52,8 @@ with the value and the allowed range.
 | node | package | what it does |
 |---|---|---|
 """
+#: Longest line of text, but of tables.
+LINE_MAX = 130
 #: What each node does.
 DUTIES = {
     "virtual_bench": "the simulation: mirror with hysteresis and creep, electronics, interferometer, camera",
@@ -243,7 +246,16 @@ def interfaces_page() -> str:
             parts += definition(path)
     parts.append(committed(PAGE.read_text()))  # from a run, which takes a minute
     parts.append(commands())
-    return re.sub(r"\n{3,}", "\n\n", "\n".join(parts)).rstrip("\n") + "\n"
+    text = "\n".join(wrapped(line) for line in "\n".join(parts).splitlines())
+    return re.sub(r"\n{3,}", "\n\n", text).rstrip("\n") + "\n"
+
+
+def wrapped(line: str) -> str:
+    """A line of text or of a list as lines that one can read; rows of tables stay whole."""
+    if line.startswith("|") or len(line) <= LINE_MAX:
+        return line
+    indent = "  " if line.startswith("* ") else ""
+    return textwrap.fill(line, LINE_MAX, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 if __name__ == "__main__":

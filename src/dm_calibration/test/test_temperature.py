@@ -68,6 +68,18 @@ def test_readings_that_are_none_are_left_out(node: Node, log: TemperatureLog) ->
     assert log.now() != log.now()
     node.say(21.0, 0.0)  # without a stamp it is of now
     assert log.now() == 21.0
-    node.say(22.0, 900.0)  # the clock was set back
-    node.seconds = 901.0
+
+
+def test_a_late_reading_takes_its_place(node: Node, log: TemperatureLog) -> None:
+    for value, seconds in ((20.0, 980.0), (22.0, 1000.0), (21.0, 990.0)):
+        node.say(value, seconds)
+    assert [log.at(seconds) for seconds in (985.0, 995.0, 1001.0)] == [20.0, 21.0, 22.0]
+
+
+def test_readings_of_before_the_clock_was_set_back_go(node: Node, log: TemperatureLog) -> None:
+    node.say(21.0, 1000.0)
+    node.seconds = 500.0
+    node.say(22.0, 500.0)
     assert log.now() == 22.0
+    node.seconds = 1001.0
+    assert log.now() != log.now()

@@ -28,8 +28,8 @@ VERBS = {
     "flatten": "dm_tools.verbs.focus",
     "degauss": "dm_tools.verbs.focus",
     "measure": "dm_tools.verbs.measure",
-    "check": "dm_tools.verbs.measure",
-    "instrument": "dm_tools.verbs.measure",
+    "check": "dm_tools.verbs.check",
+    "instrument": "dm_tools.verbs.instrument",
     "report": "dm_tools.verbs.report",
     "recipes": "dm_tools.verbs.recipes",
     "console": "dm_tools.verbs.console",
@@ -39,8 +39,8 @@ VERBS = {
     "record": "dm_tools.verbs.record",
     "replay": "dm_tools.verbs.replay",
     "faults": "fault_injection.verb",
-    "security": "dm_tools.verbs.security",
-    "doctor": "dm_tools.verbs.doctor",
+    "security": "dm_tools.security.security",
+    "doctor": "dm_tools.doctor.doctor",
     "test": "studies.verbs.run_checks",
 }
 #: Packages that are not installed: their verbs are there where the checkout is.

@@ -142,5 +142,6 @@ def converge_step(feedback: Any) -> str:
 
 
 def recipe_step(feedback: Any) -> str:
-    """Feedback of the action `build_recipes`: the curvature, the map and how far off it was."""
-    return (f"{feedback.curvature:+.4f} 1/m, " if feedback.step else "") + converge_step(feedback)
+    """Feedback of the action `build_recipes`: number in the list, curvature, the map and how far off it was."""
+    which = f"{feedback.recipes + 1}: {feedback.curvature:+.4f} 1/m, " if feedback.step else ""
+    return which + converge_step(feedback)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from collections import deque
+from bisect import bisect_right, insort
 from collections.abc import Callable
 
 from rclpy.node import Node
@@ -31,18 +30,19 @@ class TemperatureLog:
 
     def __init__(self, node: Node, silent_after: Callable[[], float]) -> None:
         self._node, self._silent_after = node, silent_after
-        self._readings: deque[tuple[float, float]] = deque(maxlen=KEPT)
+        self._readings: list[tuple[float, float]] = []
         self._published = math.nan
         node.create_subscription(Temperature, "temperature", self._on_reading, qos_profile_sensor_data)
 
     def _on_reading(self, message: Temperature) -> None:
         now = 1e-9 * self._node.get_clock().now().nanoseconds
-        stamp = seconds(message.header.stamp) or now
-        # One that a clock set back or a torn driver has spoilt is none.
-        if POSSIBLE[0] <= message.temperature <= POSSIBLE[1] and stamp <= now + self._silent_after():
-            if self._readings and stamp < self._readings[-1][0]:
-                self._readings.clear()
-            self._readings.append((stamp, message.temperature))
+        stamp, latest = seconds(message.header.stamp) or now, now + self._silent_after()
+        while self._readings and self._readings[-1][0] > latest:
+            self._readings.pop()  # of before the clock was set back
+        # One that a clock set back or a torn driver has spoilt is none; one that comes late keeps its place.
+        if POSSIBLE[0] <= message.temperature <= POSSIBLE[1] and stamp <= latest:
+            insort(self._readings, (stamp, message.temperature))
+            del self._readings[:-KEPT]
 
     def at(self, time: float) -> float:
         """degC at `time` (s): the last reading before it; NaN when there is none that is recent enough."""

@@ -122,7 +122,7 @@ class RecipeRun:
         missed = [shape_text(r) for r in recipes if r.max_zernike > options.tolerance]
         if code == ErrorCode.OK and missed:
             code = ErrorCode.NOT_CONVERGED
-            text = f"not within the tolerance of {options.tolerance * 1e9:.2f} nm: {', '.join(missed)}"
+            text = f"not within the tolerance of {options.tolerance * 1e9:.2f} nm: {' and '.join(missed)}"
         figures = (
             f"{result.recipes} of {len(targets)} recipes stored with calibration {calibration.id}, largest coefficient "
             f"error {result.max_zernike * 1e9:.2f} nm re-measured, {result.interpolation_error * 1e9:.2f} nm more "

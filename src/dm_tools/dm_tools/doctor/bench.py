@@ -52,8 +52,11 @@ def bench_checks(file: Path) -> Iterator[Check]:
     if store is not None:
         serial = str(config.get("pdm_driver", {}).get("mirror.serial", ""))
         yield f"calibration folder {store}", lambda: writable_folder(store)
+        own = {"calibration": config["calibration"]}
+        # Wrong values are reported already.
+        values = effective("calibration", {} if parameters(own) else own["calibration"])
         if serial != UNSET:
-            yield "calibration", lambda: stored_calibration(store, serial)
+            yield "calibration", lambda: stored_calibration(store, serial, values["updates.stale_after"])
 
 
 def _folder_of(config: Config, node: str, name: str) -> Path | None:
@@ -265,8 +268,8 @@ def writable_folder(folder: Path) -> Finding | None:
     return disk(nearest) if shutil.disk_usage(nearest).free != shutil.disk_usage(Path.home()).free else None
 
 
-def stored_calibration(folder: Path, serial: str) -> Finding | None:
-    """Whether there is a readable calibration of this mirror, and how old it is."""
+def stored_calibration(folder: Path, serial: str, stale_after: float) -> Finding | None:
+    """Whether there is a readable calibration of this mirror, compared with a map in the last `stale_after`, s."""
     from dm_calibration.store.calibration_store import CalibrationStore
 
     entries = CalibrationStore(folder).entries()
@@ -284,7 +287,7 @@ def stored_calibration(folder: Path, serial: str) -> Finding | None:
     assert newest is not None
     checked = max(newest.created_ns * 1e-9, (folder / f"{newest.id}.h5").stat().st_mtime)  # updates rewrite the file
     days = (time.time() - checked) / DAY_S
-    if days * DAY_S > _known("calibration")["updates.stale_after"].default:
+    if days * DAY_S > stale_after:
         return Finding(
             f"{newest.id} is {days:.0f} days old, and no map has been compared with it since",
             "./dm check says whether it is still true, and mends small drifts; else ./dm calibrate",

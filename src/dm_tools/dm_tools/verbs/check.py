@@ -1,0 +1,89 @@
+"""`dm check`: compare one map with the calibration in use, and let it improve it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from dm_common.figures import two_fold
+from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, nanometres, next_step, write_json
+from dm_tools.running_suite import REPORT_S, hear_health, kept, naming_holder, running_suite, settled_shape, verdict
+
+
+def check(
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Compare only; the calibration stays as it is.")] = False,
+    forget: Annotated[bool, typer.Option("--forget", help="Drop all earlier updates; no map is taken.")] = False,
+    without: Annotated[
+        list[int] | None,
+        typer.Option(
+            metavar="NUMBER",
+            help="Go on without this actuator, which does not move any more; repeatable. --forget takes it back.",
+        ),
+    ] = None,
+    take_over: TakeOverOption = False,
+    namespace: NamespaceOption = "",
+    json: JsonOption = None,
+) -> None:
+    """Check the calibration against the mirror as it stands, and follow its drift.
+
+    Needs the running suite (`dm up`) with an interferometer. Nothing moves. Exit status 1 when the map disagrees,
+    or shows a larger error than is promised.
+    """
+    if forget and (dry_run or without):
+        raise typer.BadParameter(f"--{'dry-run' if dry_run else 'without'} and --forget: only one of them")
+    with running_suite(namespace) as client, naming_holder(client):
+        health = hear_health(client)
+        response = client.update_calibration(dry_run=dry_run, forget=forget, without=without or (), take_over=take_over)
+        calibration = client.latest("calibration")
+        # What the shape that stands was promised, and not what the calibration promises of any.
+        client.wait(lambda: "focus_controller" in health, REPORT_S)
+    shape, capabilities = settled_shape(health), client.messages.get("capabilities")
+    if shape is not None:
+        promised = shape.bound
+    elif capabilities is not None:
+        promised = capabilities.error_bound
+    else:  # without a focus controller, what the calibration's own maps showed
+        promised = calibration.hysteresis.held_out_max_zernike or calibration.held_out_max_zernike
+    if forget:
+        console.print(response.message)
+    else:
+        console.print(f"largest coefficient: {verdict(promised, response.max_zernike)}")
+        console.print(two_fold(promised, calibration, shape.curvature if shape else 0.0), soft_wrap=True)
+        if not response.accepted:
+            console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)
+        elif without:
+            console.print(response.message, soft_wrap=True)
+    console.print(
+        f"since the calibration was made: {response.revision} maps taken in, gains changed by up to "
+        f"{response.gain_drift:.2%}, the figure by {nanometres(response.offset_drift):.2f} nm rms"
+    )
+    write_json(json, {"check": figures_of(response) | {"promised_nm": nanometres(promised)}})
+    if not (response.accepted or forget):
+        cure = "as the message says, or ./dm calibrate" if "--without" in response.message else "./dm calibrate"
+        next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}")
+        raise typer.Exit(1)
+    if not (forget or without or kept(promised, response.max_zernike)):
+        next_step("one map in twenty may be outside: ./dm check again with another shape; if it is too, ./dm calibrate")
+        raise typer.Exit(1)
+    if without and not dry_run:
+        next_step("ask for the shape again: the command that stands counts on all actuators; ./dm status has the range")
+        return
+    next_step(
+        "./dm report writes what the calibration holds"
+        if calibration.hysteresis.play_radius
+        else "./dm calibrate finds the hysteresis too, and promises far less than this"
+    )
+
+
+def figures_of(response: Any) -> dict[str, Any]:
+    """A check's figures for JSON."""
+    return {
+        "accepted": response.accepted,
+        "max_zernike_nm": nanometres(response.max_zernike),
+        "rms_nm": nanometres(response.rms),
+        "surprise": response.surprise,
+        "revision": response.revision,
+        "gain_drift": response.gain_drift,
+        "offset_drift_nm": nanometres(response.offset_drift),
+    }

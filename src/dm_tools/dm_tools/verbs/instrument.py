@@ -1,0 +1,140 @@
+"""`dm instrument`: find from files what the interferometer itself adds to every map."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dm_tools.output import JsonOption, console, nanometres, next_step, write_json
+
+
+class Procedure(StrEnum):
+    """What `dm instrument` finds."""
+
+    FLATS = "flats"
+    RETRACE = "retrace"
+    GRID = "grid"
+
+
+def instrument(
+    procedure: Annotated[
+        Procedure,
+        typer.Argument(
+            help="flats: the reference surface, from a table of maps of flats (file, reference, part, degrees). "
+            "retrace: what goes with tilt, from maps of one shape under different tilts. grid: lateral scale and "
+            "distortion, from a table of marks (column, row, x, y; m) and a map with the same zoom."
+        ),
+    ],
+    files: Annotated[list[Path], typer.Argument(help="Tables (CSV with these headings), map files.")],
+    write: Annotated[Path | None, typer.Option(metavar="FILE.fits", help="Where the reference surface goes.")] = None,
+    xyz_unit: Annotated[str, typer.Option(help="Unit of .xyz files, and of FITS files without one.")] = "",
+    json: JsonOption = None,
+) -> None:
+    """Find the errors of the interferometer itself from files, as parameters to paste. Needs no nodes."""
+    from dm_calibration.influence.poke_cure import parameter_text
+    from dm_calibration.map_files import MapFileError, read_map
+
+    def read(path: Path) -> Any:
+        return read_map(path, xyz_unit=xyz_unit or None)
+
+    if (write is not None) != (procedure is Procedure.FLATS):
+        raise typer.BadParameter("--write FILE.fits: flats need it, the others leave no file")
+    wanted = {Procedure.FLATS: (1, "one table of maps"), Procedure.GRID: (2, "the table of marks and one map")}
+    if procedure in wanted and len(files) != wanted[procedure][0]:
+        raise typer.BadParameter(f"{len(files)} files: must be {wanted[procedure][1]}")
+    try:
+        if write is not None:
+            found = _flats(files[0], write, read)
+        elif procedure is Procedure.RETRACE:
+            found = _retrace([read(file).sag for file in files])
+        else:
+            found = _grid(files[0], read(files[1]).sag.shape)
+    except (MapFileError, ValueError, OSError) as error:
+        raise typer.BadParameter(str(error)) from error
+    console.print(parameter_text({"interferometer": found}), soft_wrap=True, markup=False, highlight=False)
+    write_json(json, {"instrument": found})
+    next_step("put the parameters into the parameter file; `instrument_error` is the bound on what is left")
+
+
+def _flats(table: Path, target: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
+    """Write the error of the flat that is the first reference in `table`."""
+    from dm_calibration.map_files.fits import fits_bytes
+    from dm_calibration.optics.flats import FlatTest, reference_from_flats
+    from dm_common.atomic_write import write_whole
+
+    rows = _table(table, "file", "reference", "part", "degrees")
+    surfaces = [read(table.parent / row[0]) for row in rows]
+    tests = [
+        FlatTest(surface.sag, reference, part, math.radians(float(degrees)))
+        for surface, (_, reference, part, degrees) in zip(surfaces, rows, strict=True)
+    ]
+    found = reference_from_flats(tests)
+    write_whole(target, fits_bytes(replace(surfaces[0], sag=found.sag), "dm instrument flats"))
+    console.print(
+        f"{target}: the flat {tests[0].reference}, from {len(tests)} maps, which disagree by "
+        f"{nanometres(found.left):.2f} nm rms",
+        soft_wrap=True,
+    )
+    if found.open_orders:
+        orders = ", ".join(map(str, found.open_orders))
+        console.print(
+            f"not told by these maps, and left out: angular orders {orders} (0 = what is the same all round); exchange "
+            "the flats, or turn one by an angle of no simple share of a turn",
+            soft_wrap=True,
+        )
+    known = not found.open_orders and math.isfinite(found.bound)
+    return {"reference_surface": str(target.absolute())} | ({"instrument_error": found.bound} if known else {})
+
+
+def _retrace(maps: list[Any]) -> dict[str, Any]:
+    from dm_calibration.optics.instrument import find_retrace
+
+    found, before, left = find_retrace(maps)
+    console.print(
+        f"coefficients differ by up to {nanometres(before):.2f} nm between these maps, by {nanometres(left):.2f} nm "
+        "without the retrace error"
+    )
+    return {"retrace": [round(float(value), 9) for value in found]}
+
+
+def _grid(table: Path, shape: tuple[int, int]) -> dict[str, Any]:
+    from dm_calibration.optics.instrument import lateral_scale
+
+    marks = [[float(value) for value in row] for row in _table(table, "column", "row", "x", "y")]
+    found = lateral_scale(marks, shape)
+    console.print(
+        f"distortion {found.distortion:+.3%} +- {found.distortion_error:.3%} at the edge; the marks are "
+        f"{found.left * 1e6:.2f} um from where that puts them, rms",
+        soft_wrap=True,
+    )
+    return {
+        "pitch": round(found.pitch, 12),
+        "distortion": round(found.distortion, 7),
+        "scale_error": round(found.scale_error, 7),
+    }
+
+
+def _table(path: Path, *names: str) -> list[list[str]]:
+    """The rows of a CSV file with these headings, in any order; `degrees` may be missing and is 0 then.
+
+    Raises:
+        ValueError: naming the file, and the line that lacks a value.
+    """
+    with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading
+        rows = list(csv.DictReader(file, restval="", skipinitialspace=True))
+    missing = [name for name in names if name != "degrees" and (not rows or name not in rows[0])]
+    if missing:
+        raise ValueError(f"{path}: has no column {', '.join(missing)}; the first line must name {', '.join(names)}")
+    default = {"degrees": "0"}
+    table = [[row.get(name, "").strip() or default.get(name, "") for name in names] for row in rows]
+    for number, values in enumerate(table, start=1):
+        if "" in values:
+            raise ValueError(f"{path}: row {number} below the headings has no {names[values.index('')]}")
+    return table
