@@ -90,9 +90,15 @@ def test_recipes_are_built_and_a_conditioned_move_uses_them(page: Browser, shots
     page.unfold("Recipes")
     page.enter("First, 1/m", "0,015")  # as half of Europe writes it
     page.enter("Recipes", "1")
+    page.enter("Added terms, nm", "coma=1")
+    page.press("Build recipes")
+    wait_until(lambda: "must be like 'coma sin=-50'" in page.alerts(), 60, "the refusal")
+    page.press("Dismiss: Recipes")
+    page.enter("Added terms, nm", "coma sin=1")
     page.press("Build recipes")
     page.wait_for("1 of 1 recipes stored", 900)
     page.wait_for("+0.0150")
+    page.wait_for("coma sin +1 nm")
     page.press("Move")
     page.wait_for("Mode: conditioned.", 120)
     page.wait_for("Move: +0.0150 1/m stands after", 120)
@@ -155,6 +161,11 @@ def test_a_calibration_started_elsewhere_is_shown_and_can_be_cancelled(page: Bro
         page.wait_for("Step ", 30)
         wait_until(lambda: "maps" in " ".join(page.pictures("residual of ")), 60, "its residuals")
         assert not page.find("Move", "button").is_enabled()
+        page.resize(*PHONE)
+        assert page.driver.execute_script(
+            "const header = document.querySelector('.header'); return header.scrollHeight <= header.clientHeight"
+        ), "the header holds what it shows"
+        page.resize(*DESKTOP)
         page.press("Cancel calibration")
         wait_until(result.done, 60, "its end")
         assert "cancel" in result.result().result.message

@@ -6,7 +6,8 @@ import pytest
 import typer
 
 from dm_common.optics.zernike import SPOKEN
-from dm_tools.verbs.recipes import curvatures_of, terms_of
+from dm_common.recipes import terms_of
+from dm_tools.verbs.recipes import curvatures_of
 
 
 def test_a_list_or_a_range() -> None:
@@ -30,5 +31,5 @@ def test_added_terms_go_by_the_names_that_measure_prints() -> None:
 
 @pytest.mark.parametrize("text", ["coma=5", "coma sin", "coma sin=x", ""])
 def test_terms_that_are_none_are_refused(text: str) -> None:
-    with pytest.raises(typer.BadParameter, match=f"zernike = {text!r}"):
+    with pytest.raises(ValueError, match=f"zernike = {text!r}"):
         terms_of(text)

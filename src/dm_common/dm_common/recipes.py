@@ -114,6 +114,24 @@ def terms_text(zernike: Sequence[float]) -> str:
     return ", ".join(f"{name} {1e9 * value:+.4g} nm" for name, value in terms if value)
 
 
+def terms_of(text: str) -> list[float]:
+    """Added terms, m, from a text such as "astigmatism cos=200, coma sin=-50", in nm; names of SPOKEN.
+
+    Raises:
+        ValueError: naming what is no term, or no number.
+    """
+    terms = dict.fromkeys(SPOKEN, 0.0)
+    for part in text.split(","):
+        name, _, value = (each.strip() for each in part.partition("="))
+        if name not in terms:
+            raise ValueError(f"zernike = {text!r}: must be like 'coma sin=-50'; terms: {', '.join(SPOKEN)}")
+        try:
+            terms[name] = 1e-9 * float(value)
+        except ValueError as error:
+            raise ValueError(f"zernike = {text!r}: {value!r} is not a number of nm") from error
+    return list(terms.values())
+
+
 def shape_text(shape: Any) -> str:
     """The shape of a recipe, a target or a message of these, for people."""
     curvature, terms = f"{shape.curvature:+.4f} 1/m", terms_text(shape.zernike)

@@ -71,7 +71,7 @@ class WriterThread:
         self._queue = MoveQueue(limiter)
         self._shape: Shape | None = None  # before quantisation; ramps start here, so that rounding cannot add up
         self._written: Written | None = None
-        self._sequence = 0
+        self._sequence = self._turns_published = 0
         self._write_at = 0.0
         self._check_at = 0.0
         self._retry_at = 0.0
@@ -209,6 +209,8 @@ class WriterThread:
         first = not queue.under_way
         if not first and time.monotonic() - self._write_at > limits.step / limits.slew_rate:
             self.counters.overruns += 1
+        if queue.turns != self._turns_published:
+            self._publish(True)  # the way bent where this move took over: one step may be all of it, and bend it again
         self._write(previous, shape)
         with self._change:
             ended = queue.step_written(move, self._applied)
@@ -255,7 +257,9 @@ class WriterThread:
             self._publish(True)
 
     def _publish(self, edge: bool) -> None:
+        state = self.state()
+        self._turns_published = state.turns
         try:
-            self._listener(self.state(), edge)
+            self._listener(state, edge)
         except Exception:
             logging.getLogger(__name__).exception("the listener of the actuator writer raised")

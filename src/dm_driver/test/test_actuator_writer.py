@@ -213,6 +213,16 @@ def test_every_turn_is_counted_and_told_with_its_place(unit: Edac40TcpUnit) -> N
     assert places[2] == pytest.approx(lowest, abs=CODE) and places[3] == pytest.approx(0.9, abs=CODE)
 
 
+def test_a_move_of_one_step_that_takes_over_hides_no_turn(unit: Edac40TcpUnit) -> None:
+    with running_writer(unit, slew_rate=2.0) as (writer, told):
+        writer.command(shape(0.9))
+        wait_until(lambda: (applied := writer.state().applied) is not None and applied[0] > -0.5)
+        applied = writer.state().applied
+        assert applied is not None and writer.command(applied - 0.01).wait(5) is Outcome.REACHED
+        assert writer.state().turns == 2
+    assert {0, 1, 2} <= {state.turns for state, edge in told if edge}
+
+
 def test_a_command_cancels_a_degauss_and_leaves_the_history_unknown(unit: Edac40TcpUnit) -> None:
     with running_writer(unit, slew_rate=40.0) as (writer, _told):
         assert writer.degauss(0.1, 2, shape(0.0)).wait(5) is Outcome.REACHED

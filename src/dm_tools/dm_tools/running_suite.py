@@ -109,7 +109,7 @@ def holder(client: DeformableMirrorClient) -> Holder | None:
     from dm_client.client import INTERFACES
     from dm_tools.long_actions import LONG, ExternalGoals
 
-    client.wait(lambda: "actuator_state" in client.messages, REPORT_S)
+    client.wait(lambda: "actuator_state" in client.messages, BUSY_S)
     state = client.messages.get("actuator_state")
     if state is None or not state.holder:
         return None

@@ -108,14 +108,14 @@ async def estimate(session: Session, goal: Calibrate.Goal) -> str:
     return str((await session.ros.run("calibrate", goal, lambda _feedback: None, MOVE_S)).message)
 
 
-async def build_recipes(session: Session, curvatures: list[float]) -> str:
-    """Condition the mirror, then converge, for every curvature (1/m); stored with the calibration in use."""
+async def build_recipes(session: Session, goal: BuildRecipes.Goal) -> str:
+    """Condition the mirror, then converge, for every shape of the goal; stored with the calibration in use."""
 
     def show(feedback: Any) -> None:
-        session.progress.step, session.progress.steps = feedback.recipes, len(curvatures)
+        session.progress.step, session.progress.steps = feedback.recipes, len(goal.curvatures)
         session.progress.text = recipe_step(feedback)
 
-    result = await session.ros.run("build_recipes", BuildRecipes.Goal(curvatures=curvatures), show)
+    result = await session.ros.run("build_recipes", goal, show)
     session.base = None
     return str(result.message)
 

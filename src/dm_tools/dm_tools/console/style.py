@@ -72,7 +72,8 @@ button:focus-visible, .q-slider:focus-within { outline: 3px solid var(--focus); 
 .chart .loop { height: 340px; }
 .empty { color: var(--faint); padding: 24px 8px; text-align: center; }
 .work { display: flex; gap: 8px; align-items: center; flex: 1 1 300px; min-width: 0; }
-.work .text { flex: 0 1 auto; overflow: hidden; text-overflow: ellipsis; }
+.work .text { flex: 0 1 auto; overflow: hidden; display: -webkit-box; -webkit-box-orient: vertical;
+  -webkit-line-clamp: 2; }
 @media (max-width: 1000px) {
   .header { height: 112px; }
   .grid, .pair { grid-template-columns: minmax(0, 1fr); }

@@ -41,26 +41,6 @@ def curvatures_of(text: str) -> list[float]:
     return [round(first + k * step, 12) for k in range(number)]
 
 
-def terms_of(text: str) -> list[float]:
-    """Added terms, m, from a text such as "astigmatism cos=200, coma sin=-50", in nm; names as of `dm measure`.
-
-    Raises:
-        typer.BadParameter: naming what is no term, or no number.
-    """
-    from dm_common.optics.zernike import SPOKEN
-
-    terms = dict.fromkeys(SPOKEN, 0.0)
-    for part in text.split(","):
-        name, _, value = (each.strip() for each in part.partition("="))
-        if name not in terms:
-            raise typer.BadParameter(f"zernike = {text!r}: must be like 'coma sin=-50'; terms: {', '.join(SPOKEN)}")
-        try:
-            terms[name] = 1e-9 * float(value)
-        except ValueError as error:
-            raise typer.BadParameter(f"zernike = {text!r}: {value!r} is not a number of nm") from error
-    return list(terms.values())
-
-
 def _build(client: Any, curvatures: list[float], conic: float, zernike: list[float], **options: Any) -> Any:
     """Build with a progress bar; `options` as of `build_recipes` of the client. Returns the action's result."""
     from dm_tools.long_actions import recipe_step
@@ -116,9 +96,12 @@ def recipes(
     Needs the running suite (`dm up`) and a calibration. Ctrl-C keeps the recipes that are whole and leaves the mirror
     at mid range.
     """
-    from dm_common.recipes import shape_text
+    from dm_common.recipes import shape_text, terms_of
 
-    shapes = [terms_of(text) for text in zernike or ()] or [[]]
+    try:
+        shapes = [terms_of(text) for text in zernike or ()] or [[]]
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
     wanted = curvatures_of(curvatures or ("0" if zernike else DEFAULT))
     terms = [term for _ in wanted for shape in shapes for term in shape]
     wanted = [curvature for curvature in wanted for _ in shapes]

@@ -5,8 +5,10 @@ from __future__ import annotations
 from functools import partial
 from html import escape
 
+from dm_msgs.action import BuildRecipes
 from nicegui import ui
 
+from dm_common.recipes import terms_of
 from dm_tools.console import operations
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
@@ -20,7 +22,7 @@ HEADER = ("1/m", "conic", "added terms", "largest coefficient, nm", "rms, nm", "
 
 
 class RecipesCard:
-    """Table of the recipes, fields and button to build some."""
+    """Table of the recipes, fields and button to build some: curvatures, with one conic constant and the same terms."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -33,6 +35,9 @@ class RecipesCard:
                 self._last = DecimalField("Last, 1/m", LAST, "w-24")
                 self._number = ui.number("Recipes", value=NUMBER, min=1, max=NUMBER_MAX, step=1, format="%d")
                 self._number.classes("w-20")
+                self._conic = DecimalField("Conic", 0.0, "w-20")
+                self._terms = ui.input("Added terms, nm").classes("w-full")
+                self._terms.props('hint="astigmatism cos=200, coma sin=-50"')
             self._build = ActionButton("Build recipes", self._begin)
             self._reason = Line("reason")
 
@@ -40,9 +45,17 @@ class RecipesCard:
         session = self._session
         session.begin(
             "Recipes",
-            lambda: operations.build_recipes(session, evenly(self._first.value, self._last.value, self._number.value)),
+            lambda: operations.build_recipes(session, self._goal()),
             partial(session.ros.cancel, "build_recipes"),
         )
+
+    def _goal(self) -> BuildRecipes.Goal:
+        """What the fields say. Raises ValueError naming the one that makes no sense."""
+        if (conic := self._conic.value) is None:
+            raise ValueError("conic: must be a number")
+        terms = terms_of(self._terms.value) if self._terms.value.strip() else []
+        curvatures = evenly(self._first.value, self._last.value, self._number.value)
+        return BuildRecipes.Goal(curvatures=curvatures, conic_constant=conic, zernike=terms)
 
     def refresh(self, snapshot: Snapshot) -> None:
         reason = reason_against("converge", snapshot, self._session.running)
