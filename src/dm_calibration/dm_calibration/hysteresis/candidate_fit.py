@@ -157,10 +157,13 @@ class CandidateProblem:
         self.run, self.candidate = run, candidate
         self.radius = candidate.radius
         self._parts, self._starts = run.parts, run.starts
+        # (M, M): what creep adds at each map per unit of creep rate is linear in what stood at all; parts begin rested.
+        each = np.eye(len(run.time))
+        self._creep = self._in_parts(lambda part, start: crept(each[part], run.time[part], start, run.moved_in(part)))
         self._plays = self._in_parts(
             lambda part, start: play_features(run.signals[part], self.radius, candidate.powers)
         )
-        self._plays_crept = self._crept(self._plays)
+        self._plays_crept = np.tensordot(self._creep, self._plays, 1)
         self._figure = figure_columns(run.time, self._parts, self._starts)
         self._scale(scatter)
 
@@ -176,11 +179,6 @@ class CandidateProblem:
 
     def _in_parts(self, work: Callable[[slice, float], Floats]) -> Floats:
         return in_parts(self._parts, self._starts, work)
-
-    def _crept(self, features: Floats) -> Floats:
-        """What creep adds to `features` (M, F, N) per unit of creep rate; each part begins rested."""
-        run = self.run
-        return self._in_parts(lambda part, start: crept(features[part], run.time[part], start, run.moved_in(part)))
 
     def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
         """Fit to the rows in `keep` (M,), from `start` or from a guess.
@@ -232,7 +230,7 @@ class CandidateProblem:
             return features
         operator = DuhemOperator(slope)
         fading = self._in_parts(lambda part, start: fading_feature(self.run.signals[part], operator))
-        fading = fading + rate * self._crept(fading)
+        fading = fading + rate * np.tensordot(self._creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
 
     def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats]:

@@ -124,7 +124,7 @@ def creep_states(values: Floats, time: Floats, start: float, moved: Floats | Non
 
 
 def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:
-    """What creep of an even spectrum adds to features (M, F, N) per unit of creep rate; see :func:`creep_states`."""
+    """What creep of an even spectrum adds to features (M, ...) per unit of creep rate; see :func:`creep_states`."""
     result = np.empty_like(features)
     for row, state in enumerate(creep_states(features, time, start, moved)):
         result[row] = state.sum(axis=0)
