@@ -8,7 +8,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.parameter import parameter_value_to_python
 from rclpy.serialization import deserialize_message
 
@@ -16,13 +15,13 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, calibrate
-from dm_calibration.influence.surfaces import LinearModel
 from dm_calibration.procedure.plan import PlanOptions
 from dm_calibration.procedure.recorded_run import Move, RecordedRun, RecordingError, maps_per_state, repeat_run
 from dm_common.measurement import Measurement
 from dm_common.messages import measurement_from, mirror_from, stamp_ns
 from dm_common.mirror import Mirror
-from dm_common.optics.sampling import SamplePoints
+from dm_controller.planning.active_calibration import model_of
+from dm_controller.solvers.base import points_of
 from dm_tools.recording.bag_reader import BagReader, Message
 from dm_tools.recording.interfaces import message_class
 
@@ -47,15 +46,6 @@ COMPARED = (
     "hysteresis.creep_rate",
     "hysteresis.zernike_sigma",
 )
-
-
-@dataclass(frozen=True, eq=False)
-class _InfluenceOnly:
-    """What a shape is solved from, of a calibration that was in use."""
-
-    influence_sag: NDArray[np.float64]
-    sag_offset: NDArray[np.float64]
-    points: SamplePoints
 
 
 @dataclass
@@ -119,7 +109,7 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     maps = _maps(received, chosen.begun, end)
     moves = [move for time, move in _moves(received["actuator_state"], mirror) if chosen.begun <= time < end]
     before = [message for time, message in received["calibration"] if time < chosen.begun and message.id]
-    run = RecordedRun(mirror, tuple(moves), maps, chosen.labels, chosen.steps, _model(before))
+    run = RecordedRun(mirror, tuple(moves), maps, chosen.labels, chosen.steps, _model(before[-1]) if before else None)
     parameters, remarks = _parameters(bag, f"{prefix}calibration", chosen.begun)
     last = max((measured.stamp_ns for measured in maps), default=-1)
     known = {message.id for message in before}
@@ -210,15 +200,10 @@ def _maps(received: dict[str, list[tuple[int, Any]]], begun: int, end: int) -> t
     )
 
 
-def _model(calibrations: list[Any]) -> LinearModel | None:
-    if not calibrations:
-        return None
-    used = calibrations[-1]
-    return _InfluenceOnly(
-        np.array(used.influence_sag).reshape(used.points, used.actuators),
-        np.array(used.sag_offset),
-        SamplePoints(np.array(used.sample_x), np.array(used.sample_y), np.array(used.sample_weight)),
-    )
+def _model(calibration: Any) -> Any:
+    """What a shape is solved from, of the message of a calibration that was in use: a `LinearModel`."""
+    model = model_of(calibration)
+    return SimpleNamespace(influence_sag=model.influence_sag, sag_offset=model.sag_offset, points=points_of(model))
 
 
 def _parameters(bag: BagReader, node: str, begun: int) -> tuple[dict[str, Any], tuple[str, ...]]:
