@@ -56,7 +56,9 @@ class AutofocusAction(ProbeAction):
         self._fill(result, peak)
         if goal_handle.request.track:
             self._track(goal_handle, config, plan[1], peak, result)
-        result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre)}{remarks}"
+        known = math.isfinite(peak.error)
+        error = abs(self._optics.dioptre_for(peak.curvature + peak.error) - result.dioptre) if known else math.nan
+        result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre, error)}{remarks}"
         if peak.at_limit:
             result.message += "; at the end of the range: the object may lie beyond it"
 
@@ -208,8 +210,9 @@ class AutofocusAction(ProbeAction):
         result.sharpness = peak.sharpness
 
 
-def _distance_text(dioptre: float) -> str:
-    """A focus distance for a person."""
+def _distance_text(dioptre: float, error: float) -> str:
+    """A focus distance for a person, with its standard error [1/m]; NaN = not known."""
     if math.isnan(dioptre):
         return "nearer than any object"
-    return f"{1 / dioptre:.2f} m ({dioptre:+.4f} dioptre)" if dioptre > 0 else f"infinity ({dioptre:+.4f} dioptre)"
+    figure = f"{dioptre:+.4f} dioptre" if math.isnan(error) else f"{dioptre:+.4f} +- {error:.4f} dioptre"
+    return f"{1 / dioptre:.2f} m ({figure})" if dioptre > 0 else f"infinity ({figure})"

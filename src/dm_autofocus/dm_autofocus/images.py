@@ -171,12 +171,14 @@ class SettledGate:
         self.settled_at = math.inf
 
     def written(self, stamp: float, moving: bool, reached: bool) -> None:
-        """The driver reports its last write at `stamp`; `reached`: what stands is already what the command asked for.
+        """The driver reports its last write at `stamp`; `reached`: what stands is what the command asked for.
 
-        A report older than the command counts only when nothing had to move.
+        A report older than the command counts only when nothing had to move. One that does not show what was asked for
+        may be of before the driver got it: then the shape stands when that was predicted, at the earliest.
         """
         if math.isinf(self.settled_at) and not moving and (stamp >= self._sent_at or reached):
-            self.settled_at = max(stamp, self._stands_at) + self._settle_time
+            earliest = self._sent_at if reached else self._stands_at
+            self.settled_at = max(stamp, earliest) + self._settle_time
 
     def open_for(self, stamp: float) -> bool:
         """Whether an image with this stamp was exposed after the shape stood."""

@@ -70,10 +70,40 @@ def test_the_focus_is_found_in_few_images(model: DefocusModel, place: float, sta
     visited = run(search, DefocusedCamera(clouds(), place))
     assert search.current.peak is not None and not search.current.peak.at_limit
     assert search.current.peak.curvature == pytest.approx(place, abs=DEPTH / 2)
-    assert search.measured == len(visited) <= 10
+    assert search.measured == len(visited) <= 12
+    assert 0 < search.current.peak.error < DEPTH / 2
     assert (search.reason, search.current.phase) == ("", Phase.FINE)
     if start == 0.02:
         assert visited[0] > 0, "the nearer one first"
+
+
+@pytest.mark.parametrize("other", [-0.03, 0.0])
+def test_what_stands_beside_the_region_at_another_distance_misleads_no_search(other: float) -> None:
+    """Its blur reaches into the region in images far from the focus, and is sharpest where the object is not."""
+    texture, inside = clouds(), np.zeros((2 * SIDE, 2 * SIDE))
+    inside[SIDE // 2 : -SIDE // 2, SIDE // 2 : -SIDE // 2] = 1
+    here, beside = DefocusedCamera(texture * inside, 0.02), DefocusedCamera(clouds(7, 0.4) * (1 - inside), other, 0.0)
+    part = slice(SIDE // 2 - SIDE // 5, SIDE // 2 + SIDE // 5)
+    search = FocusSearch(CONFIG, DefocusModel((SIDE // 5 * 2,) * 2, LENS, HIGH - LOW + 10 * DEPTH), -0.03)
+    while not search.current.done:
+        place = search.current.step.curvature
+        image = (here.expose(place) + beside.expose(place))[part, part]
+        search.feed(tenengrad(image), (image,))
+    assert search.current.peak is not None and search.current.peak.curvature == pytest.approx(0.02, abs=DEPTH / 2)
+    assert search.reason == "" and search.measured <= 16
+
+
+def test_the_powers_of_an_image_are_worked_out_once(model: DefocusModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    worked_out, powers = [], DefocusModel.powers
+
+    def counted(self: DefocusModel, image: np.ndarray) -> np.ndarray:
+        worked_out.append(image)
+        return powers(self, image)
+
+    monkeypatch.setattr(DefocusModel, "powers", counted)
+    search = FocusSearch(CONFIG, model, 0.0)
+    run(search, DefocusedCamera(clouds(), 0.0123))
+    assert len(worked_out) == search.measured
 
 
 @pytest.mark.parametrize("place", [LOW - 0.002, HIGH + 0.002])

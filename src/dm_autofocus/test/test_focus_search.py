@@ -239,6 +239,13 @@ class TestSettledGate:
         gate.written(100.5, moving=False, reached=False)
         assert not gate.open_for(102.0) and gate.open_for(102.02)
 
+    def test_what_is_seen_to_stand_is_waited_for_no_longer(self) -> None:
+        """A controller predicts when a shape is right to the nanometre, creep included: an image needs less."""
+        gate = SettledGate(0.01)
+        gate.sent(100.0, duration=0.06)
+        gate.written(100.005, moving=False, reached=True)
+        assert gate.open_for(100.016) and not gate.open_for(100.014)
+
     def test_stamps_at_the_end_of_the_exposure_are_set_back(self) -> None:
         gate = SettledGate(0.0, stamp_lead=0.02)
         gate.sent(100.0)

@@ -100,6 +100,7 @@ class DefocusModel:
         # Frequencies along the first column come twice, with their negatives.
         self._share = np.where(np.arange(frequency.shape[1]) == 0, 0.5, 1.0)[None].repeat(rows, 0)[self._inside]
         self._count = np.bincount(self._band, self._share, len(edges) - 1)
+        self._gradient = self._count * np.sin(np.pi * (edges[:-1] + edges[1:])) ** 2
         # The window makes neighbours alike: 1.5 along each side.
         self.modes = self._count * len(self._starts) / 2.25
         self._step = STEP * depth_of_focus(lens.aperture_radius, lens.wavelength)
@@ -154,6 +155,14 @@ class DefocusModel:
             total += np.bincount(self._band, power * self._share, len(total))
         return total / (self._count * len(self._starts))
 
+    def sharpness(self, powers: Floats) -> float:
+        """Power of the gradient, by the powers (K,) of an image.
+
+        As the Sobel gradient's, but what lies beside the middle of a tile counts less, so that what blurs in from
+        beside the region does.
+        """
+        return float(self._gradient @ powers)
+
     def transfer(self, defocus: Floats) -> tuple[Floats, Floats]:
         """Share of the power that passes, and the largest that it may be for a pupil that is not ideal.
 
@@ -171,7 +180,9 @@ class DefocusModel:
         )
         return transfer, envelope
 
-    def judge(self, grid: Floats, places: Floats, powers: Floats, error: float) -> tuple[Floats, float]:
+    def judge(
+        self, grid: Floats, places: Floats, powers: Floats, error: float, stray: float = 0.0
+    ) -> tuple[Floats, float]:
         """What images say about where the object is.
 
         Args:
@@ -179,6 +190,7 @@ class DefocusModel:
             places: where the images were taken [1/m], (I,).
             powers: of the images, (I, K).
             error: relative, of the transfer.
+            stray: power that blurs in from beside the region, as a share of the least that an image has in a band.
 
         Returns:
             The misfit of each place of the grid, (G,): twice the negative logarithm of its likelihood; and by how much
@@ -189,7 +201,8 @@ class DefocusModel:
         signal = powers - noise
         leaked = np.maximum.accumulate(np.maximum(signal, 0), axis=1)
         leaked = LEAKAGE * np.pad(leaked, ((0, 0), (1, 0)))[:, :-1]
-        floor = noise**2 * (1 / self.modes + NOISE_ERROR**2) + leaked**2 + TINY
+        blurred_in = stray * np.maximum(signal, 0).min(0)
+        floor = blurred_in**2 + noise**2 * (1 / self.modes + NOISE_ERROR**2) + leaked**2 + TINY
         shares, envelopes = self.transfer(grid[:, None] - places)
         misfit = self._misfit(signal, noise, floor, shares, envelopes, error)
         flat = np.ones((1, *powers.shape))
@@ -231,15 +244,17 @@ def _transfer_table(edges: Floats, lens: FocusLens, length: int) -> Floats:
     share = (np.arange(SAMPLES) + 0.5) / SAMPLES
     frequency = edges[:-1, None] + np.diff(edges)[:, None] * share
     shift = frequency * lens.focal_length_px * lens.wavelength / lens.aperture_radius
-    waves = STEP / 4 * np.arange(length)  # a depth of focus is a quarter wave
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     half = np.maximum(1 - shift / 2, 0)[..., None]
     x = (nodes + 1) / 2 * half
     chord = weights / 2 * half * np.sqrt(np.maximum(1 - (x + shift[..., None] / 2) ** 2, 0))
+    phase = np.pi * STEP * shift[..., None] * x  # of one step: a depth of focus is a quarter wave
     table = np.empty((length, len(frequency)))
-    for number, wave in enumerate(waves):
-        amplitude = 4 / np.pi * np.sum(chord * np.cos(4 * np.pi * wave * shift[..., None] * x), axis=-1)
+    twice, cosine, before = 2 * np.cos(phase), np.ones_like(phase), np.cos(phase)
+    for number in range(length):
+        amplitude = 4 / np.pi * np.sum(chord * cosine, axis=-1)
         table[number] = np.average(amplitude**2, axis=1, weights=frequency)
+        cosine, before = twice * cosine - before, cosine  # cos((n + 1) a) = 2 cos(a) cos(n a) - cos((n - 1) a)
     return table
 
 

@@ -11,13 +11,12 @@ on either side: where the pupil is not ideal, what one side says is wrong by as 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_autofocus.search.defocus_model import TRANSFER_ERROR, TRANSFER_ERROR_NEAR, DefocusModel, Floats
+from dm_autofocus.search.defocus_model import TRANSFER_ERROR, DefocusModel, Floats
 from dm_autofocus.search.peak_search import (
     MOST_REFUSALS,
     NOISE_POINTS,
@@ -41,8 +40,17 @@ MOST_IMAGES, EXPECTED_IMAGES = 15, 7
 #: Steps to either side of the focus, at least and at most, and how far beyond the range objects are thought of, in
 #: depths of focus. The last images are one and two steps to either side.
 SIDE, SIDE_MAX, BEYOND = 3.0, 9.0, 10.0
-#: Where the last images are, and more of them above a standard deviation of so many depths of focus, in steps.
-LAST, MORE, PRECISION = (-1, 1, -2, 2), (0, 1.5, -1.5, 0.5, -0.5), 0.2
+#: Share of the least power of all images that may have blurred in from beside the region.
+STRAY = 1.0
+#: An image so many times as far above the least sharp as all but those within so many depths of focus of it, of which
+#: there are so many, is near the focus.
+OUTSTANDING, HILL, FAR_IMAGES = 3.0, 20.0, 2
+#: Where the last images are, and more of them while the standard error is above so many depths of focus, in steps.
+LAST, MORE, PRECISION = (-1, 1, -2, 2), (-1.5, 1.5, -2.5, 2.5, -0.6, 0.6), 0.25
+#: Standard error with which no place is found, in depths of focus.
+WORST = 1.5
+#: How far from the focus an image is blurred rather than aberrated, in depths of focus; relative error of its transfer.
+BLURRED, ERROR = 1.25, 0.17
 
 
 class DepthFromDefocus:
@@ -87,19 +95,15 @@ class DepthFromDefocus:
         """Images so far."""
         return len(self._places)
 
-    def feed(self, sharpness: float, images: Sequence[NDArray]) -> None:
-        """Report sharpness and images (H, W) at `step`."""
-        if any(image.shape != self._model.shape for image in images):
-            self._give_up("the images changed their size")
-            return
+    def feed(self, sharpness: float, powers: Floats) -> None:
+        """Report the sharpness of an image at `step` and its powers (K,), see `DefocusModel.powers`."""
         self._places.append(self.step.curvature)
         self._sharpness.append(sharpness)
-        self._powers.append(np.mean([self._model.powers(image) for image in images], axis=0))
+        self._powers.append(powers)
         if self.measured < 2:
             self.step = Step(self._first[1])
-            return
-        places, powers = np.array(self._places), np.array(self._powers)
-        self._aim(*self._model.judge(self._grid, places, powers, TRANSFER_ERROR))
+        else:
+            self._aim()
 
     def refuse(self) -> None:
         """Report that the mirror cannot take `step`: the range ends before it.
@@ -121,25 +125,27 @@ class DepthFromDefocus:
         if self._refusals > MOST_REFUSALS:
             self._give_up("the mirror refuses too much of the range")
 
-    def _aim(self, misfit: Floats, evidence: float) -> None:
-        """Choose the next step, or end.
-
-        Args:
-            misfit: of each place of the grid: twice the negative logarithm of its likelihood.
-            evidence: by how much the best place explains the images better than a scene that focus does not change.
-        """
+    def _aim(self) -> None:
+        """Choose the next step, or end."""
         config, tolerance = self.config, self.config.tolerance
-        self._evidence = evidence
-        places = np.array(self._places)
+        places, powers, grid = np.array(self._places), np.array(self._powers), self._grid
         # Where the range was drawn in since, an image may lie beyond it: nothing is sought there.
         inside = (places >= config.low) & (places <= config.high)
         sharpness = np.where(inside, self._sharpness, -np.inf)
+        misfit, evidence = self._model.judge(grid, places, powers, TRANSFER_ERROR, STRAY)
+        self._evidence = evidence
         if evidence < EVIDENCE:
             self._blind = self.measured
             self._fill_gap(places)
             return
-        _place, spread = _mean_and_spread(self._grid, misfit)
-        best = float(np.clip(self._grid[misfit.argmin()], config.low, config.high))
+        hill = self._hill(places, sharpness)
+        if not hill.all():
+            top = places[sharpness.argmax()]
+            grid = grid[np.abs(grid - top) < HILL * tolerance]
+            some = hill if hill.sum() > 1 else slice(None)
+            misfit, self._evidence = self._model.judge(grid, places[some], powers[some], TRANSFER_ERROR)
+        _place, spread = _mean_and_spread(grid, misfit)
+        best = float(np.clip(grid[misfit.argmin()], config.low, config.high))
         side = float(np.clip(2 * spread, SIDE * tolerance, SIDE_MAX * tolerance))
         near = np.abs(places - best) < 2 * side
         if np.where(inside, np.abs(places - best), np.inf).min() > 0.4 * side:
@@ -147,6 +153,17 @@ class DepthFromDefocus:
         else:
             self.phase = Phase.FINE
             self._confirm(places, sharpness, int(np.where(near, sharpness, -np.inf).argmax()), side)
+
+    def _hill(self, places: Floats, sharpness: Floats) -> NDArray[np.bool_]:
+        """Images that count: those near the sharpest where it stands far above all others, else all.
+
+        What stands at another distance beside the region blurs into it in images far from the focus.
+        """
+        near = np.abs(places - places[sharpness.argmax()]) < HILL * self.config.tolerance
+        above = np.array(self._sharpness) - min(self._sharpness)
+        if (~near).sum() >= FAR_IMAGES and above[near].max() > OUTSTANDING * above[~near].max():
+            return near
+        return np.ones(len(places), bool)
 
     def _confirm(self, places: Floats, sharpness: Floats, top: int, side: float) -> None:
         """Take what is missing of an image on either side of the sharpest; with both, end."""
@@ -165,12 +182,8 @@ class DepthFromDefocus:
             # What else is in the picture leads the model astray, not the sharpness.
             self._confirm(places, sharpness, int(sharpness.argmax()), side)
             return
-        near = np.abs(offset) < 3 * side
-        grid = places[top] + 1.5 * side * np.linspace(-1, 1, 73)
-        grid = grid[(grid >= self.config.low) & (grid <= self.config.high)]
-        misfit, _evidence = self._model.judge(grid, places[near], np.array(self._powers)[near], TRANSFER_ERROR_NEAR)
-        place, spread = _mean_and_spread(grid, misfit)
-        steps = LAST if spread < PRECISION * tolerance else LAST + MORE
+        place, error = self._fit(places, places[top], side)
+        steps = LAST if error < PRECISION * tolerance else LAST + MORE
         for wanted in place + side * np.array(steps):
             free = np.abs(places - wanted).min() > 0.3 * side
             if free and self._more and self.config.low <= wanted <= self.config.high:
@@ -180,9 +193,35 @@ class DepthFromDefocus:
             self._give_up("so little changes with the focus that it may be noise")
             return
         at_limit = len(three) < 3 and min(place - self.config.low, self.config.high - place) < tolerance
-        self.peak = Peak(place, float(sharpness[top]), at_limit)
+        if error > WORST * tolerance and not at_limit:
+            self._give_up(UNEXPLAINED)
+            return
+        self.peak = Peak(place, float(sharpness[top]), at_limit, error)
         self.step = Step(place)
         self.done = True
+
+    def _fit(self, places: Floats, centre: float, side: float) -> tuple[float, float]:
+        """Place of the focus and its standard error by the images around a centre [1/m].
+
+        Aberrations change the images in focus most, and what they say of the place least: those count only where there
+        are too few on either side of them. The error is what the images say themselves, and by how much the place
+        moves when one of them is left out.
+        """
+        grid = centre + 1.5 * side * np.linspace(-1, 1, 73)
+        grid = grid[(grid >= self.config.low) & (grid <= self.config.high)]
+        powers = np.array(self._powers)
+
+        def fit(some: NDArray[np.intp]) -> tuple[float, float]:
+            return _mean_and_spread(grid, self._model.judge(grid, places[some], powers[some], ERROR)[0])
+
+        some = np.flatnonzero(np.abs(places - centre) < 3 * side)
+        place, spread = fit(some)
+        off = (places[some] - place) / self.config.tolerance
+        if min((off < -BLURRED).sum(), (off > BLURRED).sum()) >= 2:
+            some = some[np.abs(off) > BLURRED]
+            place, spread = fit(some)
+        without = np.array([fit(np.delete(some, number))[0] for number in range(len(some))])
+        return place, math.hypot(spread, math.sqrt(len(some) - 1) * float(without.std()))
 
     def _fill_gap(self, places: Floats) -> None:
         """Next the middle of the widest gap; the end where none is wide enough to hide a focus.

@@ -30,7 +30,7 @@ class FocusSearch:
         self.reason = ""
         self._before = 0
         self._model = model
-        self._seen: list[tuple[float, NDArray]] = []  # place and powers of each image
+        self._seen: list[tuple[float, NDArray, float]] = []  # place, powers and sharpness of each image
         self.current: DepthFromDefocus | PeakSearch
         if isinstance(model, str):
             self.current, self.reason = PeakSearch(config), model
@@ -50,15 +50,29 @@ class FocusSearch:
 
     def feed(self, sharpness: float | None, images: Sequence[NDArray] = ()) -> None:
         """Report sharpness and images (H, W) at `current.step`; None when it was not to be measured."""
-        model = self._model
-        if sharpness is not None and isinstance(model, DefocusModel) and images and images[0].shape == model.shape:
-            self._seen.append((self.current.step.curvature, model.powers(images[0])))
+        powers, seen = self._powers(images), sharpness
+        if sharpness is not None and powers is not None:
+            assert isinstance(self._model, DefocusModel)
+            seen = self._model.sharpness(powers)
+            self._seen.append((self.current.step.curvature, powers, sharpness))
         if isinstance(self.current, PeakSearch):
-            self.current.feed(sharpness)
-            return
-        assert sharpness is not None
-        self.current.feed(sharpness, images)
-        self._sweep_after_all()
+            self.current.feed(seen)
+        elif seen is None or powers is None:
+            self.sweep("the images changed their size", 0.0)
+        else:
+            self.current.feed(seen, powers)
+            self._sweep_after_all()
+        if self.current.done and self.current.peak is not None and self._seen:
+            place = self.current.peak.curvature
+            nearest = min(self._seen, key=lambda image: abs(image[0] - place))
+            self.current.peak = replace(self.current.peak, sharpness=nearest[2])
+
+    def _powers(self, images: Sequence[NDArray]) -> NDArray | None:
+        """Mean powers (K,) of images; None without a model, or where they are not of its size."""
+        model = self._model
+        if isinstance(model, str) or not images or any(image.shape != model.shape for image in images):
+            return None
+        return np.mean([model.powers(image) for image in images], axis=0)
 
     def refuse(self) -> None:
         """Report that the mirror cannot take the step. Raises ValueError when hardly anything of the range is left."""
@@ -74,7 +88,7 @@ class FocusSearch:
         """How many times as large the focal length should be to explain the images; 1 = as it is, or not known."""
         if isinstance(self._model, str) or self.current.peak is None or not self._seen:
             return 1.0
-        places, powers = (np.array(part) for part in zip(*self._seen, strict=True))
+        places, powers, _sharpness = (np.array(part) for part in zip(*self._seen, strict=True))
         return self._model.fitting_scale(self.current.peak.curvature, places, powers)
 
     def _sweep_after_all(self) -> None:

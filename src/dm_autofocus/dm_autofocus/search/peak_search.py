@@ -111,11 +111,13 @@ class Peak:
         curvature: [1/m].
         sharpness: the largest seen in the last sweep.
         at_limit: the top lies at an end of the range: a sharper focus may lie beyond.
+        error: standard error of the curvature [1/m]; NaN = not known.
     """
 
     curvature: float
     sharpness: float
     at_limit: bool
+    error: float = math.nan
 
 
 class PeakSearch:
