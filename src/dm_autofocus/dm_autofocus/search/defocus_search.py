@@ -36,12 +36,12 @@ CERTAIN = 60.0
 #: Reason to give up.
 UNEXPLAINED = "the optics do not explain how the images change with focus"
 #: Images at most from where they change with focus on, and in most searches.
-MOST_IMAGES, EXPECTED_IMAGES = 15, 7
+MOST_IMAGES, EXPECTED_IMAGES = 18, 10
 #: Steps to either side of the focus, at least and at most, and how far beyond the range objects are thought of, in
 #: depths of focus. The last images are one and two steps to either side.
 SIDE, SIDE_MAX, BEYOND = 3.0, 9.0, 10.0
 #: Share of the least power of all images that may have blurred in from beside the region.
-STRAY = 1.0
+STRAY = 0.5
 #: An image so many times as far above the least sharp as all but those within so many depths of focus of it, of which
 #: there are so many, is near the focus.
 OUTSTANDING, HILL, FAR_IMAGES = 3.0, 20.0, 2
