@@ -60,7 +60,7 @@ def save_sweep_figure(
     Args:
         without_hysteresis: the same sweep by an influence function alone, for comparison.
     """
-    positions = _positions(mirror, len(rows[0]["signals"]))
+    positions = np.column_stack([mirror.actuator_x, mirror.actuator_y])
     curvatures = np.array([row["curvature"] for row in rows])
     shown = [rows[int(np.abs(curvatures - wanted).argmin())] for wanted in COLUMNS]
     figure = plt.figure(figsize=(13, 11), layout="constrained")
@@ -113,11 +113,3 @@ def save_sweep_figure(
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
-
-
-def _positions(mirror: Any, count: int) -> np.ndarray:
-    """(N, 2) actuator positions [m] of a dm_msgs/MirrorInfo."""
-    positions = np.column_stack([mirror.actuator_x, mirror.actuator_y])
-    if len(positions) != count:
-        raise ValueError(f"mirror_info has {len(positions)} actuators, the command {count}")
-    return positions
