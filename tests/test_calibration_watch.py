@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from dm_msgs.msg import Calibration as CalibrationMsg
-from dm_msgs.srv import LoadCalibration, UpdateCalibration
+from dm_msgs.srv import HoldMirror, LoadCalibration, UpdateCalibration
 
 from calibration_stand_in import StandIn
 from dm_calibration.store.calibration_store import CalibrationStore
@@ -232,6 +232,22 @@ def test_the_mirror_moved_or_the_map_is_another(suite: Suite) -> None:
     assert refused.error_code == ErrorCode.MAP_TIMEOUT
     assert not refused.accepted
     assert refused.revision == suite.calibration.revision == 0
+
+
+def test_what_waits_for_the_mirror_waits_until_the_map_can_be_judged(
+    suite: Suite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite.shape()
+    ask = suite.bench.hold.ask
+
+    def move_when_released(operation: str, *rest: Any) -> None:
+        ask(operation, *rest)
+        if operation == HoldMirror.Request.RELEASE:
+            suite.bench.move(suite.bench.mirror.rest)
+
+    monkeypatch.setattr(suite.bench.hold, "ask", move_when_released)
+    answer = suite.call(dry_run=True)
+    assert answer.accepted, answer.message
 
 
 def test_a_mirror_that_has_changed_is_told(suite: Suite) -> None:

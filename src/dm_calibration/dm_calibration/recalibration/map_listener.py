@@ -256,15 +256,15 @@ class MapListener:
             timeout = self._values["driver_timeout"]
             self._services.hold.wait_for(lambda: not self._busy(), request, "a calibration is running", timeout)
             with self._services.held(request, "a map is compared with the calibration (service update_calibration)"):
-                # A map of a mirror that does not come to rest is refused, with the reason.
+                # A map of a mirror that does not rest before and after is refused: corrections of creep wait so long.
                 _becomes(self._rests, REPORT_WAIT_S + 2.0 * self._values["updates.still_time"])
                 measured = self._services.measure_as_it_stands("calibration check")
-            try:
-                verdict = self._judge(measured, request.dry_run, [number - 1 for number in request.without])
-            except MapNotUsableError as error:
-                if not request.dry_run:
-                    self._refuse(str(error))
-                raise
+                try:
+                    verdict = self._judge(measured, request.dry_run, [number - 1 for number in request.without])
+                except MapNotUsableError as error:
+                    if not request.dry_run:
+                        self._refuse(str(error))
+                    raise
         response.accepted, response.message = verdict.accepted, verdict.reason
         comparison = verdict.comparison
         response.max_zernike, response.rms = comparison.max_zernike, comparison.rms
