@@ -31,8 +31,10 @@ from support import fast_bench, wait_until
 
 pytestmark = pytest.mark.processes
 
-#: Within which a missing node is known, s, and what is allowed for it on a busy machine.
+#: Within which a missing node is known, s, and what is allowed for it where processes get no time for seconds (CI).
+#: Measured on two cores at a load of 6, 40 kills of all nodes: 0.3 to 1.8 s, the lease and the time to be sure.
 KNOWN_S = 2.0
+assert qos.LEASE_S + qos.SURE_S < KNOWN_S
 ALLOWED_S = 4 * KNOWN_S
 
 
@@ -272,10 +274,14 @@ def test_the_others_go_on_when_it_is_back(bench: Bench, node: str) -> None:
 
 
 def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(bench: Bench) -> None:
+    running = Running(bench.client, "converge", Converge.Goal(tolerance=1e-10, max_maps=50))
+    running.wait_for(lambda feedback: feedback.step > 0)
     bench.paused = True
     bench.kill("virtual_bench")
+    running.wait_for(lambda feedback: "pdm_driver has lost the link" in feedback.message, ALLOWED_S)
     lost = ErrorCode.ELECTRONICS_UNREACHABLE
     assert bench.client.wait(lambda: bench.client.capabilities.error_code == lost, ALLOWED_S)
     assert bench.focus().error_code == lost
     bench.paused = False
+    assert running.end().error_code in (ErrorCode.TIMEOUT, lost)  # the clock of this bench stood still as well
     assert bench.client.wait(bench.all_serve, 60.0)

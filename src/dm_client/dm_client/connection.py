@@ -113,7 +113,7 @@ class Connection:
             self.hear(topic, message_type, profile)
         self._servers: dict[str, Liveliness] = {}
         for server, (message_type, topic, profile, served) in watched.items():
-            self._servers |= dict.fromkeys(served, Liveliness(self.node, server, message_type, topic, profile))
+            self._servers |= dict.fromkeys(served, qos.watch(self.node, server, message_type, topic, profile))
         for interface_name, interface in interfaces.items():
             make = ThreadedActionClient if hasattr(interface, "Goal") else Node.create_client
             self.clients[interface_name] = make(self.node, interface, interface_name)

@@ -82,3 +82,16 @@ def test_a_node_whose_coming_was_not_heard_of_has_died_all_the_same(watched: Wat
     gone = watched.since_now()
     watched.change(1, 0)
     assert gone() == "the node pdm_driver was restarted meanwhile: ask again"
+
+
+def test_a_process_watches_a_topic_once() -> None:
+    """Two subscriptions with a lease make Fast DDS take a living publisher for dead once it forgets a killed one."""
+    made: list[str] = []
+
+    class Stub:
+        def create_subscription(self, _type: Any, topic: str, *_arguments: Any, **_keywords: Any) -> None:
+            made.append(topic)
+
+    node: Any = Stub()
+    watches = [qos.watch(node, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED) for _ in range(2)]
+    assert watches[0] is watches[1] and made == ["mirror_info"]

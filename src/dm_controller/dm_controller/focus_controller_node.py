@@ -31,7 +31,7 @@ from dm_common.ros import qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.parameters import frame_id
-from dm_common.ros.qos import GONE, LEASE_S, Liveliness
+from dm_common.ros.qos import GONE, LEASE_S
 from dm_controller.focus_actions import DegaussClient, FocusServices, MoveFocusAction
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
 from dm_controller.focus_messages import capabilities_message, driver_report_from, health, state_message
@@ -86,7 +86,7 @@ class FocusControllerNode(ManagedNode):
         self.create_timer(STEADY_PERIOD_S, self._tick, clock=steady)
         FocusServices(self, lambda: values["driver_timeout"])
         self._actions = MoveFocusAction(self, lambda: values["settle_time"]), *serve_loops(self, values, LoopHost(self))
-        self._driver = Liveliness(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
+        self._driver = qos.watch(self, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self.create_subscription(MirrorInfo, "mirror_info", self._on_mirror_info, qos.LATCHED)
         self.create_subscription(Calibration, "calibration", self._on_calibration, qos.LATCHED)
         self.create_subscription(ActuatorState, "actuator_state", self._on_actuator_state, qos.STATE)

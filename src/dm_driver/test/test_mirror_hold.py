@@ -155,6 +155,20 @@ def asked(holder: str = "", take_over: bool = False) -> Any:
     return SimpleNamespace(holder=holder, take_over=take_over)
 
 
+def test_a_hold_on_a_driver_that_is_gone_is_given_up_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[str, bool]] = []
+
+    def call(_client: Any, request: Any, _timeout_s: float, cancelled: Any) -> HoldMirror.Response:
+        calls.append((request.operation, cancelled()))
+        return HoldMirror.Response()
+
+    monkeypatch.setattr(clients, "call", call)
+    node: Any = Node()
+    with clients.MirrorHolder(node, "loop", lambda: True).held(asked(), "a loop", 0.0, 1.0):
+        pass
+    assert calls == [(Operation.HOLD, False), (Operation.RELEASE, True)]
+
+
 @pytest.mark.parametrize("take_over", [False, True])
 def test_a_run_goes_on_in_the_name_of_who_asks_where_they_hold_it(
     hold: MirrorHold, run: clients.MirrorHolder, take_over: bool

@@ -42,14 +42,6 @@ _STATE_WAIT_S = 2.0
 _EXIT_WAIT_S = 5.0
 
 
-def _never() -> bool:
-    return False
-
-
-def _not_shown(_text: str) -> None:
-    pass
-
-
 class BenchServices:
     """Driver and interferometer of one calibration; implements :class:`dm_common.measurement.Bench`.
 
@@ -71,13 +63,14 @@ class BenchServices:
         self._set_signals = node.create_client(SetSignals, "set_signals")
         self._degauss = ThreadedActionClient(node, Degauss, "degauss")
         self._measure = node.create_client(Measure, "measure")
-        self._driver = Liveliness(node, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
-        self._interferometer = Liveliness(node, "interferometer", SurfaceMapInfo, "surface_map_info", qos.STATE)
-        self.hold = MirrorHolder(node, node.get_name())
-        self.waiting: Callable[[str], None] = _not_shown
+        self._driver = qos.watch(node, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
+        self._interferometer = qos.watch(node, "interferometer", SurfaceMapInfo, "surface_map_info", qos.STATE)
+        self.hold = MirrorHolder(node, node.get_name(), self._driver.missing)
+        self.waiting: Callable[[str], None] = lambda _text: None
+        self._said = ""
         self.state: ActuatorState | None = None
         self.settle_time = float(values["settle_time"])
-        self.cancelled: Callable[[], bool] = _never
+        self.cancelled: Callable[[], bool] = lambda: False
         self.map_time = 0.0
         self.temperature: Callable[[float], float] = lambda _time: math.nan
         self._commanded: Floats | None = None
@@ -94,7 +87,7 @@ class BenchServices:
             feedback.message = text
             handle.publish_feedback(feedback)
 
-        self.waiting = publish
+        self.waiting, self._said = publish, ""
 
     @contextmanager
     def held(self, asked: Any, purpose: str, duration: float = 0.0) -> Iterator[None]:
@@ -116,9 +109,8 @@ class BenchServices:
     def check_ready(self) -> None:
         """Raise Refusal when the driver says that it takes no commands."""
         state = self.state
-        if state is None or state.driver_state in (ActuatorState.STATE_ACTIVE, ActuatorState.STATE_LINK_LOST):
-            return
-        raise Refusal(ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active: activate it first")
+        if state is not None and state.driver_state not in (state.STATE_ACTIVE, state.STATE_LINK_LOST):
+            raise Refusal(ErrorCode.DRIVER_INACTIVE, "pdm_driver is not active: activate it first")
 
     def check_history(self) -> None:
         """Raise Refusal when the driver knew what the actuators went through and no longer does.
@@ -183,18 +175,14 @@ class BenchServices:
 
     def _interferometer_returns(self) -> bool:
         """Wait for an interferometer that has died, as long as for a map; whether it is back. Raises Cancelled."""
-        self.waiting(f"waiting: {self._interferometer.text}")
         deadline = time.monotonic() + self._values["measure_timeout"]
-        try:
-            while not answers_arrive(self._measure, lambda: not self._no_interferometer()):
-                if self._stopping():
-                    raise self.hold.lost or Cancelled("cancelled")
-                if time.monotonic() > deadline:
-                    return False
-                time.sleep(0.02)
-            return True
-        finally:
-            self.waiting("")
+        while not answers_arrive(self._measure, lambda: not self._no_interferometer()):
+            if self._stopping():
+                raise self.hold.lost or Cancelled("cancelled")
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
+        return True
 
     def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
@@ -221,7 +209,7 @@ class BenchServices:
 
     def rest(self, signals: Floats) -> str:
         """Ramp back to `signals`, whatever was cancelled. Returns what became of it, a sentence."""
-        self.cancelled = _never
+        self.cancelled = lambda: False
         self._history_known = False
         deadline = time.monotonic() + self._values["degauss_timeout"]
         while True:
@@ -260,7 +248,19 @@ class BenchServices:
             node.destroy_node()
             context.try_shutdown()
 
+    def _missing(self) -> str:
+        """What of the bench is missing now, as a sentence; "" = nothing."""
+        if self._driver.missing(self._set_signals.service_is_ready):
+            return self._driver.text
+        if self.state is not None and self.state.driver_state == ActuatorState.STATE_LINK_LOST:
+            return "pdm_driver has lost the link to the electronics"
+        return self._interferometer.text if self._no_interferometer() else ""
+
     def _stopping(self) -> bool:
+        """Whether a wait is to end. What is missing meanwhile, needed or not yet, is said at once."""
+        if (missing := self._missing()) != self._said:
+            self._said = missing
+            self.waiting(f"waiting: {missing}" if missing else "")
         return self.cancelled() or self.hold.lost is not None
 
     @contextmanager

@@ -145,14 +145,16 @@ class MirrorHolder:
     Args:
         node: hosts the client.
         name: of who holds the mirror.
+        gone: whether the driver is known to be gone; then nobody waits for it to take a hold back.
 
     Attributes:
         holder: who holds it; goes with every command as well.
         lost: the refusal once somebody else took the mirror over; None = nobody did.
     """
 
-    def __init__(self, node: Node, name: str) -> None:
+    def __init__(self, node: Node, name: str, gone: Callable[[], bool] = lambda: False) -> None:
         self.holder = self._name = name
+        self._gone = gone
         self.lost: Refusal | None = None
         self._client = node.create_client(HoldMirror, "hold_mirror")
         self._request = HoldMirror.Request(holder=name)
@@ -224,7 +226,7 @@ class MirrorHolder:
 
     def _release(self) -> None:
         try:
-            self._ask(HoldMirror.Request.RELEASE, RELEASE_S, lambda: False)
+            self._ask(HoldMirror.Request.RELEASE, RELEASE_S, self._gone)
         except ServiceCallError:
             pass  # the driver is gone
 
