@@ -43,13 +43,17 @@ def play(
     rate: float = 1.0,
     domain: int | None = None,
     progress: Callable[[float], None] = lambda seconds: None,
+    remark: Callable[[str], None] = lambda text: None,
     discovery_s: float = DISCOVERY_S,
 ) -> int:
     """Publish the topics `names` of the recording; returns the number of messages.
 
+    Left out are topics whose type had another layout when they were recorded: its bytes would be read as nonsense.
+
     Args:
         rate: times faster than recorded.
         progress: called with the time in the recording, s.
+        remark: called with a sentence for each topic that is left out.
 
     Raises:
         ValueError: a rate that is not above 0.
@@ -67,6 +71,9 @@ def play(
             for name in names
         }
         time.sleep(discovery_s)
+        for topic in [bag.topics[name] for name in names if _has_changed(node, bag.topics[name])]:
+            node.destroy_publisher(publishers.pop(topic.name))
+            remark(f"{topic.name} is left out: {topic.type_name} had another layout when it was recorded")
         begun, first, count = time.monotonic(), None, 0
         for message in bag.read(list(publishers)):
             first = message.log_time if first is None else first
@@ -81,6 +88,12 @@ def play(
     finally:
         node.destroy_node()
         context.try_shutdown()
+
+
+def _has_changed(node: Node, topic: Topic) -> bool:
+    """Whether its type has another layout than was recorded, as far as is known."""
+    published = [info for info in node.get_publishers_info_by_topic(topic.name) if info.node_name == node.get_name()]
+    return topic.type_hash.startswith("RIHS") and topic.type_hash not in {str(o.topic_type_hash) for o in published}
 
 
 def _offer(topic: Topic) -> QoSProfile:

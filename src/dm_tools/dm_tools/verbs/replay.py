@@ -44,7 +44,13 @@ def replay(
     console.print(f"{bag.messages} messages of {bag.duration_s:.1f} s; publishing {', '.join(sorted(names))}")
     with progress_bar() as bar:
         task = bar.add_task("replay, s", total=round(bag.duration_s))
-        count = play(bag, names, rate, progress=lambda seconds: bar.update(task, completed=round(seconds)))
+        count = play(
+            bag,
+            names,
+            rate,
+            progress=lambda seconds: bar.update(task, completed=round(seconds)),
+            remark=lambda text: console.print(f"[yellow]remark[/] {text}"),
+        )
     console.print(f"{count} messages published")
     write_json(json, {"recording": str(bag.file), "messages": count, "topics": sorted(names)})
 
