@@ -28,6 +28,7 @@ from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
+from dm_tools.verbs import console as verb_console
 from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
@@ -276,3 +277,11 @@ def test_it_is_a_command_of_ros2_too(
     shown = capsys.readouterr()
     assert ended.value.code == status
     assert re.search(said, shown.out + shown.err, re.DOTALL)
+
+
+def test_the_console_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rosdep has no key for NiceGUI."""
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    monkeypatch.delitem(sys.modules, "dm_tools.console.page", raising=False)
+    with pytest.raises(RuntimeError, match="the console needs NiceGUI: `pip install nicegui`"):
+        verb_console.console(0)

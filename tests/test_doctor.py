@@ -238,7 +238,7 @@ def test_serial_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     absent = doctor_bench.serial_port(tmp_path / "ttyUSB0")
     assert absent is not None and "does not exist" in absent.problem
     busy = doctor_bench.serial_port(device)
-    assert busy is not None and busy.note and f"(process {os.getpid()})" in busy.problem
+    assert busy is not None and busy.note and f"(process {os.getpid()}, " in busy.problem
     os.close(follower)
     assert doctor_bench.serial_port(device) is None
     monkeypatch.setattr(os, "access", lambda *_arguments: False)  # tests may run as root, who may all

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from pathlib import Path
 
-from dm_common.ros.domains import PORT_BASE, PORTS, inhabited_domains, own_domain
+import pytest
+
+from dm_common.ros.domains import PORT_BASE, PORTS, held_by, inhabited_domains, own_domain
 
 
 def test_ports_that_are_in_use_tell_the_domains(tmp_path: Path) -> None:
@@ -26,3 +29,14 @@ def test_a_domain_in_which_somebody_was_left_is_not_lent() -> None:
         left_over.bind(("127.0.0.1", PORT_BASE + PORTS * domain + PORTS - 1))
         with own_domain() as other:
             assert other != domain
+
+
+@pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM])
+def test_who_holds_a_port_is_named(kind: socket.SocketKind) -> None:
+    with socket.socket(socket.AF_INET, kind) as endpoint:
+        endpoint.bind(("127.0.0.1", 0))
+        port = endpoint.getsockname()[1]
+        if kind == socket.SOCK_STREAM:
+            endpoint.listen()
+        assert f"pytest (process {os.getpid()}, ROS domain " in held_by(port)
+    assert held_by(port) == ""

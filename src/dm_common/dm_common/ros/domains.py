@@ -1,4 +1,4 @@
-"""ROS domains for runs that must not meet others on the same machine."""
+"""ROS domains for runs that must not meet others on the same machine, and who holds what one wants for oneself."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import fcntl
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -14,6 +14,7 @@ from typing import IO
 PORT_BASE, PORTS = 7400, 250
 #: Where the kernel lists the UDP ports that are in use.
 UDP_PORTS = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
+PROCESSES = Path("/proc")
 
 
 def inhabited_domains(tables: Iterable[Path] = UDP_PORTS) -> set[int]:
@@ -23,6 +24,30 @@ def inhabited_domains(tables: Iterable[Path] = UDP_PORTS) -> set[int]:
         with contextlib.suppress(OSError):
             ports |= {int(line.split()[1].rpartition(":")[2], 16) for line in table.read_text().splitlines()[1:]}
     return {(port - PORT_BASE) // PORTS for port in ports if port >= PORT_BASE}
+
+
+def holders(targets: Collection[Path]) -> list[str]:
+    """Processes that have one of these files open, as far as we may look: their command, id and ROS domain."""
+    found = []
+    for process in PROCESSES.glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # not ours, or gone meanwhile
+            if any(link.readlink() in targets for link in (process / "fd").iterdir()):
+                command = (process / "cmdline").read_text().split("\0")[:3]
+                variables = (process / "environ").read_text(errors="replace").split("\0")
+                domain = dict(variable.partition("=")[::2] for variable in variables).get("ROS_DOMAIN_ID", "0")
+                found.append(f"{' '.join(command).strip()} (process {process.name}, ROS domain {domain})")
+    return found
+
+
+def held_by(port: int) -> str:
+    """Who has this TCP or UDP port of the machine, as `holders` names them: " by ..."; "" = not known."""
+    sockets = set()
+    for table in (*UDP_PORTS, *(path.with_name(path.name.replace("udp", "tcp")) for path in UDP_PORTS)):
+        with contextlib.suppress(OSError):
+            rows = [line.split() for line in table.read_text().splitlines()[1:]]
+            sockets |= {Path(f"socket:[{row[9]}]") for row in rows if int(row[1].rpartition(":")[2], 16) == port}
+    found = holders(sockets)
+    return f" by {', '.join(found)}" if found else ""
 
 
 @contextlib.contextmanager

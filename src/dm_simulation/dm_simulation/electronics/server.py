@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+from dm_common.ros.domains import held_by
 from dm_simulation.electronics import frames
 from dm_simulation.electronics.drive_unit import DriveUnit
 from dm_simulation.electronics.event_loop import EventLoop
@@ -260,5 +261,5 @@ def _bind(endpoint: socket.socket, port: int, name: str, patience_s: float = 0.0
             return endpoint.bind((LOOPBACK, port))
         except OSError as error:
             if error.errno != errno.EADDRINUSE or time.monotonic() >= deadline:
-                raise OSError(f"{name} = {port}: {error}") from None
+                raise OSError(f"{name} = {port}: {error.strerror}{held_by(port)}") from None
         time.sleep(0.005)

@@ -14,6 +14,7 @@ from typing import Any
 from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.suite import Config, ConfigError, load_config
 from dm_common.names import unknown_name
+from dm_common.ros.domains import held_by, holders
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
 from dm_tools.doctor.finding import Check, Finding
 from dm_tools.doctor.machine import disk
@@ -181,9 +182,9 @@ def serial_port(device: Path) -> Finding | None:
             f"no permission for {device}: it belongs to the group {group}",
             f"sudo usermod -aG {group} $USER, then log out and in again",
         )
-    if holders := _holders(device):
+    if users := holders([device.resolve()]):
         return Finding(
-            f"{device} is in use by {', '.join(holders)}",
+            f"{device} is in use by {', '.join(users)}",
             "end that program: two writers on one unit tear each other's frames",
             note=True,
         )
@@ -195,18 +196,6 @@ def _group(path: Path) -> str:
         return path.group()
     except KeyError:
         return str(path.stat().st_gid)
-
-
-def _holders(device: Path) -> list[str]:
-    """Programs that have the device open, as far as we may look."""
-    target, holders = device.resolve(), []
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            if any(link.readlink() == target for link in (process / "fd").iterdir()):
-                holders.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
-        except OSError:
-            continue  # not ours, or gone meanwhile
-    return holders
 
 
 def free_ports(bench: Mapping[str, Any]) -> Finding | None:
@@ -227,7 +216,7 @@ def free_ports(bench: Mapping[str, Any]) -> Finding | None:
             try:
                 probe.bind(("127.0.0.1", port))
             except OSError as error:
-                taken.append(f"{name} = {port}: {error.strerror}")
+                taken.append(f"{name} = {port}: {error.strerror}{held_by(port)}")
     if taken:
         return Finding(
             "; ".join(taken),
