@@ -18,7 +18,7 @@ from typing import Annotated, Any, Union, get_origin, get_type_hints
 
 import pytest
 import typer
-from dm_msgs.msg import ActuatorState, FocusState
+from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
 from dm_msgs.srv import SetFocus
 from typer.testing import CliRunner
 
@@ -32,7 +32,7 @@ from dm_tools.verbs import console as verb_console
 from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
-from dm_tools.verbs.up import end, only_suite
+from dm_tools.verbs.up import end, lacks, only_suite
 from test_console_external_goals import EXECUTING, FakeNode, Goal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -244,6 +244,22 @@ def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     said = started.communicate(timeout=300)[1]
     assert (started.returncode, "Traceback" in said) == (130, False), said
     assert said.endswith("error: interrupted\n")
+
+
+def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> None:
+    said: dict[str, Any] = {"actuator_state": ActuatorState(driver_state=ActuatorState.STATE_ACTIVE)}
+    said |= {"mirror_info": MirrorInfo(), "calibration": Calibration(id="c1")}
+    assert "have not said yet" in lacks(said)
+    for code, id_in_use, ready in (
+        (ErrorCode.NOT_CALIBRATED, "", False),
+        (ErrorCode.DRIVER_UNAVAILABLE, "", False),
+        (ErrorCode.CALIBRATION_MISMATCH, "", True),  # it will not be taken, and the log says why
+        (ErrorCode.OK, "c1", True),
+    ):
+        said["capabilities"] = Capabilities(error_code=code, calibration_id=id_in_use)
+        assert (lacks(said) == "") == ready
+    said |= {"calibration": Calibration(), "capabilities": Capabilities(error_code=ErrorCode.NOT_CALIBRATED)}
+    assert lacks(said) == ""
 
 
 def test_up_ends_those_who_wait_before_the_process_does() -> None:

@@ -10,9 +10,9 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -140,28 +140,31 @@ def end(watchers: Sequence[threading.Thread], stop: threading.Event) -> None:
             watcher.join(END_S)
 
 
+def lacks(messages: Mapping[str, Any]) -> str:
+    """What keeps a suite that said `messages` (by topic) last from taking requests; "" = nothing."""
+    from dm_common.errors import ErrorCode
+
+    state, capabilities = messages.get("actuator_state"), messages.get("capabilities")
+    if state is None or state.driver_state != state.STATE_ACTIVE:
+        return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
+    if capabilities is not None and capabilities.error_code == ErrorCode.NODE_INACTIVE:
+        return str(capabilities.message)
+    if capabilities is None or {"mirror_info", "calibration"} - messages.keys():
+        return "calibration and focus_controller have not said yet what the mirror can do"
+    refused = capabilities.error_code in (ErrorCode.CALIBRATION_MISMATCH, ErrorCode.CALIBRATION_UNREADABLE)
+    if messages["calibration"].id and not (capabilities.calibration_id or refused):
+        return "focus_controller has not taken the calibration yet"
+    return ""
+
+
 def say_when_ready(namespace: str, stop: threading.Event) -> None:
     """Wait until the suite of this namespace takes requests, and say so and what to do next."""
     from dm_client import DeformableMirrorClient
-    from dm_common.errors import ErrorCode
 
     started, late = time.monotonic(), False
     option = f" --namespace {namespace}" if namespace else ""
     with DeformableMirrorClient(namespace) as client:
-
-        def lacks() -> str:
-            state = client.messages.get("actuator_state")
-            if state is None or state.driver_state != state.STATE_ACTIVE:
-                return f"pdm_driver: {state.message if state is not None and state.message else 'not active'}"
-            if client.messages.keys() >= {"capabilities"} and client.capabilities.error_code == ErrorCode.NODE_INACTIVE:
-                return str(client.capabilities.message)
-            if {"mirror_info", "calibration", "capabilities"} - client.messages.keys():
-                return "calibration and focus_controller have not said yet what the mirror can do"
-            if client.messages["calibration"].id and client.capabilities.error_code == ErrorCode.NOT_CALIBRATED:
-                return "focus_controller has not taken the calibration yet"
-            return ""
-
-        while (lacking := lacks()) and not stop.wait(0.2):
+        while (lacking := lacks(client.messages)) and not stop.wait(0.2):
             if not late and time.monotonic() - started > LATE_S:
                 late = True
                 console.print(f"not ready after {LATE_S:.0f} s: {lacking}; ./dm doctor says more")
