@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from dm_simulation.mirror.hysteresis import LAWS
 from studies.comparison import drawn_mirrors, population
 from studies.comparison.drawn_mirrors import draw_mirror
+from studies.comparison.few_maps import HADAMARD, PUSH_PULL, FewMaps, judge_few_maps, patterns
 from studies.comparison.population import (
     ANY_ORDER,
     CHECKED,
@@ -23,7 +24,10 @@ from studies.comparison.population import (
     judge_population,
 )
 from studies.comparison.random_requests import Requests
+from studies.comparison.simulated_bench import SimulatedBench
 from studies.verbs.compare import compare as command
+from studies.verbs.compare_maps import row_of as row_of_method
+from studies.verbs.compare_maps import show as show_maps
 from studies.verbs.compare_mirrors import figures_of, row_of, show
 
 #: Tried by `common_laws`: that of the mirror that is judged among them.
@@ -87,3 +91,20 @@ def test_mirrors_need_one_first_seed() -> None:
     result = CliRunner().invoke(app, ["--mirrors", "2", "--seed", "1", "--seed", "2"])
     assert result.exit_code == 2
     assert "--seed" in result.output
+
+
+def test_pokes_of_as_many_maps_and_what_is_told_of_each_number(capsys: pytest.CaptureFixture[str]) -> None:
+    """Each pattern is legal and enough of them tell all actuators; a mirror without requests is named."""
+    mirror = SimulatedBench(draw_mirror(3, 100).simulation).mirror
+    for method in (HADAMARD, PUSH_PULL):
+        signals = patterns(method, mirror, 130)
+        assert all(mirror.limits.allow(row) for row in signals)
+        assert np.linalg.matrix_rank(np.column_stack((np.ones(80), signals[:80]))) == 1 + mirror.actuators
+    errors = Requests(np.full(20, 2e-9), np.full(20, 3e-9), np.ones(20))
+    judged = FewMaps(1, HADAMARD, 60, 60, 64.0, errors)
+    short = judge_few_maps(3, PUSH_PULL, 1, pixels=100)
+    assert short.failure and not len(short.requests.error)
+    row = row_of_method([judged, short], HADAMARD, 60)
+    assert (row["median_nm"], row["good"], row["failures"]) == (pytest.approx(2.0), 1, {3: short.failure})
+    show_maps([row])
+    assert "1 of 2" in capsys.readouterr().out

@@ -62,7 +62,7 @@ def test_mirrors_of_one_actuator_and_of_many(rings: int, maps: int) -> None:
     assert all(np.isfinite(step.signals).all() for step in plan.steps if step.signals is not None)
     assert found.duration > 0.0
     assert (found.max_zernike > 0.0) == (maps == 420)
-    assert found.maps == (sorted(plan.ends)[1] - 1 if maps == 420 else 0)
+    assert found.maps == (min(plan.ends) - 1 if maps == 420 else 0)
 
 
 def test_a_run_ends_where_it_is_good_enough() -> None:
@@ -70,7 +70,7 @@ def test_a_run_ends_where_it_is_good_enough() -> None:
     plan = make_plan(PlanKind.HYSTERESIS, bench.mirror, PlanOptions(hysteresis_maps=240, until=200e-9))
     enough = GoodEnough(200e-9)
     outcome = Procedure(plan, bench.mirror, bench, enough=enough).run()
-    assert len(plan.ends) == 2 and len(enough.reached) == 1
+    assert len(plan.ends) == 5 and len(enough.reached) == 1
     assert len(outcome.records) == min(plan.ends) - 1
     assert "200 nm is reached" in enough.sentence(enough.reached[0])
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import expected_accuracy
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
 from dm_calibration.hysteresis.excitation import excitation
-from dm_calibration.hysteresis.identify import ExcitationError, Identification, identify
+from dm_calibration.hysteresis.identify import ExcitationError, Identification, _begun, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.law_shape import slope_min
@@ -163,3 +165,39 @@ def test_a_promise_needs_check_moves_and_enough_maps() -> None:
         expected_accuracy(run.signals, run.time, np.zeros_like(check))
     with pytest.raises(ValueError, match="must be more than"):
         expected_accuracy(run.signals[-15:], run.time[-15:], check[-15:])
+
+
+def test_each_half_of_the_checks_of_a_short_run_is_predicted_with_the_other_in_the_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where other maps are few, what the final fit knows of moves in use is most of what it knows."""
+    run, check = simulated_run("prandtl_ishlinskii", 60)
+    monkeypatch.setattr("dm_calibration.hysteresis.identify.FEW", 0)
+    without = identify(run, check, [LINEAR])
+    monkeypatch.setattr("dm_calibration.hysteresis.identify.FEW", 100)
+    with_others = identify(run, check, [LINEAR])
+    assert np.isfinite(with_others.held_out[check]).all() and np.isnan(with_others.held_out[~check]).all()
+    assert held_out_rms(with_others) < held_out_rms(without)
+    np.testing.assert_array_equal(with_others.fit.residual, without.fit.residual)
+
+
+def test_own_laws_that_fade_begin_where_they_leave_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two laws at once a law without plays fades otherwise: own laws that began there erred three times as much."""
+
+    class Own:
+        def __init__(self, run: Any, candidate: Any, law: float, scatter: Any) -> None:
+            self.law = law
+
+        def fit(self, keep: Any) -> Any:
+            return SimpleNamespace(residual=np.full((4, 2), self.law))
+
+    monkeypatch.setattr("dm_calibration.hysteresis.identify.OwnLaws", Own)
+    starts: Any = [SimpleNamespace(law=left) for left in (1.0, 0.99, 0.5)]
+    run: Any = None
+
+    def order(candidate: Candidate) -> list[Any]:
+        begun: Any = _begun(run, candidate, starts, np.ones(2), np.ones(4, dtype=bool))
+        return [own.law for own, _ in begun]
+
+    assert order(Candidate("fades", 30, 5, 4, own=True)) == [0.5, 1.0, 0.99]
+    assert order(Candidate("does not", 30, 5, 0, own=True)) == [1.0, 0.99, 0.5]

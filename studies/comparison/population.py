@@ -91,6 +91,13 @@ class Outcome:
 ANY_ORDER, RECIPES, RESTARTED, CHECKED, POWER_CUT = "any order", "recipes", "restarted", "checked", "power cut"
 
 
+def held_for_a_day(bench: SimulatedBench, rng: np.random.Generator) -> None:
+    """What some mirrors went through before their calibration: a shape held for a day, then no power for a while."""
+    bench.apply(rng.uniform(-0.5, 0.5) + rng.uniform(-0.4, 0.4, bench.mirror.actuators))
+    bench.time += HELD_S
+    bench.power_cycle(OFF_S)
+
+
 def _age(bench: SimulatedBench, mirror: DrawnMirror, rng: np.random.Generator) -> None:
     """What happens to the mirror after its calibration."""
     if mirror.event == GAIN_STEP:
@@ -147,9 +154,7 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
     rng = np.random.default_rng([seed, 15])
     bench = SimulatedBench(mirror.simulation)
     if mirror.held_before:
-        bench.apply(rng.uniform(-0.5, 0.5) + rng.uniform(-0.4, 0.4, bench.mirror.actuators))
-        bench.time += HELD_S
-        bench.power_cycle(OFF_S)
+        held_for_a_day(bench, rng)
     progress(f"seed {seed}: calibration")
     calibration = bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=options.maps))
     active = active_of(bench, calibration_message(calibration, None, "mirror", 1.0))

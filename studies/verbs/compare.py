@@ -104,6 +104,10 @@ def compare(
         int,
         typer.Option(min=0, help="So many mirrors drawn at random, one a seed, from --seed on: open loop, all told."),
     ] = 0,
+    maps: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="With --mirrors: what so many maps reach, beside pokes; repeat it for several."),
+    ] = None,
     autofocus: Annotated[
         int, typer.Option(min=0, help="So many scenes drawn at random, from --seed on: searches of the sharpest focus.")
     ] = 0,
@@ -118,13 +122,16 @@ def compare(
     With --hysteresis it is models that are compared, in open loop: any order, dwell times from 0.1 s to 10 min, tracked
     from the calibration on, after a degauss and after a power cycle.
     With --mirrors it is mirrors: each of another law and other parameters, at the shipped limits, with restarts.
+    With --maps too it is numbers of maps: the hysteresis plan beside Hadamard patterns and push-pull pokes.
     With --autofocus it is searches of the sharpest focus: images and time that each takes, and how far off it ends.
     """
     if mirrors or autofocus:
         if seed and len(seed) > 1:
             raise typer.BadParameter("here it is the first of the seeds: give one", param_hint="--seed")
         first = seed[0] if seed else 1
-        if mirrors:
+        if mirrors and maps:
+            _compare_maps(first, mirrors, maps, json)
+        elif mirrors:
             _compare_mirrors(first, mirrors, quick, json)
         else:
             _compare_autofocus(first, autofocus, json)
@@ -199,6 +206,16 @@ def _compare_mirrors(first: int, count: int, quick: bool, json: Path | None) -> 
     compare_mirrors.show(rows)
     figures = {"seeds": [row["seed"] for row in rows], "population": compare_mirrors.figures_of(rows), "mirrors": rows}
     write_json(json, figures | {"seconds": time.monotonic() - started})
+    console.print(f"done in {time.monotonic() - started:.0f} s")
+
+
+def _compare_maps(first: int, count: int, maps: list[int], json: Path | None) -> None:
+    from studies.verbs import compare_maps
+
+    started = time.monotonic()
+    rows = compare_maps.run(range(first, first + count), maps)
+    compare_maps.show(rows)
+    write_json(json, {"seeds": list(range(first, first + count)), "rows": rows})
     console.print(f"done in {time.monotonic() - started:.0f} s")
 
 

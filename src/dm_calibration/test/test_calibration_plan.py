@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dm_calibration.hysteresis.excitation import REPEATS
 from dm_calibration.influence.surfaces import MODEL_NAMES, TABLE_1
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, check_shape, make_plan
 from dm_common.names import UnknownNameError
@@ -97,3 +98,18 @@ def test_checks_lie_where_the_mirror_is_used() -> None:
     )
     assert levels["one-sided"].min() < -0.7 and levels["one-sided"].max() > 0.7
     assert abs(levels["one-sided"].mean()) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("rings", "most", "looks"), [(3, 420, [80, 100, 120, 160, 200, 240, 300, 380]), (1, 100, [60, 80]), (3, 60, [])]
+)
+def test_a_run_that_may_end_early_asks_as_soon_as_a_law_can_be_found(rings: int, most: int, looks: list[int]) -> None:
+    """60 commands do for a small mirror; 37 actuators need two for each. Later it asks after a quarter more."""
+    plan = make_plan(PlanKind.HYSTERESIS, make_mirror(rings=rings), PlanOptions(hysteresis_maps=most, until=2e-9))
+    commands = [
+        sum(step.kind in (StepKind.EXCITATION, StepKind.CHECK) for step in plan.steps[:end]) - REPEATS
+        for end in sorted(plan.ends)
+    ]
+    assert commands == looks
+    for end in sorted(plan.ends):
+        assert plan.steps[end - 1].kind in (StepKind.CHECK, StepKind.REFERENCE)

@@ -60,6 +60,11 @@ def excitation(mirror: Mirror, maps: int, seed: int = 0) -> Excitation:
     """
     if not MAPS_MIN <= maps <= MAPS_MAX:
         raise ValueError(f"hysteresis_maps = {maps}: must be {MAPS_MIN} to {MAPS_MAX}")
+    return next_part(mirror, maps, seed)
+
+
+def next_part(mirror: Mirror, maps: int, seed: int) -> Excitation:
+    """`maps` commands of their own, checks included, that go on with a run which has enough to be fitted."""
     rng = np.random.default_rng(seed)
     checks = round(CHECK_SHARE * maps)
     shapes = np.vstack((_random(mirror, maps - checks, rng), _as_in_use(mirror, checks, rng)))

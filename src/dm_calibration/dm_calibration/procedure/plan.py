@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum
@@ -10,7 +11,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.hysteresis.excitation import REPEATS, excitation
+from dm_calibration.hysteresis.excitation import MAPS_MIN, REPEATS, excitation, next_part
 from dm_calibration.influence import surfaces
 from dm_common.mirror import Mirror
 
@@ -18,8 +19,9 @@ Floats = NDArray[np.float64]
 
 #: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
 HYSTERESIS_REFERENCE_EVERY = 100
-#: Commands after which a run may first end when it is accurate enough, and after which again; each part has its checks.
-FIRST_PART, NEXT_PART = 120, 60
+#: A run may end when it is accurate enough as soon as there are so many commands for each actuator, and again whenever
+#: there are so many more, as a share of those before; counted in steps. Each part has its checks.
+FIRST_PART, NEXT_PART, PART_STEP = 2.0, 0.25, 20
 #: Commands after which it ends in any case, where the goal gives no other number.
 LAST_PART_ENDS = 420
 #: Share of the neighbour limit that checks may use: rounding must not break it.
@@ -149,7 +151,8 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     """
     if not options.degauss:
         raise ValueError("skip_degauss = true: hysteresis can only be identified from a degauss on")
-    parts = [excitation(mirror, count, seed) for seed, count in enumerate(_parts(options))]
+    first, *more = _parts(options, mirror.actuators)
+    parts = [excitation(mirror, first), *(next_part(mirror, count, seed) for seed, count in enumerate(more, 1))]
     steps = [Step("degauss", StepKind.DEGAUSS), Step("reference 1", StepKind.REFERENCE, mirror.rest)]
     steps += [Step(f"rest {k + 1}", StepKind.EXCITATION, mirror.rest) for k in range(REPEATS)]
     ends = set[int]()
@@ -167,18 +170,17 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
     return Plan(PlanKind.HYSTERESIS, tuple(steps), ends=frozenset(ends))
 
 
-def _parts(options: PlanOptions) -> list[int]:
+def _parts(options: PlanOptions, actuators: int) -> list[int]:
     """Commands of each part of a hysteresis plan: one, or where it may end early some."""
-    left = options.hysteresis_maps
+    most = options.hysteresis_maps
     if not options.until:
-        return [left]
-    parts = [min(FIRST_PART, left)]
-    while (left := options.hysteresis_maps - sum(parts)) > 0:
-        # A rest that is too short to be a part of its own joins the last.
-        parts.append(NEXT_PART if left >= 2 * NEXT_PART else left)
-    if parts[-1] < NEXT_PART and len(parts) > 1:
-        parts[-2:] = [parts[-2] + parts[-1]]
-    return parts
+        return [most]
+    ends = [max(MAPS_MIN, PART_STEP * math.ceil(FIRST_PART * actuators / PART_STEP))]
+    while ends[-1] < most:
+        ends.append(ends[-1] + PART_STEP * max(1, round(NEXT_PART * ends[-1] / PART_STEP)))
+    # A rest that is too short to be a part of its own joins the last.
+    ends = [end for end in ends if end <= most - PART_STEP]
+    return np.diff([0, *ends, most]).tolist()
 
 
 def check_shape(step: Step, model: surfaces.LinearModel, mirror: Mirror) -> Step:
