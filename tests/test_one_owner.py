@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dm_msgs.action import Calibrate, Converge
+from dm_msgs.action import BuildRecipes, Calibrate, Converge
 from dm_msgs.msg import Capabilities, ErrorCode, FocusRequest
 from dm_msgs.srv import HoldMirror, SetFocus, SetSignals
 from std_srvs.srv import SetBool
@@ -247,6 +247,24 @@ def test_a_closed_loop_names_the_interferometer_and_goes_on_with_it(bench: Bench
     result = running.end()
     assert result.error_code in (ErrorCode.OK, ErrorCode.NOT_CONVERGED) and result.maps > 1, result.message
     assert time.monotonic() - began < 60.0
+
+
+def test_recipes_are_stored_once_the_calibration_node_is_back(bench: Bench) -> None:
+    running = Running(bench.client, "build_recipes", BuildRecipes.Goal(curvatures=[0.01], tolerance=1e-6))
+    running.wait_for(lambda feedback: feedback.step > 0)
+    bench.kill_and_name(running, "calibration")
+    result = running.end()
+    assert result.error_code == ErrorCode.OK and result.recipes == 1, result.message
+
+
+def test_recipes_end_soon_after_the_driver_has_died(bench: Bench) -> None:
+    running = Running(bench.client, "build_recipes", BuildRecipes.Goal(curvatures=[0.01], tolerance=1e-6))
+    wait_until(lambda: bench.client.actuator_state.holder != "", 30.0)  # it begins with a degauss
+    bench.kill_and_name(running, "pdm_driver")
+    began = time.monotonic()
+    assert running.end().error_code == ErrorCode.DRIVER_UNAVAILABLE
+    assert time.monotonic() - began < 2 * ALLOWED_S  # it waited 20 s for the driver of before
+    assert bench.client.wait(bench.all_serve, 60.0)
 
 
 def test_a_check_without_an_interferometer_says_so_at_once(bench: Bench) -> None:

@@ -8,12 +8,13 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from dm_msgs.action import BuildRecipes, Converge
-from dm_msgs.msg import FocusRequest
+from dm_msgs.msg import Calibration, FocusRequest
 from dm_msgs.srv import StoreRecipes
 from rclpy.node import Node
 
 from dm_common.errors import MeasurementError
 from dm_common.hysteresis.model import HysteresisState
+from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal
 from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE
@@ -73,14 +74,18 @@ class LoopBench(BenchServices):
         super().__init__(node, loop_times(values))
         self.host, self._parameters = host, values
         self._goal = threading.Lock()
+        self._needed: qos.Liveliness | None = None
 
     @contextmanager
-    def reserved(self, handle: WorkerGoal, feedback: Any, asked: Any, text: str) -> Iterator[None]:
+    def reserved(
+        self, handle: WorkerGoal, feedback: Any, asked: Any, text: str, needed: qos.Liveliness | None = None
+    ) -> Iterator[None]:
         """Keep the bench for one goal: its cancellation ends waits, and its feedback says what is waited for.
 
         Args:
             asked: says who asks, see `BenchServices.held`.
             text: the answer to requests of others meanwhile.
+            needed: a node that the goal needs besides driver and interferometer.
 
         Raises:
             Refusal: another goal has it, or somebody else holds the mirror.
@@ -89,7 +94,7 @@ class LoopBench(BenchServices):
         timeout = self._parameters["converge.driver_timeout"]
         self.hold.wait_for(lambda: self._goal.acquire(blocking=False), asked, busy, timeout)
         try:
-            self._values = loop_times(self._parameters)
+            self._values, self._needed = loop_times(self._parameters), needed
             self.settle_time = self._values["settle_time"]
             self.cancelled = lambda: bool(handle.is_cancel_requested)
             self.publish_waits(handle, feedback)
@@ -97,6 +102,10 @@ class LoopBench(BenchServices):
                 yield
         finally:
             self._goal.release()
+
+    def _missing(self) -> str:
+        needed = self._needed
+        return super()._missing() or (needed.text if needed is not None and needed.missing() else "")
 
     def degauss(self) -> None:
         """The condition that recipes begin with: the driver's own number of steps may be another."""
@@ -124,6 +133,7 @@ def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[
     """
     bench = LoopBench(node, values, host)
     store = node.create_client(StoreRecipes, "store_recipes")
+    calibration = qos.watch(node, "calibration", Calibration, "calibration", qos.LATCHED)
 
     def converge(handle: WorkerGoal) -> tuple[str, Any]:
         from dm_controller.converge.converge_run import ConvergeRun
@@ -133,7 +143,7 @@ def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[
     def build_recipes(handle: WorkerGoal) -> tuple[str, Any]:
         from dm_controller.converge.recipe_run import RecipeRun
 
-        return RecipeRun(node, values, bench, store).run(handle)
+        return RecipeRun(node, values, bench, store, calibration).run(handle)
 
     return (
         WorkerActionServer(node, Converge, "converge", converge, fields=CONVERGE),

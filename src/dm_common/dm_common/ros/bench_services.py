@@ -24,7 +24,6 @@ from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
 from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, answers_arrive, call, run_goal
-from dm_common.ros.qos import Liveliness
 from dm_common.ros.worker import sleep
 
 if TYPE_CHECKING:
@@ -136,8 +135,9 @@ class BenchServices:
     def _run_degauss(self, steps: int) -> None:
         """A degauss of so many half-swings, 0 = as configured in the driver. Raises as `degauss`."""
         goal = Degauss.Goal(steps=steps, holder=self.hold.holder)
+        gone = self._driver.since_now(self._degauss.server_is_ready)
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
-            result = run_goal(self._degauss, goal, self._values["degauss_timeout"], stop)
+            result = run_goal(self._degauss, goal, self._values["degauss_timeout"], stop, gone)
         self._check("degauss", result)
 
     def apply(self, signals: Floats) -> Floats:
@@ -264,7 +264,7 @@ class BenchServices:
         return self.cancelled() or self.hold.lost is not None
 
     @contextmanager
-    def _answered(self, what: str, server: Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+    def _answered(self, what: str, server: qos.Liveliness, ready: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
         """Give a call a condition to end its wait by, and its failure a code and a sentence.
 
         Args:

@@ -45,7 +45,7 @@ def answers_arrive(client: Any, is_ready: Callable[[], bool]) -> bool:
     return time.monotonic() >= _first_seen.setdefault(client, time.monotonic()) + DISCOVERY_S
 
 
-def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], bool] = lambda: False) -> Any:
+def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], object] = lambda: False) -> Any:
     """Call a service from a worker thread and wait for the answer.
 
     Never call this from an executor callback: it would wait for itself.
@@ -99,8 +99,21 @@ class ThreadedActionClient(ActionClient):
             await super().execute(taken_data)
 
 
-def run_goal(client: ActionClient, goal: Any, timeout_s: float, cancelled: Callable[[], bool] = lambda: False) -> Any:
+def run_goal(
+    client: ActionClient,
+    goal: Any,
+    timeout_s: float,
+    cancelled: Callable[[], bool] = lambda: False,
+    gone: Callable[[], object] = lambda: False,
+) -> Any:
     """Run a goal from a worker thread and wait for its result; a goal that is given up is cancelled first.
+
+    Args:
+        client: of the action.
+        goal: to send.
+        timeout_s: longest wait for the server, its answer and the end.
+        cancelled: gives the goal up.
+        gone: whether the server is known to be gone; then nobody waits for the end of a goal that is given up.
 
     Never call this from an executor callback: it would wait for itself.
 
@@ -131,7 +144,7 @@ def run_goal(client: ActionClient, goal: Any, timeout_s: float, cancelled: Calla
         if accepted.done() and accepted.result().accepted:
             accepted.result().cancel_goal_async()
             end = time.monotonic() + CANCEL_S
-            while finished is not None and not finished.done() and time.monotonic() < end:
+            while finished is not None and not (finished.done() or gone()) and time.monotonic() < end:
                 time.sleep(0.01)
         raise
     return finished.result().result

@@ -7,6 +7,7 @@ The mirror goes back to mid range.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,6 +23,7 @@ from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.messages import recipe_book_message
 from dm_common.recipes import shape_text
 from dm_common.ros.clients import ServiceCallError, call
+from dm_common.ros.qos import Liveliness
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
 from dm_common.values import without_figures
 from dm_controller.converge.goals import ending, recipe_targets
@@ -31,8 +33,9 @@ from dm_controller.planning.target import FocusTarget
 
 #: What requests are told meanwhile.
 BUSY = "recipes are being built (action build_recipes)"
-#: Longest wait for the calibration node to store recipes, s.
+#: Longest wait for the calibration node to store recipes, and before it to come back if it has died, s.
 STORE_TIMEOUT_S = 30.0
+RETURN_S = 120.0
 
 
 class RecipeRun:
@@ -43,17 +46,21 @@ class RecipeRun:
         values: its parameters, LOOP_PARAMETERS and REACHABLE_TOLERANCE among them.
         bench: its host knows the calibration in use and the actuators' hysteresis.
         store: client of the service `store_recipes`.
+        calibration: tells whether the node that serves it is alive.
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench, store: Client) -> None:
+    def __init__(
+        self, node: Node, values: Mapping[str, Any], bench: LoopBench, store: Client, calibration: Liveliness
+    ) -> None:
         self._node, self._values, self._bench, self._store = node, values, bench, store
+        self._calibration = calibration
 
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
         feedback = without_figures(BuildRecipes.Feedback())
 
         try:
-            with self._bench.reserved(handle, feedback, handle.request, BUSY):
+            with self._bench.reserved(handle, feedback, handle.request, BUSY, self._calibration):
                 outcome, result = self._build_and_store(handle, feedback)
         except Exception as error:
             outcome, error_code, message = ending(error)
@@ -111,9 +118,8 @@ class RecipeRun:
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
             book = recipe_book(recipes, planner, steps, clock.now().nanoseconds, active.recipes)
             result.interpolation_error = book.interpolation_error
-            stored, reason = self._stored(
-                StoreRecipes.Request(calibration_id=calibration.id, recipes=recipe_book_message(book))
-            )
+            request = StoreRecipes.Request(calibration_id=calibration.id, recipes=recipe_book_message(book))
+            stored, reason = self._stored(handle, request)
             if stored == ErrorCode.OK:
                 result.recipes = len(recipes)
             else:
@@ -163,10 +169,22 @@ class RecipeRun:
             return None
         return rested(law, np.array(state.applied, dtype=float), now, middle)
 
-    def _stored(self, request: Any) -> tuple[int, str]:
-        """What the calibration node answers: an ErrorCode and a sentence."""
-        try:
-            response = call(self._store, request, STORE_TIMEOUT_S)
-        except ServiceCallError as error:
-            return ErrorCode.TIMEOUT, str(error)
-        return response.error_code, response.message
+    def _stored(self, handle: WorkerGoal, request: Any) -> tuple[int, str]:
+        """What the calibration node answers: an ErrorCode and a sentence.
+
+        One that has died is waited for, and one that was started again until it has loaded its calibration.
+        """
+        deadline = time.monotonic() + RETURN_S
+        while True:
+            gone = self._calibration.since_now(self._store.service_is_ready)
+            try:
+                response = call(self._store, request, STORE_TIMEOUT_S, gone)
+                code, text = response.error_code, response.message
+                wait = code == ErrorCode.NOT_CALIBRATED
+            except ServiceCallError as error:
+                code, text = ErrorCode.TIMEOUT, gone() or str(error)
+                wait = bool(gone())
+            if not wait or handle.is_cancel_requested or time.monotonic() > deadline:
+                return code, text
+            self._bench.waiting(f"waiting: {text}")
+            time.sleep(0.1)
