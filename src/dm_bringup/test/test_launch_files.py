@@ -6,7 +6,6 @@ import runpy
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -92,12 +91,13 @@ def test_launch_files_start_what_up_starts(
 
 
 def test_a_signal_waits_until_a_node_has_imported_what_it_needs(domain: int) -> None:
-    script = "import time; time.sleep(0.5); from dm_common.ros.executor import run_node; run_node(lambda: 1 / 0)"
+    script = "print('begun', flush=True); input(); from dm_common.ros.executor import run_node; run_node(lambda: 1 / 0)"
     command = [*HELD_SIGNALS.split(), sys.executable, "-c", script]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        time.sleep(0.2)
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "begun\n"
         process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=60.0)[1] == "" and process.returncode == 0
+        assert process.communicate("\n", timeout=60.0)[1] == "" and process.returncode == 0
 
 
 def test_the_health_of_every_node_has_its_place_in_the_aggregator() -> None:

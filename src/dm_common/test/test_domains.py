@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 from pathlib import Path
 
 import pytest
@@ -38,5 +39,6 @@ def test_who_holds_a_port_is_named(kind: socket.SocketKind) -> None:
         port = endpoint.getsockname()[1]
         if kind == socket.SOCK_STREAM:
             endpoint.listen()
-        assert f"pytest (process {os.getpid()}, ROS domain " in held_by(port)
+        command = " ".join(sys.orig_argv[:3])
+        assert f" by {command} (process {os.getpid()}, ROS domain " in held_by(port)
     assert held_by(port) == ""
