@@ -32,7 +32,7 @@ def holders(targets: Collection[Path]) -> list[str]:
     for process in PROCESSES.glob("[0-9]*"):
         with contextlib.suppress(OSError):  # not ours, or gone meanwhile
             if any(link.readlink() in targets for link in (process / "fd").iterdir()):
-                command = (process / "cmdline").read_text().split("\0")[:3]
+                command = (process / "cmdline").read_text(errors="replace").split("\0")[:3]
                 variables = (process / "environ").read_text(errors="replace").split("\0")
                 domain = dict(variable.partition("=")[::2] for variable in variables).get("ROS_DOMAIN_ID", "0")
                 found.append(f"{' '.join(command).strip()} (process {process.name}, ROS domain {domain})")
