@@ -214,13 +214,14 @@ def test_things_at_several_distances_that_the_optics_do_not_explain_are_swept(
 def test_images_of_another_size_are_swept(model: DefocusModel, before: int) -> None:
     search = FocusSearch(CONFIG, model, LOW)
     for _image in range(before):
-        search.feed(1.0, (DefocusedCamera(clouds(), 0.0123).expose(LOW),))
+        search.feed(5.0, (DefocusedCamera(clouds(), 0.0123).expose(LOW),))
     search.feed(1.0, (np.ones((10, 10)),))
     assert "size" in search.reason
     while not search.current.done:
         off = search.current.step.curvature - 0.0123
         search.feed(1 / (1 + (off / 0.01) ** 2), (np.ones((10, 10)),))
     assert search.current.peak is not None and search.fitting_scale() == 1
+    assert search.current.peak.sharpness <= 1, "of these images, not of those before"
 
 
 def test_without_optics_or_a_mirror_to_trust_every_sweep_begins_below(model: DefocusModel) -> None:
