@@ -220,6 +220,8 @@ class DepthFromDefocus:
         if min((off < -BLURRED).sum(), (off > BLURRED).sum()) >= 2:
             some = some[np.abs(off) > BLURRED]
             place, spread = fit(some)
+        if len(some) < 2:
+            return place, spread
         without = np.array([fit(np.delete(some, number))[0] for number in range(len(some))])
         return place, math.hypot(spread, math.sqrt(len(some) - 1) * float(without.std()))
 
