@@ -160,7 +160,7 @@ def capabilities_message(
     message.quality = active.calibration.quality
     message.curvature_min, message.curvature_max = low, high
     message.power_min, message.power_max = 2 * low, 2 * high
-    message.error_bound = active.error_bound(not unknown)
+    message.error_bound = active.planner.error_bound(not unknown)
     message.error_bound_conditioned = active.conditioned_error
     message.condition_time = controller.conditioning.duration(
         active.degauss_steps(values["condition.degauss_steps"]), active

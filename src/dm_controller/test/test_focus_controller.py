@@ -402,6 +402,15 @@ def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:
     assert move_of(after).plan.max_zernike_upper < 0.1 * move_of(before).plan.max_zernike_upper
 
 
+def test_what_is_offered_is_what_requests_are_promised() -> None:
+    bench = Bench()
+    bench.do(bench.controller.use(calibration("still", replace(LAW, creep_rate=0.0)), MIRROR))
+    bench.degauss()
+    plan = move_of(bench.ask(dry_run=True)).plan
+    offered = capabilities_message(bench.controller, MIRROR, VALUES, bench.now).error_bound
+    assert plan.max_zernike_upper == pytest.approx(plan.max_zernike + offered)
+
+
 def test_lost_turns_make_the_history_unknown(bench: Bench) -> None:
     bench.turns += 5
     bench.move(np.full(ACTUATORS, 0.1))

@@ -70,14 +70,6 @@ class ActiveCalibration:
         """m, bound of the largest coefficient error of a conditioned move; 0 = no recipes."""
         return self.corrections.worst if self.recipes.recipes else 0.0
 
-    def error_bound(self, history_known: bool) -> float:
-        """m, 95 % bound of the largest coefficient error of a direct move."""
-        hysteresis = self.planner.hysteresis
-        if hysteresis is None:
-            return float(self.calibration.held_out_max_zernike)
-        unknown = 0.0 if history_known else self.planner.unknown_max_zernike
-        return math.hypot(hysteresis.held_out_max_zernike, unknown)
-
     def stale(self, now_ns: int, age_max_s: float) -> str:
         """The reason why the calibration should be renewed; "" = it is fresh, or of unknown age."""
         seen = stamp_ns(self.calibration.checked) or stamp_ns(self.calibration.header.stamp)

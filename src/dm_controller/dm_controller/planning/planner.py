@@ -223,14 +223,19 @@ class Planner:
 
         return CreepError(self.law, self._zernike, self.mirror.sag_root, whole)
 
+    def error_bound(self, known: bool) -> float:
+        """m, 95 % bound of the largest coefficient error, but for creep, with the history `known` or not."""
+        if self.hysteresis is None:
+            return self.mirror.model.held_out_max_zernike
+        in_use = IN_USE if self.law.remembers else 1.0
+        unknown = 0.0 if known else self.unknown_max_zernike
+        return math.hypot(in_use * self.hysteresis.held_out_max_zernike, unknown)
+
     def _bounded(
         self, plan: Plan, signals: Floats, known: bool, creep: tuple[float, float], error: float | None
     ) -> Plan:
-        hysteresis = self.hysteresis
-        assert hysteresis is not None
         rms_spread = self.mirror.model.held_out_rms
-        in_use = IN_USE if self.law.remembers else 1.0
-        largest_spread = in_use * hysteresis.held_out_max_zernike if error is None else error - plan.max_zernike
+        largest_spread = self.error_bound(True) if error is None else error - plan.max_zernike
         if not known:
             rms_spread = float(np.hypot(rms_spread, self._unknown_rms))
             largest_spread = float(np.hypot(largest_spread, self.unknown_max_zernike))
