@@ -93,6 +93,15 @@ def test_mirrors_need_one_first_seed() -> None:
     assert "--seed" in result.output
 
 
+@pytest.mark.parametrize("others", [[], ["--mirrors", "2", "--quick"]])
+def test_numbers_of_maps_are_refused_where_they_would_mean_nothing(others: list[str]) -> None:
+    app = typer.Typer()
+    app.command()(command)
+    result = CliRunner().invoke(app, ["--maps", "100", *others])
+    assert result.exit_code == 2
+    assert "--maps" in result.output
+
+
 def test_pokes_of_as_many_maps_and_what_is_told_of_each_number(capsys: pytest.CaptureFixture[str]) -> None:
     """Each pattern is legal and enough of them tell all actuators; a mirror without requests is named."""
     mirror = SimulatedBench(draw_mirror(3, 100).simulation).mirror

@@ -125,6 +125,8 @@ def compare(
     With --maps too it is numbers of maps: the hysteresis plan beside Hadamard patterns and push-pull pokes.
     With --autofocus it is searches of the sharpest focus: images and time that each takes, and how far off it ends.
     """
+    if maps and (quick or not mirrors):
+        raise typer.BadParameter("only with --mirrors, and without --quick", param_hint="--maps")
     if mirrors or autofocus:
         if seed and len(seed) > 1:
             raise typer.BadParameter("here it is the first of the seeds: give one", param_hint="--seed")
