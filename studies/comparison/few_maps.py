@@ -22,8 +22,7 @@ from studies.comparison.random_requests import Requests, active_of, draw_targets
 from studies.comparison.simulated_bench import Floats, SimulatedBench
 from studies.comparison.true_surface import TrueSurface
 
-#: What is measured: random shapes whose hysteresis is identified, patterns of all actuators, one actuator at
-#: a time.
+#: What is measured: random shapes whose hysteresis is identified, patterns of all actuators, one actuator at a time.
 HYSTERESIS, HADAMARD, PUSH_PULL = "hysteresis", "Hadamard", "push-pull"
 METHODS = (HYSTERESIS, HADAMARD, PUSH_PULL)
 #: Half-swing of a pattern; neighbours that go apart then keep the limit that ships.

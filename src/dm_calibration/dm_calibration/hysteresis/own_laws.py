@@ -65,8 +65,8 @@ LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
 CREEP_SLOPE = 0.3
 #: Rounds of the three solutions in turn, of runs of so many maps. With 6 the slow creep is a third less true and
 #: held-out errors up to four times as large, with 60 hardly better. Shorter runs, whose maps tell gains and laws apart
-#: less well, come to rest as much later: of 100 maps errors are up to a quarter smaller
-#: with 60 rounds than with 20, on some mirrors a tenth larger.
+#: less well, come to rest as much later: of 100 maps errors are up to a quarter smaller with 60 rounds than with 20, on
+#: some mirrors a tenth larger.
 ROUNDS, ROUNDS_MAPS = 20, 300
 #: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
 #: times of it errors change by less than a tenth.
