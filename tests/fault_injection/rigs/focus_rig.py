@@ -248,9 +248,13 @@ class FocusRig(DriverRig):
     def account_for(self, state: FocusState, record: FaultRecord, patience_s: float = 20.0) -> None:
         """Count a request as lost that was accepted with `state` and neither is carried out nor told of as failed."""
 
+        def stood() -> bool:
+            wanted = np.asarray(state.signals, dtype=np.float64)
+            return any(np.abs(np.asarray(report.applied) - wanted).max() <= SAME_SHAPE for report in self.states[-100:])
+
         def settled() -> bool:
             refused = any(told.error_code != ErrorCode.OK for told in self.told_of(state.curvature))
-            return refused or self.near(state.signals)
+            return refused or self.near(state.signals) or stood()  # it may have stood until a loop began
 
         if state.error_code != ErrorCode.OK:
             if not state.message:
