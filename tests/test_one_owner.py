@@ -257,16 +257,6 @@ def test_recipes_are_stored_once_the_calibration_node_is_back(bench: Bench) -> N
     assert result.error_code == ErrorCode.OK and result.recipes == 1, result.message
 
 
-def test_recipes_end_soon_after_the_driver_has_died(bench: Bench) -> None:
-    running = Running(bench.client, "build_recipes", BuildRecipes.Goal(curvatures=[0.01], tolerance=1e-6))
-    wait_until(lambda: bench.client.actuator_state.holder != "", 30.0)  # it begins with a degauss
-    bench.kill_and_name(running, "pdm_driver")
-    began = time.monotonic()
-    assert running.end().error_code == ErrorCode.DRIVER_UNAVAILABLE
-    assert time.monotonic() - began < 2 * ALLOWED_S  # it waited 20 s for the driver of before
-    assert bench.client.wait(bench.all_serve, 60.0)
-
-
 def test_a_check_without_an_interferometer_says_so_at_once(bench: Bench) -> None:
     bench.focus()
     bench.paused = True
@@ -305,4 +295,14 @@ def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(benc
     bench.paused = False
     # The clock of this bench stood still as well.
     assert running.end().error_code in (ErrorCode.TIMEOUT, ErrorCode.TRIGGER_FAILED, lost)
+    assert bench.client.wait(bench.all_serve, 60.0)
+
+
+def test_recipes_end_soon_after_the_driver_has_died(bench: Bench) -> None:
+    running = Running(bench.client, "build_recipes", BuildRecipes.Goal(curvatures=[0.01], tolerance=1e-6))
+    wait_until(lambda: bench.client.actuator_state.holder != "", 30.0)  # it begins with a degauss
+    bench.kill_and_name(running, "pdm_driver")
+    began = time.monotonic()
+    assert running.end().error_code == ErrorCode.DRIVER_UNAVAILABLE
+    assert time.monotonic() - began < 2 * ALLOWED_S  # it waited 20 s for the driver of before
     assert bench.client.wait(bench.all_serve, 60.0)

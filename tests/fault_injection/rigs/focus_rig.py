@@ -250,7 +250,8 @@ class FocusRig(DriverRig):
 
         def stood() -> bool:
             wanted = np.asarray(state.signals, dtype=np.float64)
-            return any(np.abs(np.asarray(report.applied) - wanted).max() <= SAME_SHAPE for report in self.states[-100:])
+            reports = [np.asarray(report.applied) for report in self.states[-100:] if len(report.applied)]
+            return wanted.shape == (37,) and any(np.abs(shape - wanted).max() <= SAME_SHAPE for shape in reports)
 
         def settled() -> bool:
             refused = any(told.error_code != ErrorCode.OK for told in self.told_of(state.curvature))
