@@ -248,14 +248,9 @@ class FocusRig(DriverRig):
     def account_for(self, state: FocusState, record: FaultRecord, patience_s: float = 20.0) -> None:
         """Count a request as lost that was accepted with `state` and neither is carried out nor told of as failed."""
 
-        def stood() -> bool:
-            wanted = np.asarray(state.signals, dtype=np.float64)
-            reports = [np.asarray(report.applied) for report in self.states[-100:] if len(report.applied)]
-            return wanted.shape == (37,) and any(np.abs(shape - wanted).max() <= SAME_SHAPE for shape in reports)
-
         def settled() -> bool:
             refused = any(told.error_code != ErrorCode.OK for told in self.told_of(state.curvature))
-            return refused or self.near(state.signals) or stood()  # it may have stood until a loop began
+            return refused or self.near(state.signals)
 
         if state.error_code != ErrorCode.OK:
             if not state.message:
