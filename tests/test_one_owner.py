@@ -237,7 +237,7 @@ def test_an_unplugged_unit_is_known(bench: Bench) -> None:
 
 
 def test_a_closed_loop_names_the_interferometer_and_goes_on_with_it(bench: Bench) -> None:
-    goal = Converge.Goal(request=FocusRequest(curvature=0.02), tolerance=1e-10, max_maps=20)
+    goal = Converge.Goal(request=FocusRequest(curvature=0.02), tolerance=1e-10, max_maps=10)
     running = Running(bench.client, "converge", goal)
     running.wait_for(lambda feedback: feedback.step > 0)
     assert bench.focus().error_code == ErrorCode.BUSY
@@ -246,7 +246,7 @@ def test_a_closed_loop_names_the_interferometer_and_goes_on_with_it(bench: Bench
     running.wait_for(lambda feedback: feedback.message == "" and np.isfinite(feedback.max_zernike))
     result = running.end()
     assert result.error_code in (ErrorCode.OK, ErrorCode.NOT_CONVERGED) and result.maps > 1, result.message
-    assert time.monotonic() - began < 100.0  # it was 132 s
+    assert time.monotonic() - began < 60.0
 
 
 def test_recipes_are_stored_once_the_calibration_node_is_back(bench: Bench) -> None:

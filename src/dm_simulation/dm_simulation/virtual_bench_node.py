@@ -28,12 +28,14 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from dm_common.ros import qos
+from dm_common.ros.domains import held_by
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import ERROR, OK, WARN, Diagnostics, Health
 from dm_common.ros.parameters import ParameterError, declare
 from dm_common.ros.worker import WorkerService
 from dm_simulation.bench import VirtualBench
 from dm_simulation.camera import camera_matrix
+from dm_simulation.electronics.server import PortError
 from dm_simulation.mirror.piezo import PiezoActuators
 from dm_simulation.parameters import PARAMETERS, bench_config
 
@@ -65,7 +67,10 @@ class VirtualBenchNode(Node):
         speed = values["clock.speed"]
         self._fast_clock = FastClock(speed) if speed > 0 else None
         self._stop = threading.Event()
-        self.bench = VirtualBench(bench_config(values), self._now, self._on_event)
+        try:
+            self.bench = VirtualBench(bench_config(values), self._now, self._on_event)
+        except PortError as error:
+            raise OSError(f"{error}{held_by(error.port)}") from None
 
         # Latched JSON object: the ports and paths really in use.
         endpoints = self.create_publisher(String, "~/endpoints", qos.LATCHED)

@@ -197,10 +197,9 @@ def test_parameter_table_builds_the_standard_bench() -> None:
 
 
 def test_the_simulation_imports_nothing_of_what_it_judges() -> None:
-    """Only the node's own module may use what all nodes share; the rest parameter tables, and who holds a port."""
-    of_all = ("dm_simulation", "dm_common.ros.parameters", "dm_common.ros.domains")
+    """Only the node's own module may use what all nodes share; the simulated physics knows parameter tables alone."""
     for module in FOLDER.rglob("*.py"):
-        allowed = ("dm_simulation", "dm_common.ros") if module.stem.endswith("_node") else of_all
+        allowed = ("dm_simulation", "dm_common.ros" if module.stem.endswith("_node") else "dm_common.ros.parameters")
         for node in ast.walk(ast.parse(module.read_text())):
             names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from dm_common.ros.domains import held_by
 from dm_simulation.electronics import frames
 from dm_simulation.electronics.drive_unit import DriveUnit
 from dm_simulation.electronics.event_loop import EventLoop
@@ -254,6 +253,20 @@ class ElectronicsServer:
                 self._reject("discovery", "unknown question", question)
 
 
+class PortError(OSError):
+    """A port of this machine cannot be had.
+
+    Args:
+        name: of the parameter that asks for it.
+        port: as it asks.
+        error: the reason.
+    """
+
+    def __init__(self, name: str, port: int, error: OSError) -> None:
+        super().__init__(f"{name} = {port}: {error.strerror}")
+        self.port = port
+
+
 def _bind(endpoint: socket.socket, port: int, name: str, patience_s: float = 0.0) -> None:
     deadline = time.monotonic() + patience_s
     while True:
@@ -261,5 +274,5 @@ def _bind(endpoint: socket.socket, port: int, name: str, patience_s: float = 0.0
             return endpoint.bind((LOOPBACK, port))
         except OSError as error:
             if error.errno != errno.EADDRINUSE or time.monotonic() >= deadline:
-                raise OSError(f"{name} = {port}: {error.strerror}{held_by(port)}") from None
+                raise PortError(name, port, error) from None
         time.sleep(0.005)

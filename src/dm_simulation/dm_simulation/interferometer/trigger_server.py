@@ -10,8 +10,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from dm_common.ros.domains import held_by
-from dm_simulation.electronics.server import LOOPBACK
+from dm_simulation.electronics.server import LOOPBACK, PortError
 
 
 class TriggerServer:
@@ -42,7 +41,7 @@ class TriggerServer:
         try:
             self._server = Server((LOOPBACK, port), Handler)
         except OSError as error:
-            raise OSError(f"trigger.port = {port}: {error.strerror}{held_by(port)}") from None
+            raise PortError("trigger.port", port, error) from None
         self.port: int = self._server.server_address[1]
         self._thread = threading.Thread(
             target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, name="trigger", daemon=True
