@@ -60,7 +60,8 @@ class Answer:
         """The message without what differs from run to run."""
         text = re.sub(r"PDM30-37_\S+?Z|/\S+/|\S+\.dat\b", "…", self.message)
         text = re.sub(r"inside [-+]0\.\d{4} to [-+]0\.\d{4}", "inside … to …", text)  # what the calibration reaches
-        text = re.sub(r"; the range was swept: .*", "", text)  # which search serves depends on the images
+        text = re.sub(r"; the range was swept: .*", "", text)  # which search serves depends on the images,
+        text = re.sub(r" \+- \S+ dioptre", " dioptre", text)  # and only one of them knows its standard error
         exact = self.code is None or self.code in EXACT
         return text if exact else re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
 
