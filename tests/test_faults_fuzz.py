@@ -20,7 +20,7 @@ from fault_injection.fuzz.reference_files import FORMATS, XYZ_UNIT, ReferenceFil
 pytestmark = pytest.mark.processes
 
 #: HDF5 files take longer: the library crashes now and then, and its process is started again.
-FILES = {"dat": 1000, "asc": 1000, "xyz": 1000, "fits": 500, "datx": 250, "h5": 250, "calibration": 250}
+FILES = {"dat": 1000, "asc": 1000, "xyz": 1000, "fits": 500, "datx": 250, "h5": 250, "4D": 100, "calibration": 250}
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -46,7 +46,7 @@ def read_reference(name: str, folder: Path) -> tuple[ReferenceFile, SurfaceMap]:
     return file, read_map(path, xyz_unit=XYZ_UNIT)
 
 
-@pytest.mark.parametrize("name", ["dat", "datx", "asc", "xyz", "fits", "h5"])
+@pytest.mark.parametrize("name", ["dat", "datx", "asc", "xyz", "fits", "h5", "4D"])
 def test_maps_that_the_damage_does_not_explain_are_called_wrong(name: str, tmp_path: Path) -> None:
     file, whole = read_reference(name, tmp_path)
     nothing = Mutation("none", file.content)
@@ -54,7 +54,7 @@ def test_maps_that_the_damage_does_not_explain_are_called_wrong(name: str, tmp_p
     for sag in (2 * whole.sag, np.roll(whole.sag, 1), whole.sag.T, np.where(whole.sag > 0, whole.sag, np.nan)):
         assert classify(file, whole, nothing, replace(whole, sag=sag)) is Verdict.WRONG_MAP
     assert classify(file, whole, nothing, replace(whole, wavelength=5e-7)) is Verdict.WRONG_MAP
-    assert classify(file, whole, nothing, replace(whole, pitch=None)) is Verdict.WRONG_MAP
+    assert classify(file, whole, nothing, replace(whole, pitch=5e-5)) is Verdict.WRONG_MAP
 
 
 def test_a_changed_sample_and_a_changed_scale_are_told_apart(tmp_path: Path) -> None:

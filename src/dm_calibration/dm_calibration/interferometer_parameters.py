@@ -27,7 +27,7 @@ PARAMETERS = (
     Parameter("watch_folder", text(""), "Folder in which the instrument saves its maps; empty = watch nothing."),
     Parameter(
         "file_pattern",
-        texts(["*.dat", "*.datx", "*.asc", "*.xyz", "*.fits", "*.h5"]),
+        texts(["*.dat", "*.datx", "*.asc", "*.xyz", "*.fits", "*.h5", "*.4D"]),
         "Names of the files to take from watch_folder, as shell patterns.",
     ),
     Parameter("stable_time", real(0.5, 0.02, 3600.0, "s"), "Time for which size and time of a file must stand still."),

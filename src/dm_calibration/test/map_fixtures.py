@@ -217,3 +217,12 @@ def h5_bytes(
         if xpix is not None:
             group.attrs["xpix"] = np.bytes_(xpix)
     return buffer.getvalue()
+
+
+def four_d_bytes(waves: NDArray[Any], **attributes: Any) -> bytes:
+    """A file of a newer 4Sight of `waves` (height, width), NaN = no data."""
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        file["Measurement/SurfaceInWaves/Data"] = waves.astype("<f4")
+        file["Measurement"].attrs.update(attributes or {"WavelengthInNanometers": 632.8})
+    return buffer.getvalue()

@@ -11,7 +11,7 @@ import pytest
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.map_files import MapFileError, read_map
-from map_fixtures import fits_bytes, h5_bytes
+from map_fixtures import fits_bytes, four_d_bytes, h5_bytes
 
 #: (height, width) sag in nm, NaN = no data, no two rows alike.
 SAG = np.where(np.hypot(*np.mgrid[-1:1:12j, -1:1:14j]) > 1.1, np.nan, 90.0 + np.arange(168.0).reshape(12, 14))
@@ -38,6 +38,7 @@ def write(folder: Path, name: str, content: bytes) -> Path:
         ),
         ("e.fits", fits_bytes(SAG, BUNIT=None)),
         ("f.h5", h5_bytes(SAG / 632.8)),
+        ("g.4D", four_d_bytes(SAG / 632.8)),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -46,7 +47,8 @@ def test_maps_of_other_makers(tmp_path: Path, name: str, content: bytes) -> None
     found = read_map(write(tmp_path, name, content), xyz_unit="nm")
     np.testing.assert_allclose(found.sag, 1e-9 * SAG, rtol=1e-6)
     assert found.format == name.partition(".")[2]
-    assert found.wavelength == pytest.approx(632.8e-9) and found.pitch == pytest.approx(24e-6)
+    assert found.wavelength == pytest.approx(632.8e-9)
+    assert found.pitch == (None if found.format == "4D" else pytest.approx(24e-6))
     for cut in (30, len(content) // 2, len(content) - 1):
         with pytest.raises(MapFileError):
             read_map(write(tmp_path, "cut", content[:cut]), xyz_unit="nm")
@@ -99,7 +101,10 @@ def test_a_fits_file_whose_checksum_does_not_agree_is_refused(tmp_path: Path) ->
         (h5_bytes(SAG, wavelength="red"), "wavelength = 'red': must be a length"),
         (h5_bytes(SAG, xpix="3 px"), "xpix = '3 px'"),
         (h5_bytes(SAG[0]), "must be a two-dimensional table"),
-        (h5_bytes(SAG, path="Measurement/SurfaceInWaves"), "a .4D file of 4Sight does not tell its wavelength"),
+        (four_d_bytes(SAG, other=1), "/Measurement: the attribute 'WavelengthInNanometers' is missing"),
+        (four_d_bytes(SAG, WavelengthInNanometers=0.0), "wavelength = 0"),
+        (four_d_bytes(SAG, WavelengthInNanometers="red"), "'WavelengthInNanometers' = ['red']: must be one number"),
+        (four_d_bytes(SAG, WavelengthInNanometers=632.8, NumOfMeasurements=3), "NumOfMeasurements = 3: must be a file"),
         (h5_bytes(np.full((4, 4), np.nan)), "none of the 4 x 4 pixels is valid"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

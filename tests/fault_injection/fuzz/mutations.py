@@ -53,7 +53,7 @@ def mutate(file: ReferenceFile, seed: int, number: int) -> Mutation:
         kinds += [text_word] * 6 + [text_lines] * 2
     elif file.format != "fits":
         kinds += [structure_bits] * 8 + [hdf5_structure]
-        if file.format in ("datx", "h5"):
+        if file.format in ("datx", "h5", "4D"):
             kinds += [value_bits] * 2
     mutation = random.choice(kinds)
     outcome = mutation(file, random)

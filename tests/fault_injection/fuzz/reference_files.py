@@ -232,6 +232,16 @@ def _h5() -> ReferenceFile:
     return ReferenceFile("h5", ".h5", content, places, 4)
 
 
+def _four_d() -> ReferenceFile:
+    """`four_d_bytes` made it, there too, of surface() / WAVELENGTH."""
+    content = (SAMPLES / "sample.4D").read_bytes()
+    with h5py.File(io.BytesIO(content), "r") as file:
+        data = file["Measurement/SurfaceInWaves/Data"]
+        samples = data.id.get_offset(), data.id.get_offset() + data.id.get_storage_size()
+    places = {"samples": (samples,), "wavelength": _occurrences(content, struct.pack("<d", 632.8), samples)}
+    return ReferenceFile("4D", ".4D", content, places, 4)
+
+
 FORMATS = {
     "dat": _dat,
     "datx": _datx,
@@ -239,6 +249,7 @@ FORMATS = {
     "xyz": _xyz,
     "fits": _fits,
     "h5": _h5,
+    "4D": _four_d,
     "calibration": _calibration,
 }
 

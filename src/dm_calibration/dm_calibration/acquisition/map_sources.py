@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 
 #: Endings of the map files that are taken from a folder.
-SUFFIXES = (".dat", ".datx", ".asc", ".xyz", ".fits", ".h5")
+SUFFIXES = (".dat", ".datx", ".asc", ".xyz", ".fits", ".h5", ".4D")
 
 
 def outcome_of(

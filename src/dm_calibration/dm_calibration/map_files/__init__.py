@@ -25,7 +25,7 @@ _START_BYTES = 4096
 
 
 def read_map(path: str | os.PathLike[str], *, xyz_unit: str | None = None) -> SurfaceMap:
-    """Read a surface map from a ZYGO `.dat`, `.asc`, `.xyz` or `.datx` file, a FITS file, or an `.h5` of 4Sight.
+    """Read a surface map from a ZYGO `.dat`, `.asc`, `.xyz` or `.datx` file, a FITS file, or one of 4Sight.
 
     The format is found from the content; the suffix matters only between the two text formats, whose titles are
     sometimes mixed up.
@@ -90,7 +90,7 @@ def _read(path: Path) -> bytes:
         if not (_agrees(start, status.st_size) or is_text(start) or is_fits(start)):
             raise MapFileError(
                 f"begins with bytes {start[:8].hex(' ') or '(none)'}: not a ZYGO .dat, .datx, .asc or .xyz file, no "
-                "FITS file and no .h5 of 4Sight"
+                "FITS file and no .h5 or .4D of 4Sight"
             )
         file.seek(0)
         return file.read(status.st_size)

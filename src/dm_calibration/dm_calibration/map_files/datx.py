@@ -14,11 +14,12 @@ from dm_calibration.map_files.datx_structure import (
     SIGNATURE,
     as_text,
     check_end,
+    missing,
+    number_in,
     object_at,
     read_heights,
 )
-from dm_calibration.map_files.four_d import GROUP as FOUR_D
-from dm_calibration.map_files.four_d import parse_four_d
+from dm_calibration.map_files.four_d import is_four_d, parse_four_d
 from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
@@ -60,9 +61,7 @@ def parse_datx(content: bytes) -> SurfaceMap:
     try:
         check_end(content, len(content))
         with h5py.File(io.BytesIO(content), "r") as file:
-            if "Measurement" in file and "MetaData" not in file:
-                raise MapFileError("a .4D file of 4Sight does not tell its wavelength: save the map as .h5 or .fits")
-            return parse_four_d(file, content) if FOUR_D in file else _parse(file, content)
+            return parse_four_d(file, content) if is_four_d(file) else _parse(file, content)
     except MapFileError:
         raise
     except Exception as error:  # h5py raises whatever a damaged file provokes: OSError, KeyError, RuntimeError, ...
@@ -101,16 +100,12 @@ def _parse(file: h5py.File, content: bytes) -> SurfaceMap:
     )
 
 
-def _missing(where: Any, name: str) -> MapFileError:
-    return MapFileError(f"{where.name}: the attribute '{name}' is missing")
-
-
 def _required(surface: h5py.Dataset, name: str, *otherwise: float | None) -> float:
     """The number in the attribute `name`, or the first that is known of `otherwise`."""
-    for value in (_number(surface, name), *otherwise):
+    for value in (number_in(surface, name), *otherwise):
         if value is not None:
             return value
-    raise _missing(surface, name)
+    raise missing(surface, name)
 
 
 def _metadata(file: h5py.File) -> dict[tuple[str, str], str]:
@@ -131,15 +126,6 @@ def _path(metadata: dict[tuple[str, str], str], what: str) -> str:
             raise MapFileError(f"/MetaData: no link '{link}' from '{node}' (Root -> Measurement -> {what} -> Path)")
         node = metadata[node, link]
     return node
-
-
-def _number(node: Any, name: str) -> float | None:
-    if name not in node.attrs:
-        return None
-    value = np.asarray(node.attrs[name]).ravel()
-    if value.size != 1 or value.dtype.kind not in "fiu":
-        raise MapFileError(f"{node.name}: attribute '{name}' = {value.tolist()}: must be one number")
-    return float(value[0])
 
 
 def _extra_attributes(file: h5py.File, metadata: dict[tuple[str, str], str]) -> dict[str, Any]:
@@ -181,7 +167,7 @@ def _truth(value: NDArray[Any] | None) -> bool | None:
 def _metres_per_unit(surface: h5py.Dataset, extra: dict[str, Any], wavelength: float) -> float:
     """m per stored unit: S O W for fringes, a plain length otherwise (already scaled by Mx)."""
     if "Unit" not in surface.attrs:
-        raise _missing(surface, "Unit")
+        raise missing(surface, "Unit")
     unit = as_text(np.asarray(surface.attrs["Unit"]).ravel()[0])
     if unit.lower() in _LENGTHS:
         return _LENGTHS[unit.lower()]
@@ -230,7 +216,7 @@ def _origin(surface: h5py.Dataset) -> tuple[int, int]:
 def _check_witnesses(surface: h5py.Dataset, extra: dict[str, Any], wavelength: float) -> None:
     """Values that the file tells twice must agree: the format has no checksum."""
     stated = _converter(surface, "Z Converter")
-    scale, obliquity = _number(surface, "Interferometric Scale Factor"), _number(surface, "Obliquity Factor")
+    scale, obliquity = number_in(surface, "Interferometric Scale Factor"), number_in(surface, "Obliquity Factor")
     witnesses: list[tuple[str, float | None, float | None]]
     witnesses = [("Wavelength", wavelength, _extra_number(extra, "Wavelength"))]
     if stated is not None and len(stated) >= 4:  # (0, wavelength, scale factor, obliquity)

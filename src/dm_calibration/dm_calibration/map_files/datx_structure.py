@@ -190,6 +190,24 @@ def _check_foreign(surface: h5py.Dataset, stored: NDArray[Any]) -> None:
         raise MapFileError(f"{surface.name}: holds values smaller than {least:g} other than 0, which are no heights")
 
 
+def missing(where: Any, name: str) -> MapFileError:
+    return MapFileError(f"{where.name}: the attribute '{name}' is missing")
+
+
+def number_in(node: Any, name: str) -> float | None:
+    """The number in the attribute `name`; None when it is absent.
+
+    Raises:
+        MapFileError: it holds something else.
+    """
+    if name not in node.attrs:
+        return None
+    value = np.asarray(node.attrs[name]).ravel()
+    if value.size != 1 or value.dtype.kind not in "fiu":
+        raise MapFileError(f"{node.name}: attribute '{name}' = {value.tolist()}: must be one number")
+    return float(value[0])
+
+
 def as_text(value: Any) -> str:
     if isinstance(value, bytes):
         return value.decode("latin-1")

@@ -1,4 +1,4 @@
-"""Maps of 4D Technology's 4Sight (HDF5, `.h5`; docs/map-files.md)."""
+"""Maps of 4D Technology's 4Sight (HDF5, `.h5` and `.4D`; docs/map-files.md)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
-from dm_calibration.map_files.datx_structure import as_text, object_at, read_heights
+from dm_calibration.map_files.datx_structure import as_text, missing, number_in, object_at, read_heights
 from dm_calibration.map_files.surface_map import (
     METRES,
     MapFileError,
@@ -18,10 +19,16 @@ from dm_calibration.map_files.surface_map import (
     check_wavelength,
 )
 
-#: The group that only these files have.
-GROUP = "measurement0"
-#: What stands where there is no data: the largest single-precision number.
+#: The groups by which files are known: of version 2 (.h5), and of newer ones (.4D).
+_OLD, _NEW = "measurement0", "Measurement"
+#: What stands where there is no data: the largest single-precision number; in newer versions what is not finite.
 _NO_DATA = float(np.finfo(np.float32).max)
+_WAVELENGTH, _COUNT = "WavelengthInNanometers", "NumOfMeasurements"
+
+
+def is_four_d(file: h5py.File) -> bool:
+    """Whether an open HDF5 file is one of 4Sight."""
+    return _OLD in file or (_NEW in file and "MetaData" not in file)
 
 
 def parse_four_d(file: h5py.File, content: bytes) -> SurfaceMap:
@@ -30,18 +37,36 @@ def parse_four_d(file: h5py.File, content: bytes) -> SurfaceMap:
     Raises:
         MapFileError: not a whole, meaningful map; the message names what is missing or wrong.
     """
-    group, surface = (object_at(file, path) for path in (f"{GROUP}/genraw", f"{GROUP}/genraw/data"))
+    if _OLD not in file:
+        return _newer(file, content)
+    group, surface = (object_at(file, path) for path in (f"{_OLD}/genraw", f"{_OLD}/genraw/data"))
     wavelength = check_wavelength(_length(group, "wavelength"))
     pitch = check_pitch(_length(group, "xpix")) if "xpix" in group.attrs else None
-    sag = read_heights(surface, content, _NO_DATA) * wavelength
+    return _surface_map(read_heights(surface, content, _NO_DATA), wavelength, pitch, "h5")
+
+
+def _newer(file: h5py.File, content: bytes) -> SurfaceMap:
+    group = object_at(file, _NEW)
+    if (count := number_in(group, _COUNT)) is not None:
+        raise MapFileError(f"{group.name}: {_COUNT} = {count:g}: must be a file of one map, without it")
+    nanometres = number_in(group, _WAVELENGTH)
+    if nanometres is None:
+        raise missing(group, _WAVELENGTH)
+    wavelength = check_wavelength(1e-9 * nanometres)
+    surface = object_at(file, f"{_NEW}/SurfaceInWaves/Data")
+    return _surface_map(read_heights(surface, content, np.nan), wavelength, None, "4D")
+
+
+def _surface_map(waves: NDArray[np.float64], wavelength: float, pitch: float | None, suffix: str) -> SurfaceMap:
+    sag = waves * wavelength
     check_heights(sag)
-    return SurfaceMap(sag, wavelength, pitch, "h5", instrument="4Sight")
+    return SurfaceMap(sag, wavelength, pitch, suffix, instrument="4Sight")
 
 
 def _length(group: Any, name: str) -> float:
     """m, of an attribute such as "632.8 nm"."""
     if name not in group.attrs:
-        raise MapFileError(f"{group.name}: the attribute '{name}' is missing")
+        raise missing(group, name)
     text = as_text(np.asarray(group.attrs[name]).ravel()[0])
     number = re.fullmatch(r"(\d+\.?\d*(?:[eE][-+]?\d+)?) (nm|um|mm|m)", text.strip("\0 "))
     if number is None:
