@@ -18,7 +18,7 @@ FOUND = "/**/interferometer:\n  ros__parameters:\n    orientation.rotate_deg: -3
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("2nm", 2e-9), (" 0.5 nm", 5e-10), ("500pm", 5e-10), (".002um", 2e-9), ("12 nm ", 12e-9)]
+    ("text", "value"), [("2nm", 2e-9), (" 0.5 nm", 5e-10), ("500pm", 5e-10), (".002um", 2e-9), ("2,5 nm", 2.5e-9)]
 )
 def test_lengths(text: str, value: float) -> None:
     assert metres(text) == pytest.approx(value)

@@ -65,6 +65,23 @@ def test_a_negative_curvature_is_a_number(words: tuple[str, ...]) -> None:
     assert parsed("focus", *words)["conic"] == (-1.0 if "--conic" in words else 0.0)
 
 
+@pytest.mark.parametrize(
+    ("verb", "words", "values"),
+    [
+        ("focus", ("0,03",), {"curvature": 0.03}),
+        ("focus", ("-0,02", "--conic", "-0,5"), {"curvature": -0.02, "conic": -0.5}),
+        ("focus", ("--conic=−,5", "--", "−1e-2"), {"curvature": -0.01, "conic": -0.5}),
+        ("measure", ("--reference-sphere", "1,25"), {"reference_sphere": 1.25}),
+        ("recipes", ("--curvatures", "0,03", "--conic", "0,5"), {"curvatures": "0,03", "conic": 0.5}),
+        ("report", ("--operator", "1,5"), {"operator": "1,5"}),
+    ],
+)
+def test_a_decimal_comma_is_understood_where_a_number_is_wanted(
+    verb: str, words: tuple[str, ...], values: dict[str, Any]
+) -> None:
+    assert parsed(verb, *words).items() >= values.items()
+
+
 def test_what_is_mistyped_is_guessed_and_wrong_usage_is_2() -> None:
     wrong_verb, wrong_option = (
         CliRunner().invoke(cli.app, words) for words in (["focuss", "1"], ["focus", "--dry-rn"])

@@ -22,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
 from dm_bringup.nodes import NODES
-from dm_bringup.suite import load_config
+from dm_bringup.suite import load_config, save_config
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
@@ -211,6 +211,26 @@ def test_what_is_left_of_the_template_is_named() -> None:
     del config["pdm_driver"]["volts.max"]
     missing = doctor_bench.required_parameters(config)
     assert missing is not None and missing.problem == "pdm_driver lacks volts.max"
+
+
+@pytest.mark.parametrize("wrong", ["to be set", doctor_bench.UNSET])
+def test_wrong_values_are_named_and_nothing_is_tried_with_them(wrong: str, tmp_path: Path) -> None:
+    """The rest of the file is gone through all the same."""
+    changes: dict[str, dict[str, Any]] = {
+        "pdm_driver": {"electronics.kind": "edac40_udp", "electronics.discovery_port": wrong},
+        "interferometer": {"watch_folder": str(tmp_path), "trigger_command": wrong},
+        "calibration": {"calibration_folder": str(tmp_path), "updates.stale_after": wrong},
+    }
+    config = {node: values for node, values in bench(changes).items() if node != "virtual_bench"}
+    save_config(config, tmp_path / "bench.yaml")
+    found = {name: run() for name, run in doctor_bench.bench_checks(tmp_path / "bench.yaml")}
+    named = found["parameters"] or found["values of your own"]
+    assert named is not None
+    for name in ("electronics.discovery_port", "trigger_command", "updates.stale_after"):
+        assert name in named.problem
+    assert "electronics at 127.0.0.1" not in found
+    calibration = found["calibration"]
+    assert calibration is not None and "no calibration of the mirror" in calibration.problem
 
 
 def test_a_port_in_use_is_named() -> None:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 from documentation import ROOT
+from studies.documentation.interfaces import LINE_MAX, wrapped
 
 
 def test_the_interface_page_is_what_the_code_says() -> None:
@@ -16,3 +17,11 @@ def test_the_interface_page_is_what_the_code_says() -> None:
     assert done.returncode == 0, done.stderr
     committed = (ROOT / "docs" / "interfaces.md").read_text()
     assert committed == done.stdout, "./dm exec python -m studies.documentation.interfaces > docs/interfaces.md"
+
+
+def test_long_lines_are_wrapped_but_those_of_tables_and_code() -> None:
+    long = "word " * LINE_MAX
+    kept = f"| {long}|\n\n```console\n{long}\n```\n"
+    assert wrapped(kept) == kept
+    item, after = wrapped(f"* {long}"), wrapped(f"{kept}{long}").removeprefix(kept)
+    assert "\n  word" in item and max(map(len, f"{item}\n{after}".splitlines())) <= LINE_MAX

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 import typer
+from dm_msgs.action import BuildRecipes
 
 from dm_common.optics.zernike import SPOKEN
 from dm_common.recipes import terms_of
+from dm_tools.long_actions import recipe_step
 from dm_tools.verbs.recipes import curvatures_of
 
 
@@ -14,12 +16,21 @@ def test_a_list_or_a_range() -> None:
     assert curvatures_of("-0.02, 0,0.02") == [-0.02, 0.0, 0.02]
     assert curvatures_of("-0.05:0.05:11") == pytest.approx([-0.05 + 0.01 * k for k in range(11)])
     assert 0.0 in curvatures_of("-0.05:0.05:11")
+    assert curvatures_of("-0,05:0,05:11") == curvatures_of("-0.05:0.05:11")
 
 
 @pytest.mark.parametrize("text", ["a", "0:1", "0:1:1", "0:1:x", "0:1:3:4"])
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(typer.BadParameter, match=f"curvatures = {text!r}"):
         curvatures_of(text)
+
+
+def test_progress_names_the_shape_being_worked_on() -> None:
+    terms = [*terms_of("coma sin=50"), *terms_of("astigmatism cos=200")]
+    at = BuildRecipes.Feedback(step=3, recipes=1, curvature=0.02, max_zernike=4e-9)
+    assert recipe_step(at, terms) == "2: +0.0200 1/m with astigmatism cos +200 nm, map 3: largest coefficient 4.0 nm"
+    assert "with coma sin +50 nm, " in recipe_step(at, terms_of("coma sin=50")), "one set for all"
+    assert recipe_step(at) == "2: +0.0200 1/m, map 3: largest coefficient 4.0 nm"
 
 
 def test_added_terms_go_by_the_names_that_measure_prints() -> None:

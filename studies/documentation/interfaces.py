@@ -246,13 +246,17 @@ def interfaces_page() -> str:
             parts += definition(path)
     parts.append(committed(PAGE.read_text()))  # from a run, which takes a minute
     parts.append(commands())
-    text = "\n".join(wrapped(line) for line in "\n".join(parts).splitlines())
+    text = wrapped("\n".join(parts))
     return re.sub(r"\n{3,}", "\n\n", text).rstrip("\n") + "\n"
 
 
-def wrapped(line: str) -> str:
-    """A line of text or of a list as lines that one can read; rows of tables stay whole."""
-    if line.startswith("|") or len(line) <= LINE_MAX:
+def wrapped(text: str) -> str:
+    """Text whose long lines one can read; rows of tables and blocks of code stay as they are."""
+    return re.sub(r"(?ms)^```.*?^```$|^[^\n]+", lambda found: _wrapped(found[0]), text)
+
+
+def _wrapped(line: str) -> str:
+    if line.startswith(("|", "```")) or len(line) <= LINE_MAX:
         return line
     indent = "  " if line.startswith("* ") else ""
     return textwrap.fill(line, LINE_MAX, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)

@@ -52,3 +52,8 @@ def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
     }
     limit = max(parts, key=lambda part: parts[part])
     return f"{text}, absolute to {length(math.hypot(*parts.values()))}, limited by {limit}"
+
+
+def with_point(text: str) -> str:
+    """A number as people write it, with a decimal comma or a typeset minus, as Python reads it."""
+    return text.replace(",", ".").replace("−", "-")

@@ -58,7 +58,9 @@ def test_one_turn_may_be_missed(tracker: HysteresisTracker) -> None:
 
 def test_two_missed_turns_are_noticed(tracker: HysteresisTracker) -> None:
     tracker.observe(report(3.0, C, 4, B))
-    assert "2 turns were not seen" in tracker.unknown
+    assert tracker.unknown == "2 turns were not seen"
+    tracker.observe(report(4.0, A, 6, B))
+    assert tracker.unknown == "a turn was not seen"
 
 
 def test_a_degauss_cures(tracker: HysteresisTracker) -> None:

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import typer
 from typer.core import TyperCommand
 
+from dm_common.figures import with_point
 from dm_tools.output import NotRunningError, fail
 
 #: Module of each verb, in the order of the help text; its function has the verb's name.
@@ -47,8 +48,8 @@ VERBS = {
 CHECKOUT = ("studies", "fault_injection")
 #: Settings of verbs that take more than their own options: `test` hands the rest to pytest.
 SETTINGS = {"test": {"allow_extra_args": True, "ignore_unknown_options": True}}
-#: An argument that is a number below zero, and no option.
-NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+#: A number, which may be below zero and no option for that, or have a decimal comma.
+NUMBER = re.compile(r"[-−]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
 #: Exit codes, as the help says them.
 REFUSED, NOT_RUNNING, INTERRUPTED = 1, 3, 130
 EXIT_CODES = f"""Exit codes: 0 done; {REFUSED} refused or failed, with the reason on standard error; 2 wrong usage;
@@ -56,15 +57,28 @@ EXIT_CODES = f"""Exit codes: 0 done; {REFUSED} refused or failed, with the reaso
 
 
 class Command(TyperCommand):
-    """A verb that takes `-0.02` for the number it is."""
+    """A verb that takes `-0.02` and `0,02` for the numbers they are."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the first negative number that is no option's value behind `--`, where nothing is an option."""
-        valued = {name for option in self.params if not getattr(option, "is_flag", True) for name in option.opts}
+        """Write numbers as Python does, and put the first negative argument behind `--`, where nothing is an option.
+
+        Values of options that are no numbers, such as lists with commas, stay as they are.
+        """
+        hints = get_type_hints(self.callback) if self.callback else {}
+        valued = {
+            name: float in (hints.get(str(option.name)), *get_args(hints.get(str(option.name))))
+            for option in self.params
+            if not getattr(option, "is_flag", True)
+            for name in option.opts
+        }
+        for place, word in enumerate(args):
+            option, equals, value = word.rpartition("=")
+            if NUMBER.fullmatch(value) and valued.get(option or args[place - 1], not option):
+                args = [*args[:place], option + equals + with_point(value), *args[place + 1 :]]
         for place, word in enumerate(args):
             if word == "--":
                 break
-            if NEGATIVE.fullmatch(word) and (place == 0 or args[place - 1] not in valued):
+            if word.startswith("-") and NUMBER.fullmatch(word) and (place == 0 or args[place - 1] not in valued):
                 args = [*args[:place], *args[place + 1 :], "--", word]
                 break
         return super().parse_args(ctx, args)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 from rclpy.node import Node
@@ -14,6 +16,8 @@ from rclpy.qos import qos_profile_action_status_default
 from rclpy.task import Future
 
 from dm_common.figures import in_nanometres
+from dm_common.optics.zernike import SPOKEN
+from dm_common.recipes import shape_text
 from dm_common.ros import qos
 
 #: Those that keep mirror or interferometer busy for long; a move gives way to the next one.
@@ -141,7 +145,14 @@ def converge_step(feedback: Any) -> str:
     return f"map {feedback.step}: largest coefficient {feedback.max_zernike * 1e9:.1f} nm"
 
 
-def recipe_step(feedback: Any) -> str:
-    """Feedback of the action `build_recipes`: number in the list, curvature, the map and how far off it was."""
-    which = f"{feedback.recipes + 1}: {feedback.curvature:+.4f} 1/m, " if feedback.step else ""
-    return which + converge_step(feedback)
+def recipe_step(feedback: Any, zernike: Sequence[float] = ()) -> str:
+    """Feedback of the action `build_recipes`: number in the list, shape, the map and how far off it was.
+
+    Args:
+        zernike: of the goal; () = of somebody else's, which is not known.
+    """
+    if not feedback.step:
+        return converge_step(feedback)
+    begin = len(SPOKEN) * feedback.recipes if len(zernike) > len(SPOKEN) else 0  # one set for all, or one for each
+    shape = SimpleNamespace(curvature=feedback.curvature, zernike=zernike[begin : begin + len(SPOKEN)])
+    return f"{feedback.recipes + 1}: {shape_text(shape)}, {converge_step(feedback)}"

@@ -160,8 +160,8 @@ def _hysteresis_plan(mirror: Mirror, options: PlanOptions) -> Plan:
         zip(part.signals, part.dwell, part.settle_share, part.check, np.arange(len(part.check)) == 0, strict=True)
         for part in parts
     )
-    for k, (signals, dwell, share, check, first) in enumerate(chain.from_iterable(rows)):
-        if first and k:
+    for k, (signals, dwell, share, check, begins) in enumerate(chain.from_iterable(rows)):
+        if begins and k:
             ends.add(len(steps))
         kind = StepKind.CHECK if check else StepKind.EXCITATION
         steps.append(Step(f"{kind.value} {k + 1}", kind, signals, dwell=float(dwell), settle_share=float(share)))

@@ -108,7 +108,8 @@ class HysteresisTracker:
             self._guess_keeping_creep(report, "writes were lost, or a degauss was left")
             return
         if report.turns > last.turns + 1:
-            self._guess_keeping_creep(report, f"{report.turns - last.turns - 1} turns were not seen")
+            missed = report.turns - last.turns - 1
+            self._guess_keeping_creep(report, f"{missed} turns were not seen" if missed > 1 else "a turn was not seen")
             return
         self._follow(report, last)
 

@@ -113,7 +113,7 @@ async def build_recipes(session: Session, goal: BuildRecipes.Goal) -> str:
 
     def show(feedback: Any) -> None:
         session.progress.step, session.progress.steps = feedback.recipes, len(goal.curvatures)
-        session.progress.text = recipe_step(feedback)
+        session.progress.text = recipe_step(feedback, goal.zernike)
 
     result = await session.ros.run("build_recipes", goal, show)
     session.base = None

@@ -12,6 +12,7 @@ from dm_msgs.msg import ActuatorState, Calibration, FocusRequest
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
+from dm_common.figures import with_point
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 from dm_common.recipes import terms_text
 
@@ -229,7 +230,7 @@ def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: fl
 def decimal(text: str | None) -> float | None:
     """The number in `text`, whose decimal sign may be a comma; None = there is none."""
     try:
-        value = float((text or "").strip().replace(",", ".").replace("−", "-"))
+        value = float(with_point(text or ""))
     except ValueError:
         return None
     return value if math.isfinite(value) else None

@@ -40,29 +40,39 @@ def bench_checks(file: Path) -> Iterator[Check]:
     for node in nodes_of(config):
         if node.configuring:
             yield f"configuration of {node.name}", partial(node_configuration, config, node)
+    # Wrong values are reported already: what is tried goes by the others.
+    sound = {node: _sound(node, values) for node, values in config.items()}
+    driver = sound.get("pdm_driver", {})
     if "virtual_bench" in config:
-        yield "ports of the virtual bench", lambda: free_ports(config["virtual_bench"])
+        yield "ports of the virtual bench", lambda: free_ports(sound["virtual_bench"])
     else:
-        yield from _electronics(config.get("pdm_driver", {}))
-    watched = _folder_of(config, "interferometer", "watch_folder")
+        yield from _electronics(driver)
+    watched = _folder_of(sound, "interferometer", "watch_folder")
     if watched is not None:
-        writes = "{path}" in " ".join(map(str, config["interferometer"].get("trigger_command", [])))
+        writes = "{path}" in " ".join(sound["interferometer"].get("trigger_command", []))
         made = "virtual_bench" in config
         yield f"watched folder {watched}", lambda: watched_folder(watched, writes, made)
-    store = _folder_of(config, "calibration", "calibration_folder")
+    store = _folder_of(sound, "calibration", "calibration_folder")
     if store is not None:
-        serial = str(config.get("pdm_driver", {}).get("mirror.serial", ""))
         yield f"calibration folder {store}", lambda: writable_folder(store)
-        own = {"calibration": config["calibration"]}
-        # Wrong values are reported already.
-        values = effective("calibration", {} if parameters(own) else own["calibration"])
-        if serial != UNSET:
+        values = effective("calibration", sound["calibration"])
+        if serial := driver.get("mirror.serial"):
             yield "calibration", lambda: stored_calibration(store, serial, values["updates.stale_after"])
 
 
+def _sound(node: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of a node's values that are given and allowed."""
+    known = _known(node)
+    return {
+        name: value
+        for name, value in values.items()
+        if name in known and value != UNSET and not _wrong(known[name], value)
+    }
+
+
 def _folder_of(config: Config, node: str, name: str) -> Path | None:
-    text = str(config.get(node, {}).get(name, ""))
-    if not text or text == UNSET:
+    text = config.get(node, {}).get(name, "")
+    if not text:
         return None
     try:
         return Path(text).expanduser()
@@ -134,15 +144,15 @@ def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
 
 
 def _electronics(driver: Mapping[str, Any]) -> Iterator[Check]:
-    kind, address = driver.get("electronics.kind"), str(driver.get("electronics.address", ""))
+    kind, address = driver.get("electronics.kind"), driver.get("electronics.address", "")
     port = driver.get("electronics.port", 1234)
-    if kind == "edac40_tcp" and address and address != UNSET:
+    if kind == "edac40_tcp" and address:
         yield f"electronics at {address}:{port}", lambda: tcp(address, port)
     discovery = driver.get("electronics.discovery_port", 0)
-    if kind == "edac40_udp" and address and address != UNSET and discovery:
+    if kind == "edac40_udp" and address and discovery:
         yield f"electronics at {address}", lambda: answers_discovery(address, discovery)
-    device = str(driver.get("electronics.serial_port", ""))
-    if kind in ("usb_dac40", "framed_serial") and device and device != UNSET:
+    device = driver.get("electronics.serial_port", "")
+    if kind in ("usb_dac40", "framed_serial") and device:
         yield f"serial port {device}", lambda: serial_port(Path(device).expanduser())
 
 
@@ -208,7 +218,7 @@ def free_ports(bench: Mapping[str, Any]) -> Finding | None:
         ("trigger.port", socket.SOCK_STREAM),
     ):
         port = values[name]
-        if not isinstance(port, int) or not 0 < port <= 65535:
+        if port <= 0:
             continue
         with socket.socket(socket.AF_INET, kind) as probe:
             if kind == socket.SOCK_STREAM:

@@ -45,8 +45,8 @@ def play(
     progress: Callable[[float], None] = lambda seconds: None,
     remark: Callable[[str], None] = lambda text: None,
     discovery_s: float = DISCOVERY_S,
-) -> int:
-    """Publish the topics `names` of the recording; returns the number of messages.
+) -> dict[str, int]:
+    """Publish the topics `names` of the recording; returns the number of messages of each that was published.
 
     Left out are topics whose type had another layout when they were recorded: its bytes would be read as nonsense.
 
@@ -74,17 +74,17 @@ def play(
         for topic in [bag.topics[name] for name in names if _has_changed(node, bag.topics[name])]:
             node.destroy_publisher(publishers.pop(topic.name))
             remark(f"{topic.name} is left out: {topic.type_name} had another layout when it was recorded")
-        begun, first, count = time.monotonic(), None, 0
+        begun, first, counts = time.monotonic(), None, dict.fromkeys(publishers, 0)
         for message in bag.read(list(publishers)):
             first = message.log_time if first is None else first
             elapsed = 1e-9 * (message.log_time - first)
             time.sleep(max(0.0, begun + elapsed / rate - time.monotonic()))
             publishers[message.topic.name].publish(message.data)
-            count += 1
+            counts[message.topic.name] += 1
             progress(elapsed)
         for publisher in publishers.values():  # or the last messages would leave with their publisher
             publisher.wait_for_all_acked()
-        return count
+        return counts
     finally:
         node.destroy_node()
         context.try_shutdown()

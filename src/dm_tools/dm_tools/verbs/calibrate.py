@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_common.figures import in_nanometres
+from dm_common.figures import in_nanometres, with_point
 from dm_tools.output import (
     JsonOption,
     NamespaceOption,
@@ -71,7 +71,7 @@ def metres(text: str) -> float:
     Raises:
         typer.BadParameter: another form, 0, or a unit that is none of a surface.
     """
-    found = re.fullmatch(r"\s*(\d+|\d*\.\d+)\s*(pm|nm|um)\s*", text)
+    found = re.fullmatch(r"\s*(\d+|\d*\.\d+)\s*(pm|nm|um)\s*", with_point(text))
     if found is None or float(found[1]) == 0.0:
         raise typer.BadParameter(f"--until {text!r}: must be a number above 0 with pm, nm or um, such as 2nm")
     return float(found[1]) * {"pm": 1e-12, "nm": 1e-9, "um": 1e-6}[found[2]]

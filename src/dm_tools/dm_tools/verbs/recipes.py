@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_common.figures import with_point
 from dm_tools.output import (
     JsonOption,
     NamespaceOption,
@@ -28,7 +29,7 @@ def curvatures_of(text: str) -> list[float]:
     Raises:
         typer.BadParameter: naming what is not a number.
     """
-    parts = text.split(":")
+    parts = (with_point(text) if ":" in text else text).split(":")
     try:
         if len(parts) == 1:
             return [float(part) for part in text.split(",") if part.strip()]
@@ -49,7 +50,8 @@ def _build(client: Any, curvatures: list[float], conic: float, zernike: list[flo
         task = progress.add_task("recipes", total=len(curvatures))
 
         def show(feedback: Any) -> None:
-            progress.update(task, completed=feedback.recipes, description=f"recipe {recipe_step(feedback)}")
+            text = recipe_step(feedback, zernike)
+            progress.update(task, completed=feedback.recipes, description=f"recipe {text}")
 
         result = client.build_recipes(curvatures, conic, zernike, on_feedback=show, **options)
         progress.update(task, completed=len(curvatures), description="recipes: done")

@@ -44,15 +44,17 @@ def replay(
     console.print(f"{bag.messages} messages of {bag.duration_s:.1f} s; publishing {', '.join(sorted(names))}")
     with progress_bar() as bar:
         task = bar.add_task("replay, s", total=round(bag.duration_s))
-        count = play(
+        counts = play(
             bag,
             names,
             rate,
             progress=lambda seconds: bar.update(task, completed=round(seconds)),
             remark=lambda text: console.print(f"[yellow]remark[/] {text}"),
         )
+    count, left_out = sum(counts.values()), sorted(set(names) - counts.keys())
     console.print(f"{count} messages published")
-    write_json(json, {"recording": str(bag.file), "messages": count, "topics": sorted(names)})
+    figures = {"recording": str(bag.file), "messages": count, "topics": sorted(counts), "left_out": left_out}
+    write_json(json, figures)
 
 
 def _again(bag: Any, run: int, namespace: str, store: Path | None, config: Path | None) -> dict[str, Any]:
