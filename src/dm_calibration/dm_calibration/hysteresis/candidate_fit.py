@@ -11,12 +11,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dm_calibration.hysteresis.features import crept, fading_feature, play_features
+from dm_calibration.hysteresis.features import PER_ELEMENT, creep_states, fading_feature, play_features
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of, without
 from dm_common.hysteresis.duhem import DuhemOperator
@@ -134,6 +135,16 @@ class Run:
         """`moved` of the maps of a part."""
         return None if self.moved is None else self.moved[part]
 
+    @cached_property
+    def followed(self) -> Floats:
+        """(M, J, M) what each creep element has followed at each map of what stood at all; parts begin rested."""
+        each = np.eye(len(self.time))
+        states = [
+            np.array(list(creep_states(each[part], self.time[part], start, self.moved_in(part))))
+            for part, start in zip(self.parts, self.starts, strict=True)
+        ]
+        return np.concatenate(states)
+
 
 @dataclass(frozen=True, eq=False)
 class LawFit:
@@ -157,9 +168,7 @@ class CandidateProblem:
         self.run, self.candidate = run, candidate
         self.radius = candidate.radius
         self._parts, self._starts = run.parts, run.starts
-        # (M, M): what creep adds at each map per unit of creep rate is linear in what stood at all; parts begin rested.
-        each = np.eye(len(run.time))
-        self._creep = self._in_parts(lambda part, start: crept(each[part], run.time[part], start, run.moved_in(part)))
+        self._creep = PER_ELEMENT * run.followed.sum(axis=1)  # (M, M) per unit of creep rate
         self._plays = self._in_parts(
             lambda part, start: play_features(run.signals[part], self.radius, candidate.powers)
         )

@@ -186,11 +186,16 @@ def weights_of(features: Floats, left: Floats, gains: Floats, prior: Floats, bet
     `between` (N, N) over actuators times `prior` (F, F) over features.
     """
     count, actuators = features.shape[1:]
-    flat = features.transpose(0, 2, 1).reshape(len(features), -1)
-    normal = (flat.T @ flat).reshape(actuators, count, actuators, count)
-    normal *= (gains @ gains.T)[:, None, :, None]
-    normal += between[:, None, :, None] * prior[:, None, :]
+    by_actuator = np.ascontiguousarray(features.transpose(2, 1, 0)).reshape(actuators * count, -1)
+    seen = gains @ gains.T
+    normal = np.empty((actuators * count, actuators * count))
+    for number in range(actuators):  # the lower triangle alone, block by block: it is symmetric
+        rows, end = slice(number * count, (number + 1) * count), (number + 1) * count
+        block = (by_actuator[rows] @ by_actuator[:end].T).reshape(count, -1, count)
+        block *= seen[number, : number + 1, None]
+        block += between[number, : number + 1, None] * prior[:, None, :]
+        normal[rows, :end] = block.reshape(count, end)
     right = np.einsum("mfn,mn->nf", features, left @ gains.T)
-    # In the order in which LAPACK can overwrite it: its transpose, since it is symmetric.
-    factor = cho_factor(normal.reshape(len(flat.T), -1).T, overwrite_a=True, check_finite=False)
+    # In the order in which LAPACK can overwrite it: transposed, the upper triangle is there.
+    factor = cho_factor(normal.T, overwrite_a=True, check_finite=False)
     return np.asarray(cho_solve(factor, right.ravel()).reshape(actuators, count).T)
