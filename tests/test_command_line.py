@@ -99,6 +99,7 @@ def test_options_have_types_that_an_older_typer_knows() -> None:
     hints = get_type_hints(cli.verb(example), include_extras=True)
     assert hints["number"] is float
     assert get_origin(hints["folder"].__origin__) is Union
+    assert not isinstance(cli._options.__annotations__["version"], str), "it reads annotations as they stand"
 
 
 def test_a_sourced_workspace_has_it_on_its_path() -> None:

@@ -58,7 +58,7 @@ LINE_MAX = 130
 DUTIES = {
     "virtual_bench": "the simulation: mirror with hysteresis and creep, electronics, interferometer, camera",
     "pdm_driver": "signals in, frames of the drive unit out; a safety limiter in front of every write",
-    "interferometer": "reads `.dat`, `.datx`, `.asc`, `.xyz`; fits 21 Zernike terms over all pixels",
+    "interferometer": "reads [map files](map-files.md) and a sensor; fits 21 Zernike terms over all pixels",
     "calibration": "measures influence function, hysteresis and creep, checks the wiring, follows later maps",
     "focus_controller": "curvature, conic constant and Zernike terms in, commands out: bounded least squares, then the "
     "inverse of hysteresis and creep",

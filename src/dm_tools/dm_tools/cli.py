@@ -125,7 +125,7 @@ def make_app() -> typer.Typer:
         rich_markup_mode="markdown" if sys.stderr.isatty() else None,  # frames are for screens
         pretty_exceptions_enable=False,
     )
-    app.callback()(_options)
+    app.callback()(verb(_options))
     for name, module in VERBS.items():
         try:
             function = getattr(importlib.import_module(module), name)

@@ -129,7 +129,10 @@ _DECLARED = (
     NodeInterface(
         "dm_client_*",
         "cli",
-        subscribe=("actuator_state", "calibration", "capabilities", "mirror_info", "surface_map", "surface_map_info"),
+        subscribe=(
+            *(*_HEALTH, "actuator_state", "calibration", "capabilities"),
+            *("mirror_info", "surface_map", "surface_map_info"),
+        ),
         request=(*_OPERATION, "ingest_file", "update_calibration"),
         call=_LONG_OPERATION,
     ),
