@@ -54,9 +54,10 @@ def check(
             console.print(f"[red]the map disagrees with the calibration[/]: {response.message}", soft_wrap=True)
         elif without:
             console.print(response.message, soft_wrap=True)
+    maps = f"{response.revision} map{'' if response.revision == 1 else 's'}"
     console.print(
-        f"since the calibration was made: {response.revision} map{'' if response.revision == 1 else 's'} taken in, "
-        f"gains changed by up to {response.gain_drift:.2%}, the figure by {nanometres(response.offset_drift):.2f} nm rms"
+        f"since the calibration was made: {maps} taken in, gains changed by up to {response.gain_drift:.2%}, the "
+        f"figure by {nanometres(response.offset_drift):.2f} nm rms"
     )
     write_json(json, {"check": figures_of(response) | {"promised_nm": nanometres(promised)}})
     if not (response.accepted or forget):
