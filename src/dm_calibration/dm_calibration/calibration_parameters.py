@@ -100,7 +100,8 @@ PARAMETERS = (
     Parameter(
         "hysteresis_allowance",
         real(0.10, 0.0, 1.0),
-        "Share of their moves by which actuators may miss their mark (hysteresis) without the map being an outlier.",
+        "Share of their moves by which actuators may miss their mark (hysteresis) without the map being an outlier; "
+        "0 = they have none, and moves without a law of it are promised what held-out maps show.",
         live=True,
     ),
     Parameter("dead_sigmas", real(3.0, 0.0, 1e3), "Dead below this many standard errors.", live=True),

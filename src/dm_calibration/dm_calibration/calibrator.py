@@ -185,7 +185,7 @@ def fit_effective(
         As :func:`~dm_calibration.influence.fit.fit_influence`.
     """
     if hysteresis is None:
-        return fit_influence(maps, options, rings=mirror.rings, exclude=exclude)
+        return fit_influence(maps, options, rings=mirror.rings, limits=mirror.limits, exclude=exclude)
     fit = fit_influence(effective_maps(maps, hysteresis.law), options, rings=mirror.rings, exclude=exclude)
     return replace(fit, signal_min=float(maps.applied.min()), signal_max=float(maps.applied.max()))
 

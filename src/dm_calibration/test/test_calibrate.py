@@ -17,11 +17,13 @@ from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import MeasurementError
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints
+from hysteretic_mirror import MIRROR, lagging_bench
 from linear_mirror import RADIUS, LinearMirror, make_mirror
 from map_fixtures import NO_DATA, dat_bytes
 
@@ -75,6 +77,22 @@ def test_a_folder_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert all(len(digest) == 64 for digest in calibration.maps.sha256)
     true = plant.fit_terms(plant.influence.T).T
     np.testing.assert_allclose(calibration.fit.influence_zernike[3:], true[3:], atol=0.01 * np.abs(true).max())
+
+
+def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
+    """A poke shows the loop of one actuator; in a sphere all of them err alike."""
+    bench = lagging_bench()
+    calibration = calibrate(Procedure(make_plan(PlanKind.POKES, MIRROR), MIRROR, bench).run(), mirror=MIRROR)
+    fit = calibration.fit
+    assert "no law follows it: the error allows for" in " ".join(calibration.limitations)
+    sphere = np.linalg.pinv(fit.influence_zernike[3:])[:, 0]
+    errors = []
+    for level in np.random.default_rng(5).uniform(-1.0, 1.0, 40):
+        signals = bench.apply(level * sphere / np.abs(sphere).max())
+        seen = bench.measure("sphere").coefficients - fit.zernike_offset - fit.influence_zernike @ signals
+        errors.append(np.abs(seen[3:]).max())
+    bound = fit.held_out_max_zernike
+    assert np.mean(np.array(errors) <= bound) >= 0.95 and 0.2 * bound < max(errors)
 
 
 def test_arrays_of_commands_times_and_maps(

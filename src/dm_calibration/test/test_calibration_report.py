@@ -126,7 +126,7 @@ def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibra
     assert "absolute not known (instrument_error and scale_error of the interferometer not given)" in text
     known = replace(calibration, reference_surface="flat.dat, SHA-256 01", instrument_error=5e-9, scale_error=1e-4)
     absolute = one_html("", [certificate(known, {})])
-    assert "flat.dat, SHA-256 01" in absolute and "nm (λ/" in absolute.partition("absolute to ")[2][:20]
+    assert "flat.dat, SHA-256 01" in absolute and " nm (" in absolute.partition("absolute to ")[2][:20]
     dead = replace(calibration.fit, grades=np.array([2] + [0] * 36, dtype=np.uint8))
     assert "actuators 1 are dead" in doubts(replace(calibration, fit=dead))[0]
     assert people(tmp_path / "none.json") == {}

@@ -28,6 +28,7 @@ from dm_calibration.influence.regression import (
     usable_sag,
 )
 from dm_calibration.influence.weights import check_epsilon
+from dm_common.limits import Limits
 from dm_common.names import unknown_name
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import SamplePoints
@@ -91,7 +92,7 @@ class InfluenceFit:
         in_sample_rms: rms sag over all maps used, m.
         held_out_rms: the same for maps predicted from a fit that has not seen them, m.
         held_out_max_zernike: 95th percentile over held-out maps of the largest coefficient error without piston and
-            tilt, m.
+            tilt, m; with what all actuators may miss together where the maps show hysteresis and no law follows it.
         condition_number: of influence_zernike without piston (and without tilt when the maps do not show it).
         response: (N,) rms sag of a unit signal, m.
         standard_error: (N,) of the response, m.
@@ -133,12 +134,14 @@ def fit_influence(
     options: FitOptions | None = None,
     *,
     rings: NDArray[np.int64] | None = None,
+    limits: Limits | None = None,
     exclude: Collection[str] = (),
 ) -> InfluenceFit:
     """Fit the influence function to `maps`.
 
     Args:
         rings: (N,) ring of each actuator, for the grades; None = all are compared with each other.
+        limits: of the signals, where hysteresis is not followed: the error allows for it; None = it does not.
         exclude: labels of maps to leave out.
 
     Raises:
@@ -195,7 +198,7 @@ def fit_influence(
             f"More than {screening.DROPPED_MAX:.0%} of the maps look like outliers; not all of them were "
             "dropped. Doubt this calibration."
         )
-    return _judge(maps, options, rings, reasons, good, design, fitted, responses, remarks)
+    return _judge(maps, options, rings, limits, reasons, good, design, fitted, responses, remarks)
 
 
 def _fit_good(maps: MapSet, sag: Floats, reasons: list[str]) -> tuple[MapSet, Design, Regression, Floats]:
@@ -217,6 +220,7 @@ def _judge(
     maps: MapSet,
     options: FitOptions,
     rings: NDArray[np.int64] | None,
+    limits: Limits | None,
     reasons: list[str],
     good: MapSet,
     design: Design,
@@ -244,8 +248,12 @@ def _judge(
     in_sample = rms(residual[:, terms:], weight)
     map_residual = np.full(len(maps), np.nan)
     map_residual[used] = in_sample
-    worst_term = np.abs(held_out[tested, PISTON_TILT:terms]).max(axis=1, initial=0.0)
-
+    error = float(np.percentile(np.abs(held_out[tested, PISTON_TILT:terms]).max(axis=1, initial=0.0), 95.0))
+    if limits is not None:
+        moved = good.applied @ coefficients[:, terms:]
+        share = quality.loop_share(held_out[:, terms:], moved, weight, tested, options.hysteresis_allowance)
+        error, more = quality.with_loops(error, share, coefficients[:, :terms].T, limits)
+        remarks += more
     tilt = coefficients[:, 1:PISTON_TILT]
     tilt_error = np.sqrt(np.diag(covariance)[:, None] * variance[1:PISTON_TILT])
     tilt_known = bool(np.all(np.linalg.norm(tilt, axis=0) > 3.0 * np.linalg.norm(tilt_error, axis=0)))
@@ -275,7 +283,7 @@ def _judge(
         map_residual=map_residual,
         in_sample_rms=float(np.sqrt(np.mean(np.square(in_sample)))),
         held_out_rms=float(np.sqrt(np.mean(np.square(rms(held_out[tested, terms:], weight))))),
-        held_out_max_zernike=float(np.percentile(worst_term, 95.0)),
+        held_out_max_zernike=error,
         condition_number=quality.condition_number(coefficients[:, :terms].T, tilt_known),
         response=response,
         standard_error=standard_error,

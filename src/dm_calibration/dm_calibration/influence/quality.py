@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import EXCITATION, MapSet
 from dm_calibration.influence.regression import Design
-from dm_common.optics.zernike import TERM_RMS
+from dm_common.limits import Limits
+from dm_common.optics.piston_tilt import rms
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
 Floats = NDArray[np.float64]
 
@@ -19,6 +21,13 @@ DEAD_SHARE = 0.02
 #: An actuator is uncertain when its relative error is so many times that of the others: an error that all share, as
 #: hysteresis makes it in pokes, says nothing of one of them.
 STANDS_OUT = 2.0
+
+#: Maps show hysteresis that no law describes from this share of their moves on; what is less may be noise.
+LOOPS_SHOW = 0.01
+#: Moves in use go up to twice as far as those of pokes, and loops widen with the way, ...
+LOOPS_WIDEN = 2.0
+#: ... but not beyond this, in what single actuators are allowed to miss: together they err alike.
+LOOPS_WIDEST = 1.5
 
 # Values of dm_msgs/Calibration.actuator_grade.
 GRADE_GOOD = 0
@@ -112,6 +121,43 @@ def held_out_residual(
         inflation[left_out] = np.where(beyond, np.inf, inflation[left_out])
     tested = inflation <= EXTRAPOLATION_MAX
     return residual, tested if tested.any() else fold >= 0
+
+
+def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.bool_], allowance: float) -> float:
+    """Share of a move over the range by which hysteresis may make it miss where no law describes it.
+
+    One poke shows its own actuator's loop only, so what is left of held-out pokes says less than what all actuators
+    miss together. A map counts by what it misses the way of its move, against the largest move up to then, which may
+    have left a remanence.
+
+    Args:
+        left, moved: (M, P) m, sag of the held-out residuals, and that the signals make.
+        weight: (P,) of the points.
+        tested: (M,) which maps count.
+        allowance: share of an actuator's move by which it may miss.
+    """
+    size = np.maximum(rms(moved, weight), np.finfo(float).tiny)
+    along = np.abs((left[tested] * moved[tested]) @ weight) / (size * np.maximum.accumulate(size))[tested]
+    shown = float(np.percentile(along, 95.0))
+    return min(LOOPS_WIDEN * shown, LOOPS_WIDEST * allowance) if shown > LOOPS_SHOW else 0.0
+
+
+def with_loops(error: float, share: float, influence_zernike: Floats, limits: Limits) -> tuple[float, list[str]]:
+    """`error` (m) with what `share` of a move makes of the largest sphere inside `limits`, and that in a sentence.
+
+    Args:
+        influence_zernike: (K, N).
+    """
+    signals: Floats = np.asarray(np.linalg.pinv(influence_zernike[PISTON_TILT:])[:, 0], np.float64)  # a unit of defocus
+    used = np.abs(signals).max() / limits.half_range
+    apart = limits.differences(signals).max(initial=0.0) / limits.neighbour_difference
+    if not (share and used):
+        return error, []
+    beyond = float(share / max(used, apart))
+    return error + beyond, [
+        f"The maps show hysteresis, and no law follows it: the error allows for {share:.1%} of a move over the whole "
+        f"range ({beyond * 1e9:.0f} nm) beside the {error * 1e9:.0f} nm of held-out maps."
+    ]
 
 
 def condition_number(influence_zernike: Floats, tilt_known: bool) -> float:
