@@ -62,7 +62,8 @@ class Value:
         if math.isinf(self.low) and math.isinf(self.high):
             return f"a finite {kind}" if self.item is float else f"a {kind}"
         zero = f", or 0 ({self.zero})" if self.zero else ""
-        return f"{kind}, {self.low:g} to {self.high:g}{' ' + self.unit if self.unit else ''}{zero}"
+        low, high = (f"{limit:{'g' if self.item is float else '.10g'}}" for limit in (self.low, self.high))
+        return f"{kind}, {low} to {high}{' ' + self.unit if self.unit else ''}{zero}"
 
     def check(self, name: str, given: Any) -> None:
         """Raise unless `given` may be the value of `name`; the sentence names both, and what is allowed.

@@ -51,6 +51,7 @@ def run_boresight(
         DeformableMirrorError: it does not move less than before: the axis is as it was.
     """
     from dm_autofocus import CameraFocusClient
+    from dm_calibration.influence.poke_cure import parameter_text
     from dm_client import DeformableMirrorError
 
     part = region_of(region)
@@ -93,7 +94,7 @@ def run_boresight(
         )
     figures = {"optical_axis_m": axis.tolist(), "moved_before_px": before, "moved_px": after, "sigma_px": sigma}
     write_json(json, {"boresight": figures | cost})
-    parameters = f"/**/focus_controller:\n  ros__parameters:\n    optical_axis: [{axis[0]:.6f}, {axis[1]:.6f}]\n"
+    parameters = parameter_text({"focus_controller": {"optical_axis": axis.round(6).tolist()}})
     if write is not None and source is not None:
         write_parameters(parameters, write, source)
     else:

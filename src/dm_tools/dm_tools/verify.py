@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_autofocus.images import pixels_of
 from dm_calibration.optics.map_fit import MapFitter
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.target import FocusTarget
@@ -29,11 +30,8 @@ class SurfaceError:
 
 
 def map_of(image: Any) -> NDArray[np.float32]:
-    """The sag (H, W) [m] of a sensor_msgs/Image of encoding 32FC1."""
-    if image.encoding != "32FC1":
-        raise ValueError(f"encoding = {image.encoding!r}: a surface map is 32FC1")
-    order = ">f4" if image.is_bigendian else "<f4"
-    return np.frombuffer(image.data, dtype=order).reshape(image.height, image.step // 4)[:, : image.width]
+    """The sag (H, W) [m] of a sensor_msgs/Image. Raises ImageError (a ValueError) when it contradicts itself."""
+    return pixels_of(image)[..., 0]
 
 
 def surface_error(sag: NDArray[np.floating[Any]], info: Any, target: FocusTarget) -> SurfaceError:

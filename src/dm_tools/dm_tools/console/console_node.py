@@ -15,7 +15,6 @@ from action_msgs.srv import CancelGoal
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from dm_msgs.msg import ActuatorEstimate, SurfaceMapInfo, ZernikeCoefficients
 from rcl_interfaces.msg import Log
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import Image
@@ -97,7 +96,9 @@ class ConsoleNode:
         self.node = self._connection.node
         self.log: deque[tuple[str, str, str, str]] = deque(maxlen=LOG_LINES)
         self.lines_logged = 0
-        hear_log(self.node, LOG_LINES, self.take_log)
+        # Nodes offer their latest lines to those who come late.
+        profile = QoSProfile(depth=LOG_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(Log, "/rosout", self._take_line, profile)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.STATE)
         self.watched = {name: ExternalGoals(self.node, INTERFACES[name], name) for name in LONG}
         self._connection.start()
@@ -117,6 +118,9 @@ class ConsoleNode:
         for status in message.status:
             self._diagnostics[status.name] = status
             self._heard[status.name] = time.monotonic()
+
+    def _take_line(self, line: Log) -> None:
+        self.take_log(seconds(line.stamp), LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg)
 
     def take_log(self, time_s: float, level: str, logger: str, message: str) -> None:
         """Keep a line of the log."""
@@ -241,17 +245,3 @@ async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[
             return False
         await asyncio.sleep(0.02)
     return True
-
-
-def hear_log(node: Node, keep: int, take: Callable[[float, str, str, str], None]) -> None:
-    """Call `take(time, level, logger, message)` for every line on `/rosout`, the last `keep` of before among them.
-
-    The time is ROS time, s.
-    """
-
-    def on_log(line: Log) -> None:
-        take(seconds(line.stamp), LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg)
-
-    # Nodes offer their latest lines to those who come late.
-    profile = QoSProfile(depth=keep, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(Log, "/rosout", on_log, profile)

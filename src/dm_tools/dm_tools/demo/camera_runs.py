@@ -18,6 +18,8 @@ if TYPE_CHECKING:  # slow to import, and `dm --help` does not need it
 
 #: How fast the nearest object comes nearer [m/s] until it is so far away [m].
 SPEED, NEAREST = 0.7, 4.5
+#: Time for the mirror to settle before an image is looked at, s.
+SETTLE_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def image_now(client: CameraFocusClient, recorder: Recorder) -> NDArray[np.uint8
     return grey(recorder.newest).copy()
 
 
-def focus_on(client: CameraFocusClient, recorder: Recorder, item: Focused, settle: float = 0.3) -> None:
+def focus_on(client: CameraFocusClient, recorder: Recorder, item: Focused) -> None:
     """Search on one object, then focus it by its distance alone for comparison."""
     from dm_autofocus.sharpness import cut, tenengrad
 
@@ -132,12 +134,12 @@ def focus_on(client: CameraFocusClient, recorder: Recorder, item: Focused, settl
             item.region, on_feedback=lambda f: progress.update(task, total=f.steps, completed=f.step)
         )
         progress.update(task, total=item.result.images, completed=item.result.images)
-    time.sleep(settle)
+    time.sleep(SETTLE_S)
     image = image_now(client, recorder)
     item.shots = list(recorder.shots)
     item.final = Shot(image, item.result.curvature, tenengrad(cut(image, item.region)))
     client.focus_distance(item.distance)
-    time.sleep(settle)
+    time.sleep(SETTLE_S)
     item.by_distance = tenengrad(cut(image_now(client, recorder), item.region))
 
 
@@ -165,7 +167,7 @@ def follow(client: CameraFocusClient, recorder: Recorder, region: tuple[float, f
     with console.status(f"the nearest object comes nearer by {SPEED:g} m/s"):
         client.track((DISTANCES[0] - NEAREST) / SPEED, region, on_feedback=move)
         bench.set_parameters([Parameter("camera.distances", value=list(DISTANCES))])
-        time.sleep(0.3)
+        time.sleep(SETTLE_S)
     return approach
 
 

@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import yaml
@@ -45,6 +44,17 @@ class Topic:
     type_name: str
     qos: Sequence[Mapping[str, Any]]
     type_hash: str = ""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Without anchors for what stands there twice, which no reader of recordings expects."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _as_yaml(value: Any) -> str:
+    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False))
 
 
 class BagWriter:
@@ -89,7 +99,7 @@ class BagWriter:
             self._schemas[topic.type_name] = self._writer.register_schema(
                 topic.type_name, SchemaEncoding.ROS2, definition.encode()
             )
-        metadata = {QOS_KEY: yaml.safe_dump(list(map(dict, topic.qos)), sort_keys=False), HASH_KEY: topic.type_hash}
+        metadata = {QOS_KEY: _as_yaml(list(topic.qos)), HASH_KEY: topic.type_hash}
         self._channels[topic.name] = self._writer.register_channel(
             topic.name, MessageEncoding.CDR, self._schemas[topic.type_name], metadata
         )
@@ -112,29 +122,24 @@ class BagWriter:
         """Finish the file and write the metadata."""
         if self._stream.closed:
             return
-        text = yaml.safe_dump(self._metadata(), sort_keys=False)
-        self._writer.add_metadata(ROSBAG_RECORD, {"serialized_metadata": text})
+        self._writer.add_metadata(ROSBAG_RECORD, {"serialized_metadata": _as_yaml(self._metadata())})
         self._writer.finish()
         self._stream.close()
-        whole = yaml.safe_dump({INFORMATION: self._metadata()}, sort_keys=False)
-        write_whole(self.folder / METADATA_FILE, whole.encode())
+        write_whole(self.folder / METADATA_FILE, _as_yaml({INFORMATION: self._metadata()}).encode())
 
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(
-        self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     def _metadata(self) -> dict[str, Any]:
         duration, start = {"nanoseconds": self._last - self._first}, {"nanoseconds_since_epoch": self._first}
-        # Built anew for each place: the same object twice would become an anchor, which no reader expects.
         return {
             "version": METADATA_VERSION,
             "storage_identifier": "mcap",
-            "duration": dict(duration),
-            "starting_time": dict(start),
+            "duration": duration,
+            "starting_time": start,
             "message_count": self.messages,
             "topics_with_message_count": [
                 {
@@ -142,7 +147,7 @@ class BagWriter:
                         "name": topic.name,
                         "type": topic.type_name,
                         "serialization_format": MessageEncoding.CDR,
-                        "offered_qos_profiles": [_copy(profile) for profile in topic.qos],
+                        "offered_qos_profiles": list(topic.qos),
                         "type_description_hash": topic.type_hash,
                     },
                     "message_count": self._counts[topic.name],
@@ -155,15 +160,11 @@ class BagWriter:
             "files": [
                 {
                     "path": self.file.name,
-                    "starting_time": dict(start),
-                    "duration": dict(duration),
+                    "starting_time": start,
+                    "duration": duration,
                     "message_count": self.messages,
                 }
             ],
             "custom_data": None,
             "ros_distro": "jazzy",
         }
-
-
-def _copy(profile: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: dict(value) if isinstance(value, Mapping) else value for key, value in profile.items()}

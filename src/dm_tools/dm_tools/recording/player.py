@@ -44,7 +44,6 @@ def play(
     domain: int | None = None,
     progress: Callable[[float], None] = lambda seconds: None,
     remark: Callable[[str], None] = lambda text: None,
-    discovery_s: float = DISCOVERY_S,
 ) -> dict[str, int]:
     """Publish the topics `names` of the recording; returns the number of messages of each that was published.
 
@@ -70,7 +69,7 @@ def play(
             name: node.create_publisher(message_class(bag.topics[name].type_name), name, _offer(bag.topics[name]))
             for name in names
         }
-        time.sleep(discovery_s)
+        time.sleep(DISCOVERY_S)
         for topic in [bag.topics[name] for name in names if _has_changed(node, bag.topics[name])]:
             node.destroy_publisher(publishers.pop(topic.name))
             remark(f"{topic.name} is left out: {topic.type_name} had another layout when it was recorded")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
@@ -142,13 +143,7 @@ def recalibrate(session: Session, identifier: str, created_ns: int) -> Calibrati
 def differences(calibration: Calibration, published: Any) -> list[str]:
     """Names of the fields of the message `published` that `calibration` does not give to the last bit."""
     again = calibration_message(calibration, None, "", 0.0)
-    return [name for name in COMPARED if not _same(_member(again, name), _member(published, name))]
-
-
-def _member(message: Any, path: str) -> Any:
-    for name in path.split("."):
-        message = getattr(message, name)
-    return message
+    return [name for name in COMPARED if not _same(*map(attrgetter(name), (again, published)))]
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -61,6 +61,7 @@ def measure(
 
 def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> float:
     """Say what lateral resolution (m per pixel) a map of a known sphere shows, as parameters, and what limits it."""
+    from dm_calibration.influence.poke_cure import parameter_text
     from dm_common.optics.conic import pitch_of_sphere
 
     try:
@@ -73,7 +74,8 @@ def _scale(info: Any, coefficients: list[float], radius_of_curvature: float) -> 
         "and the sphere's radius counts by half",
         soft_wrap=True,
     )
-    console.print(f"/**/interferometer:\n  ros__parameters:\n    pitch: {pitch:.12f}")
+    found = {"pitch": pitch}
     if info.instrument_error > 0.0:
-        console.print(f"    scale_error: {1e9 * info.instrument_error * share:.6f}")
+        found["scale_error"] = 1e9 * info.instrument_error * share
+    console.print(parameter_text({"interferometer": found}), markup=False, highlight=False)
     return pitch
