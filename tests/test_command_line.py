@@ -29,6 +29,7 @@ from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
 from dm_tools.verbs import console as verb_console
+from dm_tools.verbs import status as verb_status
 from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
@@ -262,6 +263,11 @@ def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     said = started.communicate(timeout=300)[1]
     assert (started.returncode, "Traceback" in said) == (130, False), said
     assert said.endswith("error: interrupted\n")
+
+
+def test_a_calibration_that_was_not_heard_is_not_called_none() -> None:
+    assert verb_status._calibration(None) == "not heard"
+    assert verb_status._calibration(Calibration()) == "none in use"
 
 
 def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> None:

@@ -9,7 +9,6 @@ from dm_common.errors import ErrorCode
 from dm_common.figures import two_fold
 from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, write_json
 from dm_tools.running_suite import (
-    BUSY_S,
     NEEDED,
     REPORT_S,
     SettledShape,
@@ -23,27 +22,30 @@ from dm_tools.running_suite import (
     where,
 )
 
+#: A node that is not found after this does not run, s: it announces itself every 3 s, and a busy machine may miss one.
+MISSING_S = 10.0
+
 
 def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     """Say on one screen what runs, where the mirror stands, what it promises, and what to do next."""
     with running_suite(namespace) as client:
         health = hear_health(client)
         client.wait(lambda: set(NEEDED) <= health.keys() & nodes_of_suite(client).keys(), REPORT_S)
-        client.wait(lambda: set(NEEDED) <= nodes_of_suite(client).keys(), BUSY_S - REPORT_S)
+        client.wait(lambda: set(NEEDED) <= nodes_of_suite(client).keys(), MISSING_S - REPORT_S)
         client.wait(lambda: {"mirror_info", "calibration", "capabilities"} <= client.messages.keys(), 0.5)
         by = holder(client)
         found, place = nodes_of_suite(client), where(client)
-    mirror, calibration, capabilities, state = (
+    mirror, heard, capabilities, state = (
         client.messages.get(name) for name in ("mirror_info", "calibration", "capabilities", "actuator_state")
     )
-    calibration = calibration if calibration is not None and calibration.id else None
+    calibration = heard if heard is not None and heard.id else None
     shape, lacking = settled_shape(health), [name for name in NEEDED if not found[name]]
     rows = {
         "nodes": f"{', '.join(found)}: running {place}"
         + (f"; [red]not running: {', '.join(lacking)}[/]" if lacking else ""),
         "mirror": f"{mirror.name} {mirror.serial}, {mirror.actuators} actuators" if mirror is not None else "not heard",
         "now": _now(by, shape, state),
-        "calibration": _calibration(calibration),
+        "calibration": _calibration(heard),
         "promise": _promise(capabilities) if calibration is not None else "none without a calibration",
         "absolute": _absolute(capabilities, calibration),
         "health": _health(health),
@@ -87,8 +89,8 @@ def _now(by: Any, shape: SettledShape | None, state: Any) -> str:
 
 
 def _calibration(calibration: Any) -> str:
-    if calibration is None:
-        return "none in use"
+    if calibration is None or not calibration.id:
+        return "not heard" if calibration is None else "none in use"
     age = time.time() - calibration.header.stamp.sec
     doubtful = sum(grade != 0 for grade in calibration.actuator_grade)
     law = f"law {calibration.hysteresis.law}" if calibration.hysteresis.play_radius else "[yellow]without hysteresis[/]"
