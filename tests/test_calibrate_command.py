@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 import typer
+from dm_msgs.action import Calibrate
 
 from dm_bringup.suite import ConfigError, load_config
 from dm_calibration.procedure.forecast import GoodEnough
 from dm_tools.parameter_changes import source_of, write_parameters
-from dm_tools.verbs.calibrate import REACHED, metres
+from dm_tools.verbs.calibrate import REACHED, metres, show_result
 from dm_tools.verbs.up import shared_config
 
 FOUND = "/**/interferometer:\n  ros__parameters:\n    orientation.rotate_deg: -35.010000\n    orientation.flip_x: true"
@@ -52,6 +53,14 @@ def test_the_file_of_another_mirror_is_refused(tmp_path: Path) -> None:
     shutil.copy(shared_config("bench.yaml"), source)
     with pytest.raises(ConfigError, match=r"is of the mirror 'virtual-1', the nodes run 'T-7'"):
         source_of(tmp_path / "new.yaml", source, "T-7")
+
+
+@pytest.mark.parametrize(("model", "promised"), [("Preisach, each actuator its own", "2.8"), ("static", "2")])
+def test_the_promise_is_what_requests_will_be_told(
+    model: str, promised: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    show_result(Calibrate.Result(hysteresis_model=model, hysteresis_held_out_max_zernike=2e-9))
+    assert f"promise: {promised} nm (95 % bound" in capsys.readouterr().out
 
 
 def test_what_was_reached_is_one_part_of_a_result_message() -> None:

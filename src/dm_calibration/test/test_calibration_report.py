@@ -31,7 +31,7 @@ from dm_calibration.report.page import figures_of, write_report
 from dm_calibration.report.pdf_pages import pdf_pages
 from dm_calibration.report.residuals import residuals
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.hysteresis.model import HysteresisModel
+from dm_common.hysteresis.model import IN_USE, HysteresisModel
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.recipes import Recipe, RecipeBook
@@ -121,7 +121,7 @@ def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibra
     keep_people({}, file)
     hysteresis = HysteresisFit("Prandtl-Ishlinskii", PLAY, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
     text = one_html("", [certificate(replace(calibration, hysteresis=hysteresis), people(file))])
-    for expected in ("<td>calibrated</td>", "2.00 nm (λ/316)", "A. N. Other", "Verifire"):
+    for expected in ("<td>calibrated</td>", "2.80 nm (λ/226), 95 % bound", "A. N. Other", "Verifire"):
         assert expected in text
     assert "absolute not known (instrument_error and scale_error of the interferometer not given)" in text
     known = replace(calibration, reference_surface="flat.dat, SHA-256 01", instrument_error=5e-9, scale_error=1e-4)
@@ -143,7 +143,8 @@ def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[C
 
 
 def test_checks_say_what_drifts_and_when_to_calibrate_next(calibration: Calibration, tmp_path: Path) -> None:
-    known = replace(calibration, hysteresis=HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), 5e-9, 0.05, 120, ()))
+    held_out = 5e-9 / IN_USE
+    known = replace(calibration, hysteresis=HysteresisFit("Preisach", PLAY, np.full(21, 1e-9), held_out, 0.05, 120, ()))
     start = known.created_ns * 1e-9
     # From 1 nm by 0.1 nm a day to 5 nm: 40 days; without growth thirty days after the last check that agreed.
     for growth, days, reason in ((1e-10, 40.0, "the error grows by +3"), (0.0, 24 + 30.0, "no growth")):

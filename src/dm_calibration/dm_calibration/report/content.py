@@ -34,9 +34,11 @@ def length(metres: float, wavelength: float) -> str:
 
 
 def promise(calibration: Calibration) -> float:
-    """m, 95 % bound on the largest coefficient error of an open-loop move, from maps that had no part in the fit."""
+    """m, 95 % bound on the largest coefficient error of a request, from maps that had no part in the fit."""
     found = calibration.hysteresis
-    return float(found.held_out_max_zernike if found is not None else calibration.fit.held_out_max_zernike)
+    if found is None:
+        return float(calibration.fit.held_out_max_zernike)
+    return float(found.law.in_use * found.held_out_max_zernike)
 
 
 def _counted(number: int, one: str, many: str) -> str:

@@ -37,9 +37,6 @@ DRAWS = 4000
 RANGE_TOLERANCE = 20e-9
 #: Effective signals that a limit denies count from here on, normalised.
 MISSED_MAX = 1e-6
-#: How much more a request may err, where there is hysteresis, than the held-out moves of the calibration, which follow
-#: each other within seconds: requests after a degauss err 1.2 to 2.6 times as much as the same law does on those moves.
-IN_USE = 1.4
 #: A message's constants are properties of its class, which take longer to look up.
 _DIRECT = FocusRequest.MODE_DIRECT
 
@@ -227,9 +224,8 @@ class Planner:
         """m, 95 % bound of the largest coefficient error, but for creep, with the history `known` or not."""
         if self.hysteresis is None:
             return self.mirror.model.held_out_max_zernike
-        in_use = IN_USE if self.law.remembers else 1.0
         unknown = 0.0 if known else self.unknown_max_zernike
-        return math.hypot(in_use * self.hysteresis.held_out_max_zernike, unknown)
+        return math.hypot(self.law.in_use * self.hysteresis.held_out_max_zernike, unknown)
 
     def _bounded(
         self, plan: Plan, signals: Floats, known: bool, creep: tuple[float, float], error: float | None

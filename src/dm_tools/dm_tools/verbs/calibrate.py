@@ -24,6 +24,8 @@ from dm_tools.output import (
 from dm_tools.parameter_changes import set_parameter, source_of, write_parameters
 from dm_tools.running_suite import naming_holder, promise, running_suite
 
+#: How laws are called under which what was commanded before does not count.
+NO_HISTORY = ("linear", "static")
 #: What tells the sentence of a result on what --until asked for.
 REACHED = re.compile(r"^\S+ nm is (not )?reached")
 
@@ -90,9 +92,13 @@ def show_result(result: Any) -> None:
             f"{nanometres(result.held_out_rms):.2f} nm rms on maps held out"
         )
     if result.hysteresis_model:
+        from dm_common.hysteresis.model import IN_USE
+
+        held_out = result.hysteresis_held_out_max_zernike
+        in_use = 1.0 if result.hysteresis_model.startswith(NO_HISTORY) else IN_USE
         console.print(
-            f"promise: {promise(result.hysteresis_held_out_max_zernike)} for the largest coefficient, from moves held "
-            f"out{_foretold(result)}; hysteresis {result.hysteresis_model}"
+            f"promise: {promise(in_use * held_out)} for the largest coefficient, from {in_nanometres(held_out)} of "
+            f"moves held out{_foretold(result)}; hysteresis {result.hysteresis_model}"
         )
     for entry in result.dropped:
         console.print(f"[yellow]dropped[/] {entry}")
