@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 import typer
 from dm_msgs.action import Calibrate
+from typer.testing import CliRunner
 
 from dm_bringup.suite import ConfigError, load_config
 from dm_calibration.procedure.forecast import GoodEnough
+from dm_tools import cli
 from dm_tools.parameter_changes import source_of, write_parameters
 from dm_tools.verbs.calibrate import REACHED, metres, show_result
 from dm_tools.verbs.up import shared_config
@@ -29,6 +31,12 @@ def test_lengths(text: str, value: float) -> None:
 def test_what_is_no_length(text: str) -> None:
     with pytest.raises(typer.BadParameter, match="must be a number above 0 with pm, nm or um, such as 2nm"):
         metres(text)
+
+
+@pytest.mark.parametrize("option", [("--until", "2nm"), ("--hysteresis", "100")])
+def test_maps_of_another_plan_are_no_hysteresis_run(option: tuple[str, str]) -> None:
+    found = CliRunner().invoke(cli.app, ["calibrate", "--plan", "pokes", *option])
+    assert found.exit_code == 2 and f"--plan pokes and {option[0]}: must be the plan hysteresis" in found.output
 
 
 def test_what_a_poke_check_finds_goes_into_a_copy(tmp_path: Path) -> None:

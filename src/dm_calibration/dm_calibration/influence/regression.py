@@ -30,8 +30,9 @@ Floats = NDArray[np.float64]
 #: Methods by the name used in messages and calibration files; AZWreg fits the Zernike coefficients anew to the sag with
 #: region weights, Eq. (8).
 METHODS = ("AZreg", "AZWreg")
-#: Least range of applied signals over the maps, normalised, for an actuator to count as excited.
-EXCITATION_MIN = 0.02
+#: Least range of applied signals over the maps, normalised, for an actuator to count as excited: that of the smallest
+#: pokes (a half-swing of 0.01), which converters round.
+EXCITATION_MIN = 0.0199
 #: Maps beyond the number of unknowns before the drift is followed; with fewer, the figure is taken as constant.
 DRIFT_SPARE_MAPS = 5
 #: Smallest singular value of the design, relative to the largest, that still tells actuators apart.

@@ -199,8 +199,9 @@ def calibrate(
     if boresight:
         run_boresight(namespace, region, take_over, write, config, json)
         return
-    if hysteresis is not None or until:
-        plan = CalibrationPlan.hysteresis
+    if (hysteresis is not None or until) and plan != CalibrationPlan.hysteresis:
+        option = "--until" if until else "--hysteresis"
+        raise typer.BadParameter(f"--plan {plan.value} and {option}: must be the plan hysteresis, which alone has that")
     goal = Calibrate.Goal(
         plan=plan.name,
         hysteresis_maps=hysteresis or 0,
