@@ -159,7 +159,10 @@ class Connection:
 
     def _since_now(self, name: str) -> Callable[[], str]:
         """What became of the node that serves `name` since this call, see `Liveliness.since_now`."""
-        return self._servers[name].since_now() if name in self._servers else lambda: ""
+        if name not in self._servers:
+            return lambda: ""
+        self._servers[name].wait_for_return()
+        return self._servers[name].since_now()
 
     def _check(self, name: str, gone: Callable[[], str]) -> None:
         """Raise DeformableMirrorError when the node that serves `name` is `gone`."""

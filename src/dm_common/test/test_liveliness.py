@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,8 +29,31 @@ class Watched(Liveliness):
         self._on_change(info)
 
 
+class Time:
+    """Stands still but for `sleep`; what is due `at` a time is done then."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.at: dict[float, Callable[[], None]] = {}
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        self.now += duration
+        for due in [due for due in self.at if due <= self.now]:
+            self.at.pop(due)()
+
+
 @pytest.fixture
-def watched() -> Watched:
+def time(monkeypatch: pytest.MonkeyPatch) -> Time:
+    time = Time()
+    monkeypatch.setattr(qos, "time", time)
+    return time
+
+
+@pytest.fixture
+def watched(time: Time) -> Watched:
     return Watched()
 
 
@@ -39,18 +63,43 @@ def test_a_node_that_comes_at_last_is_what_was_waited_for(watched: Watched) -> N
     assert gone() == "" and not watched.lost
 
 
-def test_a_dead_node_is_missing_within_two_seconds_and_a_stall_is_forgiven(
-    watched: Watched, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dead_node_is_missing_within_two_seconds_and_a_stall_is_forgiven(watched: Watched, time: Time) -> None:
     """The lease lapses at most LEASE_S after the node said last that it lives; those who wait look often."""
-    now = 100.0
-    monkeypatch.setattr(qos.time, "monotonic", lambda: now)
     watched.change(1, 0)
-    now += qos.LEASE_S
+    time.now += qos.LEASE_S
     watched.change(-1, 1)
     assert watched.lost and not watched.missing()
-    now = 101.9
+    time.now = 101.9
     assert watched.missing()
+
+
+def test_a_node_whose_messages_come_lives_though_its_lease_lapsed(watched: Watched, time: Time) -> None:
+    watched.change(1, 0)
+    time.now += qos.LEASE_S
+    watched.change(-1, 1)
+    for _ in range(6):
+        time.now += 0.5
+        watched.heard()
+        assert not watched.missing()
+    time.now += qos.LEASE_S + 0.1
+    assert watched.missing()
+
+
+def test_a_call_waits_for_a_node_that_others_know_to_be_back(watched: Watched, time: Time) -> None:
+    """The controller knew the driver that was started again, the calibration refused: it had died."""
+    watched.change(1, 0)
+    watched.wait_for_return()
+    assert time.now == 100.0
+    watched.change(-1, 1)
+    time.now += 10.0
+    time.at[110.5] = lambda: watched.change(1, 0)
+    watched.wait_for_return()
+    gone = watched.since_now()
+    assert gone() == "" and time.now >= 110.5 + qos.DISCOVERY_S
+    watched.change(-1, 1)
+    began = time.now = 120.0
+    watched.wait_for_return()
+    assert watched.missing() and time.now - began < 2.0
 
 
 @pytest.mark.parametrize("lapsed_before", [False, True])

@@ -152,9 +152,9 @@ class FocusController:
         limit, age = values["request_age"], 1e-9 * (now.ns - request.stamp_ns)
         if degaussed is None and limit and request.stamp_ns and not -limit <= age <= limit:
             raise Refusal(ErrorCode.STALE, f"header.stamp: the request is {age:.3f} s old; allowed: {limit:g} s")
+        target, settle, budget = request.target(), values["settle_time"], request.time_budget or values["time_budget"]
         if active is None:
             raise self.not_calibrated
-        target, settle, budget = request.target(), values["settle_time"], request.time_budget or values["time_budget"]
         estimate = self._at_rest or self.observer.estimate(now.time, active.slew_rate)
         if degaussed is not None:
             degauss = Degauss(degaussed, True, 0.0)

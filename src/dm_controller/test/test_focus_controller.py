@@ -315,6 +315,14 @@ def test_a_request_that_makes_no_sense_is_refused(bench: Bench, fields: dict[str
     assert bench.log[-1].startswith("refused: ")
 
 
+def test_a_request_that_makes_no_sense_is_told_so_without_a_calibration_too(bench: Bench) -> None:
+    bench.do(bench.controller.rest(Refusal(ErrorCode.NOT_CALIBRATED, "no calibration"), bench.now))
+    bench.ask(float("nan"))
+    assert bench.refusal().error_code == ErrorCode.NOT_FINITE
+    bench.ask(0.01)
+    assert bench.refusal().error_code == ErrorCode.NOT_CALIBRATED
+
+
 def test_the_newest_request_wins(bench: Bench) -> None:
     first, second = bench.ask(0.01), bench.ask(0.02)
     assert len(bench.commands) == 2

@@ -78,6 +78,7 @@ class BenchServices:
 
     def _on_state(self, message: ActuatorState) -> None:
         self.state = message
+        self._driver.heard()
 
     def publish_waits(self, handle: Any, feedback: Any) -> None:
         """Publish what is waited for from now on as the `message` of the feedback of a goal."""
@@ -117,16 +118,15 @@ class BenchServices:
         A driver that was restarted, or lost its link, takes commands again soon; what was measured before and after
         does not belong together without a degauss between.
         """
-        state = self.state
-        if state is None:
+        if self.state is None:
             return
-        if self._history_known and not state.history_known:
-            self._history_known = False
+        was_known = self._history_known
+        self._history_known = self.state.history_known
+        if was_known and not self._history_known:
             raise Refusal(
                 ErrorCode.DRIVER_UNAVAILABLE,
                 "pdm_driver no longer knows what the actuators went through: it was restarted or lost its link",
             )
-        self._history_known = state.history_known
 
     def degauss(self) -> None:
         self._history_known = False
@@ -135,9 +135,8 @@ class BenchServices:
     def _run_degauss(self, steps: int) -> None:
         """A degauss of so many half-swings, 0 = as configured in the driver. Raises as `degauss`."""
         goal = Degauss.Goal(steps=steps, holder=self.hold.holder)
-        gone = self._driver.since_now(self._degauss.server_is_ready)
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
-            result = run_goal(self._degauss, goal, self._values["degauss_timeout"], stop, gone)
+            result = run_goal(self._degauss, goal, self._values["degauss_timeout"], stop, self._driver.since_now())
         self._check("degauss", result)
 
     def apply(self, signals: Floats) -> Floats:
@@ -272,6 +271,7 @@ class BenchServices:
             server: of the node that serves it.
             ready: whether it is served.
         """
+        server.wait_for_return(self._stopping)
         gone = server.since_now(ready)
         try:
             yield lambda: self._stopping() or bool(gone())

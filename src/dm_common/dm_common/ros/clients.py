@@ -16,9 +16,8 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.ros.qos import DISCOVERY_S
 
-#: Time that discovery may take on a busy machine from one side to the other.
-DISCOVERY_S = 0.5
 #: How often a hold is renewed, s: several times within the driver's lease of 3 s.
 RENEW_S = 0.7
 #: Longest wait for the driver to take a hold back, s; else it ends with its lease.

@@ -7,6 +7,7 @@ who wait watch it here: they know within a second, also after kill -9.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from copy import copy
@@ -47,6 +48,11 @@ LEASE_S = 1.0
 SURE_S = 0.7
 #: A node that has not appeared for so long after the one that watches it was started is missing, s.
 APPEAR_S = 5.0
+#: A node that was started again is known to one process sooner than to another, up to seconds on a busy machine: a call
+#: to one that is lost waits for so long before it counts as dead, s.
+RETURN_S = 1.2
+#: Time that discovery may take on a busy machine from one side to the other, s.
+DISCOVERY_S = 0.5
 #: What became of a node that is lost.
 GONE = "has died or was stopped: start it again"
 
@@ -63,7 +69,8 @@ class Liveliness:
     """Watches the publisher of a topic by a subscription of its own, whose messages it does not even decode.
 
     Made by `watch`: with two such subscriptions in one process Fast DDS counts a living publisher as dead when it
-    forgets one that was killed, 20 s later (measured).
+    forgets one that was killed, 20 s later (measured; the first of them is told the state of whichever publisher
+    `LivelinessManager::remove_writer` passed last).
 
     A publisher without a lease is not seen at all: nothing is known of it.
 
@@ -81,11 +88,12 @@ class Liveliness:
 
     def __init__(self, node: Node, name: str, message_type: Any, topic: str, profile: QoSProfile) -> None:
         self.name, self.lost, self.starts = name, False, 0
-        self._born = self._lost_at = time.monotonic()
+        self._born = self._lost_at = self._heard_at = time.monotonic()
+        self._started_at = -math.inf
         node.create_subscription(
             message_type,
             topic,
-            lambda _message: None,
+            lambda _message: self.heard(),
             with_lease(profile),
             event_callbacks=SubscriptionEventCallbacks(
                 liveliness=self._on_change,
@@ -94,14 +102,31 @@ class Liveliness:
             raw=True,
         )
 
+    def heard(self) -> None:
+        """Note that a message of the node has come: who speaks lives, whatever a lease says that lapsed."""
+        self._heard_at = time.monotonic()
+
+    def wait_for_return(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Wait for a node that is lost, and until one that was started again knows this process; `RETURN_S` at most.
+
+        Args:
+            stop: ends the wait.
+        """
+        deadline = time.monotonic() + RETURN_S
+        while self.lost or time.monotonic() < self._started_at + DISCOVERY_S:
+            if stop() or time.monotonic() > deadline:
+                return
+            time.sleep(0.02)
+
     def missing(self, served: Callable[[], bool] = lambda: True) -> bool:
         """Whether the node is lost, or never came: not even what it serves is there, which `served` looks for.
 
         Without that, one that never came is not missing.
         """
+        now = time.monotonic()
         if self.lost:
-            return time.monotonic() - self._lost_at > SURE_S
-        return not self.starts and time.monotonic() - self._born > APPEAR_S and not served()
+            return now - self._lost_at > SURE_S and now - self._heard_at > LEASE_S
+        return not self.starts and now - self._born > APPEAR_S and not served()
 
     @property
     def text(self) -> str:
@@ -128,6 +153,8 @@ class Liveliness:
         # not always heard, when it came before the executor did; whatever changes afterwards, there was one.
         started = info.alive_count_change + info.not_alive_count_change > 0
         self.starts = max(self.starts + started, 1)
+        if started and self.starts > 1:
+            self._started_at = time.monotonic()
         if lost != self.lost:
             self.lost, self._lost_at = lost, time.monotonic()
 
