@@ -256,9 +256,12 @@ def test_a_suite_that_is_started_twice_is_named(tmp_path: Path, monkeypatch: pyt
 
 def test_a_command_that_is_interrupted_at_once_says_so() -> None:
     """As `./dm` starts it: the signal waits until the command can answer it."""
+    # A job in the background of a shell, which tests may be, ignores the signal and so would what it starts.
+    answered = signal.signal(signal.SIGINT, signal.default_int_handler)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     started = subprocess.Popen([sys.executable, "-m", "dm_tools", "up"], stderr=subprocess.PIPE, text=True)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    signal.signal(signal.SIGINT, answered)
     started.send_signal(signal.SIGINT)
     said = started.communicate(timeout=300)[1]
     assert (started.returncode, "Traceback" in said) == (130, False), said

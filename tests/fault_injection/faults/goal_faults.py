@@ -108,7 +108,7 @@ def loop_cancelled(rig: FocusRig, random: Random, record: FaultRecord) -> None:
     goal = Converge.Goal(request=FocusRequest(curvature=rig.far_curvature(random)), max_maps=20, tolerance=1e-10)
     handle, result = rig.goal(Converge, goal)
     if random.random() < 0.5:
-        rig.account_for(rig.set_focus(rig.curvature(random)), record)
+        rig.account_for(rig.set_focus(rig.curvature(random)), record, loop=True)
     outcome = _end_somehow(rig, random, handle, result)
     _check_ended(record, outcome, ErrorCode.OK, ErrorCode.CANCELED, ErrorCode.NOT_CONVERGED)
     _check_at_rest(rig, record)

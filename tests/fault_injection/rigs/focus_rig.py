@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from rclpy.qos import QoSProfile
 
 from dm_bringup.nodes import MODULES
-from dm_common.messages import doubles, limits_from, recipe_book_message
+from dm_common.messages import doubles, limits_from, recipe_book_message, stamp_ns
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
 from dm_common.ros.clients import ThreadedActionClient, answers_arrive
@@ -55,6 +55,12 @@ DRIVER_TIMEOUT_S = 2.0
 ANSWER_S = 20.0
 #: What the interferometer of the rig measures beside the plate: its surface answers more weakly than calibrated.
 GAIN = 0.85
+
+
+def same_shape(signals: ArrayLike, others: ArrayLike) -> bool:
+    """Whether both are signals of all actuators and differ by no more than corrections of creep."""
+    one, other = np.asarray(signals, dtype=np.float64), np.asarray(others, dtype=np.float64)
+    return bool(one.shape == other.shape == (37,) and np.abs(one - other).max() <= SAME_SHAPE)
 
 
 class FocusRig(DriverRig):
@@ -238,19 +244,30 @@ class FocusRig(DriverRig):
 
     def near(self, signals: ArrayLike) -> bool:
         """Whether the actuators stand in this shape, but for corrections of creep."""
-        wanted = np.asarray(signals, dtype=np.float64)
-        return bool(wanted.shape == (37,) and np.abs(self.signals - wanted).max() <= SAME_SHAPE)
+        return same_shape(self.signals, signals)
 
     def told_of(self, curvature: float) -> list[FocusState]:
         """All that `focus_state` said of the request of just this curvature."""
         return [state for state in list(self.focus_states) if state.curvature == curvature]
 
-    def account_for(self, state: FocusState, record: FaultRecord, patience_s: float = 20.0) -> None:
-        """Count a request as lost that was accepted with `state` and neither is carried out nor told of as failed."""
+    def overtaken(self, state: FocusState) -> bool:
+        """Whether somebody who holds the mirror has commanded another shape than that of `state` since."""
+        since = stamp_ns(state.header.stamp)
+        return any(
+            report.holder and stamp_ns(report.header.stamp) > since and not same_shape(report.requested, state.signals)
+            for report in list(self.states)
+        )
+
+    def account_for(self, state: FocusState, record: FaultRecord, patience_s: float = 20.0, loop: bool = False) -> None:
+        """Count a request as lost that was accepted with `state` and neither is carried out nor told of as failed.
+
+        Args:
+            loop: one begins, and its commands replace those of a request that came just before it held the mirror.
+        """
 
         def settled() -> bool:
             refused = any(told.error_code != ErrorCode.OK for told in self.told_of(state.curvature))
-            return refused or self.near(state.signals)
+            return refused or self.near(state.signals) or (loop and self.overtaken(state))
 
         if state.error_code != ErrorCode.OK:
             if not state.message:
