@@ -44,7 +44,7 @@ def fast_bench(folder: Path, seed: int, source: Path | None = None) -> dict[str,
     is tested elsewhere.
     """
     config = bench_config(folder, "off", 0.0, seed, 20.0, source)
-    config["virtual_bench"] |= {"clock.period": 0.01, "interferometer.pixels": 472}
+    config["virtual_bench"] |= {"clock.period": 0.02, "interferometer.pixels": 472}
     config["calibration"]["write_report"] = False
     quick_trigger(config)
     return config

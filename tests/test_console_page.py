@@ -24,7 +24,7 @@ from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shot
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
 from fault_injection.rigs.forked_node import ForkedSuite
-from support import wait_until
+from support import quick_trigger, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
 
@@ -45,6 +45,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningConsole]:
     folder = tmp_path_factory.mktemp("console")
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 3, 20.0)
     config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
+    quick_trigger(config)
     with own_domain() as domain, served(domain, folder) as address:
         bench = RunningConsole(config, folder, domain, address, ForkedSuite(config, folder, domain).__enter__())
         try:
