@@ -6,12 +6,13 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from dm_msgs.msg import FocusRequest
+from dm_msgs.msg import ActuatorState, FocusRequest, FocusState
 from dm_msgs.srv import SetFocus
 
 from fault_injection.fault import FaultRecord, run_faults
 from fault_injection.faults.registry import GROUPS, OTHERS, select
 from fault_injection.rigs.focus_rig import FocusRig
+from fault_injection.rigs.parts import overtaken
 
 pytestmark = pytest.mark.processes
 
@@ -53,6 +54,20 @@ def test_a_dead_driver_is_known_and_what_nobody_carries_out_counts_as_lost(tmp_p
         rig.kill()
         rig.account_for(rig.set_focus(rig.curvature(random)), record, patience_s=4.0)
     assert record.lost == 1
+
+
+@pytest.mark.parametrize(
+    ("holder", "requested", "stamp", "by_another"),
+    [("loop", 0.5, 2, True), ("loop", 0.1, 2, False), ("", 0.5, 2, False), ("loop", 0.5, 1, False)],
+)
+def test_only_who_holds_the_mirror_overtakes_a_request(
+    holder: str, requested: float, stamp: int, by_another: bool
+) -> None:
+    state = FocusState(signals=[0.1] * 37)
+    state.header.stamp.sec = 1
+    report = ActuatorState(holder=holder, requested=[requested] * 37)
+    report.header.stamp.sec = stamp
+    assert overtaken([report], state) == by_another
 
 
 def test_groups_stand_for_their_faults() -> None:

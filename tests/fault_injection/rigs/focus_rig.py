@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from rclpy.qos import QoSProfile
 
 from dm_bringup.nodes import MODULES
-from dm_common.messages import doubles, limits_from, recipe_book_message, stamp_ns
+from dm_common.messages import doubles, limits_from, recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
 from dm_common.ros.clients import ThreadedActionClient, answers_arrive
@@ -40,13 +40,12 @@ from dm_controller.planning.target import FocusTarget
 from fault_injection.fault import FaultRecord
 from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
 from fault_injection.rigs.forked_node import Process
+from fault_injection.rigs.parts import overtaken, same_shape
 from studies.benchmarks import stand_in_mirror
 
 LAW = "Prandtl-Ishlinskii"
 #: Curvatures asked for lie within ± this, 1/m; two in a row differ by at least the other.
 REACH, LEAST_CHANGE = 0.02, 0.004
-#: A held shape is corrected for creep: signals that differ less are the same shape.
-SAME_SHAPE = 0.04
 #: Half-swings of a degauss, few: faults are to meet it on its way.
 DEGAUSS_STEPS = 8
 #: The controller's own time-outs, short enough for a run; s.
@@ -55,12 +54,6 @@ DRIVER_TIMEOUT_S = 2.0
 ANSWER_S = 20.0
 #: What the interferometer of the rig measures beside the plate: its surface answers more weakly than calibrated.
 GAIN = 0.85
-
-
-def same_shape(signals: ArrayLike, others: ArrayLike) -> bool:
-    """Whether both are signals of all actuators and differ by no more than corrections of creep."""
-    one, other = np.asarray(signals, dtype=np.float64), np.asarray(others, dtype=np.float64)
-    return bool(one.shape == other.shape == (37,) and np.abs(one - other).max() <= SAME_SHAPE)
 
 
 class FocusRig(DriverRig):
@@ -250,14 +243,6 @@ class FocusRig(DriverRig):
         """All that `focus_state` said of the request of just this curvature."""
         return [state for state in list(self.focus_states) if state.curvature == curvature]
 
-    def overtaken(self, state: FocusState) -> bool:
-        """Whether somebody who holds the mirror has commanded another shape than that of `state` since."""
-        since = stamp_ns(state.header.stamp)
-        return any(
-            report.holder and stamp_ns(report.header.stamp) > since and not same_shape(report.requested, state.signals)
-            for report in list(self.states)
-        )
-
     def account_for(self, state: FocusState, record: FaultRecord, patience_s: float = 20.0, loop: bool = False) -> None:
         """Count a request as lost that was accepted with `state` and neither is carried out nor told of as failed.
 
@@ -267,7 +252,7 @@ class FocusRig(DriverRig):
 
         def settled() -> bool:
             refused = any(told.error_code != ErrorCode.OK for told in self.told_of(state.curvature))
-            return refused or self.near(state.signals) or (loop and self.overtaken(state))
+            return refused or self.near(state.signals) or (loop and overtaken(list(self.states), state))
 
         if state.error_code != ErrorCode.OK:
             if not state.message:
