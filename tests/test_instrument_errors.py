@@ -121,6 +121,9 @@ def test_tables_with_gaps_and_files_too_many_are_refused(tmp_path: Path) -> None
     table.write_text("\ufeffcolumn, row, x, y\n1, 2, 0.1, 0.2\n\n3, 4, 0.3\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"grid\.csv: row 2 below the headings has no y"):
         _table(table, "column", "row", "x", "y")
+    table.write_text("file, reference, part, degrees\na.dat, A, B,\na.dat, A, B, 3O\n")
+    with pytest.raises(ValueError, match="row 2 below the headings: degrees = '3O': must be a number"):
+        _table(table, "file", "degrees")
     table.write_text("file, reference, part\na.dat, A, B\n")
     with pytest.raises(ValueError, match="has no column row"):
         _table(table, "file", "row")

@@ -14,6 +14,9 @@ import typer
 
 from dm_tools.output import JsonOption, console, nanometres, next_step, write_json
 
+#: Columns of tables that hold no numbers.
+_TEXTS = ("file", "reference", "part")
+
 
 class Procedure(StrEnum):
     """What `dm instrument` finds."""
@@ -125,7 +128,7 @@ def _table(path: Path, *names: str) -> list[list[str]]:
     """The rows of a CSV file with these headings, in any order; `degrees` may be missing and is 0 then.
 
     Raises:
-        ValueError: naming the file, and the line that lacks a value.
+        ValueError: naming the file, and the row that lacks a value or holds what is no number.
     """
     with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets put a mark before the first heading
         rows = list(csv.DictReader(file, restval="", skipinitialspace=True))
@@ -137,4 +140,14 @@ def _table(path: Path, *names: str) -> list[list[str]]:
     for number, values in enumerate(table, start=1):
         if "" in values:
             raise ValueError(f"{path}: row {number} below the headings has no {names[values.index('')]}")
+        for name, value in zip(names, values, strict=True):
+            if name not in _TEXTS and not _is_number(value):
+                raise ValueError(f"{path}: row {number} below the headings: {name} = {value!r}: must be a number")
     return table
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
