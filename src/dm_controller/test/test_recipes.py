@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from dm_msgs.srv import StoreRecipes
 
+from dm_common.errors import ErrorCode
 from dm_common.optics.zernike import TERMS
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
+from dm_common.ros.clients import ServiceCallError
+from dm_controller.converge import recipe_run
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.recipes import REPEAT_SHARE, Corrections
 from dm_controller.planning.target import FocusTarget
@@ -222,3 +226,25 @@ def test_an_empty_book_says_so() -> None:
         Corrections(NO_RECIPES, PLANNER).find(FocusTarget(0.0))
     none: Any = None
     assert ActiveCalibration(none, none, none, PLANNER, NO_RECIPES, 0.0, 1.0, 2.0).conditioned_error == 0.0
+
+
+def test_recipes_whose_answer_was_lost_are_stored_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A calibration node that has just been started loses the answer to a controller that it does not know yet."""
+    answers = [ServiceCallError("no answer within 10 s"), StoreRecipes.Response(message="stored")]
+
+    def call(*_arguments: Any) -> Any:
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(recipe_run, "call", call)
+    monkeypatch.setattr(recipe_run.time, "sleep", lambda _duration: None)
+    said: list[str] = []
+    alive: Any = SimpleNamespace(wait_for_return=lambda _stop: None, since_now=lambda _served: lambda: "")
+    bench: Any = SimpleNamespace(waiting=said.append)
+    store: Any = SimpleNamespace(service_is_ready=lambda: True)
+    run = recipe_run.RecipeRun(cast(Any, None), {}, bench, store, alive)
+    handle: Any = SimpleNamespace(is_cancel_requested=False)
+    assert run._stored(handle, StoreRecipes.Request()) == (ErrorCode.OK, "stored")
+    assert said == ["waiting: no answer within 10 s"]

@@ -33,8 +33,8 @@ from dm_controller.planning.target import FocusTarget
 
 #: What requests are told meanwhile.
 BUSY = "recipes are being built (action build_recipes)"
-#: Longest wait for the calibration node to store recipes, and before it to come back if it has died, s.
-STORE_TIMEOUT_S = 30.0
+#: Longest wait for an answer of the calibration node that stores recipes, and for one that does, s.
+STORE_TIMEOUT_S = 10.0
 RETURN_S = 120.0
 
 
@@ -172,10 +172,12 @@ class RecipeRun:
     def _stored(self, handle: WorkerGoal, request: Any) -> tuple[int, str]:
         """What the calibration node answers: an ErrorCode and a sentence.
 
-        One that has died is waited for, and one that was started again until it has loaded its calibration.
+        One that has died is waited for, and one that was started again until it has loaded its calibration. Where no
+        answer came it is asked again: one that has just been started loses answers to whom it does not know yet.
         """
         deadline = time.monotonic() + RETURN_S
         while True:
+            self._calibration.wait_for_return(lambda: bool(handle.is_cancel_requested))
             gone = self._calibration.since_now(self._store.service_is_ready)
             try:
                 response = call(self._store, request, STORE_TIMEOUT_S, gone)
@@ -183,7 +185,7 @@ class RecipeRun:
                 wait = code == ErrorCode.NOT_CALIBRATED
             except ServiceCallError as error:
                 code, text = ErrorCode.TIMEOUT, gone() or str(error)
-                wait = bool(gone())
+                wait = True
             if not wait or handle.is_cancel_requested or time.monotonic() > deadline:
                 return code, text
             self._bench.waiting(f"waiting: {text}")
