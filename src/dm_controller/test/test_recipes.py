@@ -37,14 +37,15 @@ def own(target: FocusTarget) -> np.ndarray:
 
 
 class StandIn:
-    """A planner whose model promises an error, m."""
+    """A planner whose model promises an error, m, `in_use` times that on held-out moves."""
 
-    def __init__(self, promised: float) -> None:
+    def __init__(self, held_out: float, in_use: float = 1.0) -> None:
         self.mirror = SimpleNamespace(
             command=lambda target: (own(target), 0.0),
-            model=SimpleNamespace(influence_zernike=INFLUENCE, held_out_max_zernike=promised, aperture_radius=0.11),
+            model=SimpleNamespace(influence_zernike=INFLUENCE, held_out_max_zernike=held_out, aperture_radius=0.11),
         )
         self.hysteresis = None
+        self.error_bound = lambda known: in_use * held_out
 
 
 class Law:
@@ -124,6 +125,15 @@ def test_a_single_recipe_claims_nothing_of_other_shapes_beyond_the_model() -> No
     errors = [Corrections(alone, PLANNER).find(FocusTarget(0.04, conic)).error for conic in (-1.0, -50.0, -200.0)]
     assert errors == sorted(errors)
     assert errors[-1] > 100e-9
+
+
+def test_shapes_between_recipes_are_promised_from_what_any_request_is() -> None:
+    """Which is more than the error of the calibration's held-out moves; a recipe itself repeats as they do."""
+    in_use: Any = StandIn(1e-9, in_use=1.4)
+    plain, wider = Corrections(BOOK, PLANNER), Corrections(BOOK, in_use)
+    assert wider.amplitude == pytest.approx(1.4 * plain.amplitude)
+    assert wider.find(FocusTarget(0.01)).error > plain.find(FocusTarget(0.01)).error
+    assert wider.find(FocusTarget(0.02)).error == plain.find(FocusTarget(0.02)).error
 
 
 def test_merging_recipes_that_contradict_each_other_widens_the_bound() -> None:

@@ -33,7 +33,7 @@ REACH = 1.0
 NUGGET = 1e-3
 #: Where recipes leave more of the variance than this they say nothing of a shape.
 LEFT_MAX = 0.5
-#: By how much a conditioned shape does not repeat, as a share of what the model promises of any shape.
+#: By how much a conditioned shape does not repeat, as a share of the model's error on held-out moves.
 REPEAT_SHARE = 0.3
 #: Recipes whose weight is less, as a share of the largest, do not count for what was measured nearby.
 SLIGHT = 0.2
@@ -108,11 +108,11 @@ class Corrections:
         # Alone, a recipe is missed by its whole correction; what was re-measured counts by itself.
         beyond = np.maximum(self._largest(missed) - self._measured.max(), 0.0) / np.sqrt(left)
         hysteresis, model = planner.hysteresis, planner.mirror.model
-        promised = model.held_out_max_zernike if hysteresis is None else hysteresis.held_out_max_zernike
+        held_out = model.held_out_max_zernike if hysteresis is None else hysteresis.held_out_max_zernike
         shown = max(float(self._largest(self._corrections).max()), float(beyond.max()))
         # The largest of a few samples is not the largest there is.
-        self.amplitude = max(promised, shown * (1.0 + 2.0 / len(recipes)))
-        self._repeat = REPEAT_SHARE * promised
+        self.amplitude = max(planner.error_bound(known=True), shown * (1.0 + 2.0 / len(recipes)))
+        self._repeat = REPEAT_SHARE * held_out
 
     def _surface(self, target: FocusTarget) -> Floats:
         """Coefficients beyond tilt, m."""
