@@ -15,7 +15,7 @@ from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.responses import Responses
 from dm_common.hysteresis.creep_record import UNSEEN, rested
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_controller.planning.creep_error import CreepError
+from dm_controller.planning.creep_error import IN_FIGURE_S, CreepError
 from linear_mirror import make_mirror
 
 Floats = NDArray[np.float64]
@@ -121,6 +121,21 @@ def test_after_a_calibration_only_what_came_later_is_in_doubt() -> None:
     soon, late = (rested(law, np.zeros(COUNT), 1000.0 + elapsed).crept_sigma for elapsed in (60.0, 86_400.0))
     assert soon[-1] < 1e-3
     assert late[-4] > 0.9 * UNSEEN
+
+
+def test_what_was_held_before_a_calibration_is_in_doubt_while_it_fades() -> None:
+    """Its size is known, of which actuators it was is not: what differs by half of it fades within the bound."""
+    rng = np.random.default_rng(7)
+    sure = np.zeros((2, 1 + len(CREEP_TIMES), 1 + len(CREEP_TIMES)))
+    law = replace(CREEPS, creep_covariance=sure, crept_at=1000.0, crept=0.3 * rng.standard_normal(COUNT))
+    error, rest, state = creep_error(law), np.zeros(COUNT), law.demagnetised(COUNT, 1000.0)
+    hours = [error.bound(law.advance(state, 1000.0 + 3600.0 * hour), rest, 0.05).max_zernike for hour in (0.1, 1, 3)]
+    assert hours == sorted(hours)
+    faded = np.exp(-(3 * 3600.0) / CREEP_TIMES) - np.exp(-IN_FIGURE_S / CREEP_TIMES)
+    size = 0.5 * np.sqrt(np.mean(np.square(law.crept)))
+    others = size * rng.standard_normal((400, COUNT)) @ RESPONSE.T * (law.creep_share @ faded)
+    assert 0.85 < np.mean(np.abs(others).max(axis=1) < hours[-1]) < 1.0
+    assert error.bound(law.advance(state, 11800.0), rest, 0.05, measured=True).max_zernike == 0.0
 
 
 def test_a_longer_move_is_known_less_well() -> None:

@@ -19,8 +19,8 @@ IN_FIGURE_S = 200.0
 ONE, LARGEST = 1.96, 2.5
 #: Ages at which recipes are measured, s.
 MEASURED_S = (1.0, 5.0)
-#: Share of creep that is known no better, of an element that the calibration says nothing of: by its time
-#: constant, s, below which and above which.
+#: Share of creep that is known no better: of an element that the calibration says nothing of, by its time constant, s,
+#: below which and above which; and of what was held before the calibration.
 UNKNOWN_SHARE, UNKNOWN_BELOW, UNKNOWN_ABOVE = 0.5, 1.0, 300.0
 
 
@@ -58,7 +58,12 @@ class CreepError:
         if law.crept.shape == whole.shape:
             self._in_figure = law.crept[:, None] * np.exp(-IN_FIGURE_S / law.creep_time)
         # What a shape of the whole range held unseen would leave, by element.
-        self._unseen = (rows @ whole)[:, None] * np.atleast_2d(law.creep_share).mean(axis=0)
+        share = np.atleast_2d(law.creep_share).mean(axis=0)
+        self._unseen = (rows @ whole)[:, None] * share
+        # What was held before the calibration fades for hours. A run of minutes shows of it how large it is, but hardly
+        # of which actuators: any may differ from what was found by a share of what they have in the mean.
+        found = float(np.sqrt(np.mean(np.square(law.crept)))) if law.crept.size else 0.0
+        self._old = UNKNOWN_SHARE * found * share
 
     def bound(self, state: HysteresisState, position: Floats, ahead: float, measured: bool = False) -> CreepBound:
         """Of a move from `state` to the static effective signals `position` (N,), `ahead` s after it and at AGES.
@@ -81,7 +86,12 @@ class CreepError:
             features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
         shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
         shared += np.square(self._unseen * (state.crept_sigma * faded)[:, None]).sum(axis=2)
-        each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True) @ np.square(self._rows).T
+        each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
+        if not measured:
+            since = np.maximum(state.time + ages - self._law.crept_at, 0.0)
+            fade = np.exp(-since[:, None] / self._law.creep_time) - np.exp(-IN_FIGURE_S / self._law.creep_time)
+            each += np.square(fade @ self._old)[:, None]
+        each = each @ np.square(self._rows).T
         count = self._coefficients
         largest = ONE**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)
         rms = (shared + each)[:, count:].sum(axis=1)
