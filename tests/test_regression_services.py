@@ -188,6 +188,8 @@ def test_maps_that_do_not_do_are_refused_and_what_was_in_use_stays(node: NodePro
     load(observer, "whole")
     assert predict().predicted_rms == before.predicted_rms
     assert "Traceback" not in node.output, node.output
+    # The controller asks of each calibration, and a clean start warns of nothing.
+    assert "predict_error: calibration pokes" not in node.output
 
 
 def test_epsilon_is_a_parameter(node: NodeProcess, observer: Observer, tmp_path: Path) -> None:

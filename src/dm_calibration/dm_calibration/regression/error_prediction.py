@@ -68,7 +68,14 @@ class ErrorPrediction:
         reals([], low, high, sizes=(calibration.fit.actuators,)).check("signals", signals)
         with self._lock:
             if self._predictor is None or self._of != calibration.id:
-                self._predictor = self._fitted(calibration, calibration.fit.method, None)
+                try:
+                    self._predictor = self._fitted(calibration, calibration.fit.method, None)
+                except Refusal as error:
+                    if error.error_code != ErrorCode.TOO_FEW_MAPS:
+                        raise
+                    # Of pokes alone, for instance: nothing to warn of, for the controller asks of each calibration.
+                    response.error_code, response.message = error.error_code, str(error)
+                    return response
                 self._of = calibration.id
             predictor = self._predictor
         response.predicted_rms, response.lower, response.upper = predictor.predict(signals)
