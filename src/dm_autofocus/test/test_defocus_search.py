@@ -11,6 +11,7 @@ from defocused_camera import DEPTH, LENS, SIDE, DefocusedCamera, clouds
 
 from dm_autofocus.search import defocus_search
 from dm_autofocus.search.defocus_model import DefocusModel
+from dm_autofocus.search.defocus_search import DepthFromDefocus
 from dm_autofocus.search.focus_search import FocusSearch
 from dm_autofocus.search.peak_search import Phase, SearchConfig
 from dm_autofocus.sharpness import tenengrad
@@ -170,6 +171,17 @@ def test_an_image_that_the_range_was_drawn_in_past_is_no_top(model: DefocusModel
         search.feed(tenengrad(image), (image,))
     run(search, camera, reach=0.012)
     assert search.current.peak is not None and search.current.peak.at_limit and search.current.peak.curvature > -0.013
+
+
+@pytest.mark.parametrize("off", [-7, 7])
+def test_a_place_at_the_end_of_what_is_thought_of_is_not_believed(model: DefocusModel, off: int) -> None:
+    """Noise and what else is in the picture may make an image the sharpest that is far from the focus."""
+    camera = DefocusedCamera(clouds(), 0.01 + off * DEPTH)
+    search = DepthFromDefocus(CONFIG, model, 0.0)
+    while not search.done:
+        place = search.step.curvature
+        search.feed(math.exp(-(((place - 0.01) / (8 * DEPTH)) ** 2)), model.powers(camera.expose(place)))
+    assert search.peak is not None and search.peak.curvature == pytest.approx(0.01 + off * DEPTH, abs=0.5 * DEPTH)
 
 
 def test_where_the_optics_do_not_explain_the_images_the_range_is_swept(

@@ -47,8 +47,8 @@ STRAY = 0.5
 OUTSTANDING, HILL, FAR_IMAGES = 3.0, 20.0, 2
 #: Where the last images are, and more of them while the standard error is above so many depths of focus, in steps.
 LAST, MORE, PRECISION = (-1, 1, -2, 2), (-1.5, 1.5, -2.5, 2.5, -0.6, 0.6), 0.25
-#: Standard error with which no place is found, in depths of focus.
-WORST = 1.5
+#: Standard error with which no place is found, in depths of focus; how often a place may lead to another.
+WORST, RECENTRED = 1.5, 3
 #: How far from the focus an image is blurred rather than aberrated, in depths of focus; relative error of its transfer.
 BLURRED, ERROR = 1.25, 0.17
 
@@ -204,18 +204,25 @@ class DepthFromDefocus:
         """Place of the focus and its standard error by the images around a centre [1/m].
 
         Aberrations change the images in focus most, and what they say of the place least: those count only where there
-        are too few on either side of them. The error is what the images say themselves, and by how much the place
-        moves when one of them is left out.
+        are too few on either side of them. A place far from the centre becomes the centre: at the
+        end of what is thought of it would seem certain. The error is what the images say themselves, and by how much
+        the place moves when one of them is left out.
         """
-        grid = centre + 1.5 * side * np.linspace(-1, 1, 73)
-        grid = grid[(grid >= self.config.low) & (grid <= self.config.high)]
         powers = np.array(self._powers)
 
         def fit(some: NDArray[np.intp]) -> tuple[float, float]:
+            grid = centre + 1.5 * side * np.linspace(-1, 1, 73)
+            grid = grid[(grid >= self.config.low) & (grid <= self.config.high)]
             return _mean_and_spread(grid, self._model.judge(grid, places[some], powers[some], ERROR)[0])
 
         some = np.flatnonzero(np.abs(places - centre) < 3 * side)
         place, spread = fit(some)
+        for _round in range(RECENTRED):
+            near = np.flatnonzero(np.abs(places - place) < 3 * side)
+            if abs(place - centre) < side or not near.size:
+                break
+            centre, some = place, near
+            place, spread = fit(some)
         off = (places[some] - place) / self.config.tolerance
         if min((off < -BLURRED).sum(), (off > BLURRED).sum()) >= 2:
             some = some[np.abs(off) > BLURRED]
