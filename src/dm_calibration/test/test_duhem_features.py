@@ -1,4 +1,4 @@
-"""Duhem operators of each actuator: found from how the common one's values differ."""
+"""Duhem operators of each actuator, found from how the common one's values differ, and weights of features."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dm_calibration.calibration_messages import hysteresis_message
-from dm_calibration.hysteresis.features import fading_changes, fading_feature, own_slopes, padded_slope
+from dm_calibration.hysteresis.features import fading_changes, fading_feature, own_slopes, padded_slope, weights_of
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
@@ -31,6 +31,18 @@ def test_small_changes_of_the_slope_are_found() -> None:
 def test_nothing_is_said_of_an_operator_without_weight() -> None:
     common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
     assert own_slopes(common, np.full(ACTUATORS, 1e-3), np.full((6, ACTUATORS), 0.1)) == pytest.approx(common)
+
+
+def test_weights_are_those_of_the_whole_normal_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only their lower half is put together: whatever memory held before in the other counts for nothing."""
+    rng = np.random.default_rng(3)
+    features, left, gains = (rng.standard_normal(shape) for shape in ((40, 3, ACTUATORS), (40, 6), (ACTUATORS, 6)))
+    between = np.eye(ACTUATORS) + 0.1
+    columns = np.einsum("mfn,nd->mdnf", features, gains).reshape(40 * 6, -1)
+    normal = columns.T @ columns + np.kron(between, np.eye(3))
+    expected = np.linalg.solve(normal, columns.T @ left.ravel()).reshape(ACTUATORS, 3).T
+    monkeypatch.setattr(np, "empty", lambda shape, *_arguments, **_keywords: np.full(shape, np.nan))
+    np.testing.assert_allclose(weights_of(features, left, gains, np.eye(3), between), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("own", [True, False])

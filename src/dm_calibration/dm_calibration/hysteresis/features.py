@@ -188,7 +188,7 @@ def weights_of(features: Floats, left: Floats, gains: Floats, prior: Floats, bet
     count, actuators = features.shape[1:]
     by_actuator = np.ascontiguousarray(features.transpose(2, 1, 0)).reshape(actuators * count, -1)
     seen = gains @ gains.T
-    normal = np.empty((actuators * count, actuators * count))
+    normal = np.zeros((actuators * count, actuators * count))
     for number in range(actuators):  # the lower triangle alone, block by block: it is symmetric
         rows, end = slice(number * count, (number + 1) * count), (number + 1) * count
         block = (by_actuator[rows] @ by_actuator[:end].T).reshape(count, -1, count)
