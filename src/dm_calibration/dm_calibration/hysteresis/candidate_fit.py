@@ -138,12 +138,13 @@ class Run:
     @cached_property
     def followed(self) -> Floats:
         """(M, J, M) what each creep element has followed at each map of what stood at all; parts begin rested."""
-        each = np.eye(len(self.time))
-        states = [
-            np.array(list(creep_states(each[part], self.time[part], start, self.moved_in(part))))
-            for part, start in zip(self.parts, self.starts, strict=True)
-        ]
-        return np.concatenate(states)
+        maps = len(self.time)
+        each, followed = np.eye(maps), np.empty((maps, len(CREEP_TIMES), maps))  # 480 MB for 2000 maps: made in place
+        for part, start in zip(self.parts, self.starts, strict=True):
+            states = creep_states(each[part], self.time[part], start, self.moved_in(part))
+            for row, state in zip(followed[part], states, strict=True):
+                row[:] = state
+        return followed
 
 
 @dataclass(frozen=True, eq=False)
