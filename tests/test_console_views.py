@@ -24,6 +24,7 @@ from dm_msgs.msg import (
     ZernikeCoefficients,
 )
 from matplotlib.image import imread
+from sensor_msgs.msg import Image
 
 import console_stand_in
 from dm_common.geometry import hexagonal_positions
@@ -42,6 +43,7 @@ from dm_tools.console.state_observer import StateObserver
 from dm_tools.console.style import CSS
 from dm_tools.console.surfaces import SHOWN, SurfaceModel, difference, measured_surface
 from dm_tools.running_suite import NEEDED
+from dm_tools.verify import map_of
 
 COUNT = 7
 RADIUS = 11e-3
@@ -142,6 +144,11 @@ def test_maps_of_another_aperture_are_not_compared() -> None:
     info.aperture_radius = 10e-3
     with pytest.raises(ValueError, match=r"10\.00 mm, that of the calibration 11\.00 mm"):
         difference(measured_surface(sag, info), SurfaceModel(message).surface(np.zeros(COUNT)))
+
+
+def test_an_image_of_another_kind_is_no_map() -> None:
+    with pytest.raises(ValueError, match="encoding = 'mono8': a surface map is 32FC1"):
+        map_of(Image(encoding="mono8", height=2, width=2, step=2, data=bytes(4)))
 
 
 def test_a_calibration_that_does_not_fit_together_names_the_field() -> None:
