@@ -22,7 +22,7 @@ from dm_tools.running_suite import (
     where,
 )
 
-#: A node that is not found after this does not run, s: it announces itself every 3 s, and a busy machine may miss one.
+#: A node that is not found after this does not run, s: it announces itself every second, which a busy machine may miss.
 MISSING_S = 10.0
 
 
