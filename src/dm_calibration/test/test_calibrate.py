@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dm_calibration import calibrate
 from dm_calibration.acquisition.ingest import IngestSettings
+from dm_calibration.acquisition.map_sources import outcome_of
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.influence.regression import TooFewMapsError
@@ -25,7 +26,7 @@ from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints
 from hysteretic_mirror import MIRROR, lagging_bench
 from linear_mirror import RADIUS, LinearMirror, make_mirror
-from map_fixtures import NO_DATA, dat_bytes
+from map_fixtures import NO_DATA, dat_bytes, four_d_bytes
 
 Floats = NDArray[np.float64]
 
@@ -77,6 +78,15 @@ def test_a_folder_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert all(len(digest) == 64 for digest in calibration.maps.sha256)
     true = plant.fit_terms(plant.influence.T).T
     np.testing.assert_allclose(calibration.fit.influence_zernike[3:], true[3:], atol=0.01 * np.abs(true).max())
+
+
+def test_a_folder_of_maps_whose_names_end_in_capitals(tmp_path: Path) -> None:
+    mirror = make_mirror(rings=1)
+    plant, inside = plant_on_pixels(mirror)
+    commands = pokes(mirror)[1:2]
+    (tmp_path / "1.4D").write_bytes(four_d_bytes(seen(plant, inside, commands)[0] / 632.8e-9))
+    outcome = outcome_of(tmp_path, commands, None, mirror, IngestSettings(pitch=PITCH, aperture_radius=RADIUS))
+    assert [Path(record.file).name for record in outcome.records] == ["1.4D"]
 
 
 def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:

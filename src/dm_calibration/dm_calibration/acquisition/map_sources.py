@@ -24,8 +24,8 @@ Floats = NDArray[np.float64]
 #: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats
 
-#: Endings of the map files that are taken from a folder.
-SUFFIXES = (".dat", ".datx", ".asc", ".xyz", ".fits", ".h5", ".4D")
+#: Endings of the map files that are taken from a folder, in small letters; those of files may be in capitals.
+SUFFIXES = (".dat", ".datx", ".asc", ".xyz", ".fits", ".h5", ".4d")
 
 
 def outcome_of(
