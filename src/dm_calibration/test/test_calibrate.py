@@ -16,6 +16,7 @@ from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.map_sources import outcome_of
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
+from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -103,6 +104,10 @@ def test_what_pokes_of_a_mirror_with_hysteresis_promise_spheres_keep() -> None:
         errors.append(np.abs(seen[3:]).max())
     bound = fit.held_out_max_zernike
     assert np.mean(np.array(errors) <= bound) >= 0.95 and 0.2 * bound < max(errors)
+    # The same bench whose signals begin at 0 instead: a move is counted from mid range on.
+    maps = replace(calibration.maps, applied=calibration.maps.applied + 1.0)
+    pulled = fit_influence(maps, rings=MIRROR.rings, limits=replace(MIRROR.limits, low=0.0, high=2.0))
+    assert pulled.held_out_max_zernike == pytest.approx(bound, rel=1e-6)
 
 
 def test_arrays_of_commands_times_and_maps(

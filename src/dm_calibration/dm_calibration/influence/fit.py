@@ -250,7 +250,7 @@ def _judge(
     map_residual[used] = in_sample
     error = float(np.percentile(np.abs(held_out[tested, PISTON_TILT:terms]).max(axis=1, initial=0.0), 95.0))
     if limits is not None:
-        moved = good.applied @ coefficients[:, terms:]
+        moved = (good.applied - limits.middle) @ coefficients[:, terms:]
         share = quality.loop_share(held_out[:, terms:], moved, weight, tested, options.hysteresis_allowance)
         error, more = quality.with_loops(error, share, coefficients[:, :terms].T, limits)
         remarks += more

@@ -131,7 +131,7 @@ def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.b
     have left a remanence.
 
     Args:
-        left, moved: (M, P) m, sag of the held-out residuals, and that the signals make.
+        left, moved: (M, P) m, sag of the held-out residuals, and that the signals make from mid range on.
         weight: (P,) of the points.
         tested: (M,) which maps count.
         allowance: share of an actuator's move by which it may miss.
