@@ -36,7 +36,7 @@ from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from documentation import Block, blocks
 from studies.documentation.parameters import TABLES
-from support import quick_trigger, wait_until
+from support import wait_until
 
 pytestmark = pytest.mark.processes
 
@@ -283,7 +283,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     home = folder / "home"
     config = bench_config(folder / "bench", "drawn_preisach", 0.01, 1, 20.0)  # the shipped mirror in fast time
     config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
-    quick_trigger(config)
     config["calibration"] |= {"calibration_folder": "~/.ros/dm_calibrations", "load_on_start": "newest"}
     home.mkdir()
     save_config(config, folder / "my_bench.yaml")
