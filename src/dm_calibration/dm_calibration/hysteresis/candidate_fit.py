@@ -138,10 +138,9 @@ class Run:
     @cached_property
     def followed(self) -> Floats:
         """(M, J, M) what each creep element has followed at each map of what stood at all; parts begin rested."""
-        maps = len(self.time)
-        each, followed = np.eye(maps), np.empty((maps, len(CREEP_TIMES), maps))  # 480 MB for 2000 maps: made in place
+        followed = np.empty((len(self.time), len(CREEP_TIMES), len(self.time)))  # 480 MB for 2000 maps: made in place
         for part, start in zip(self.parts, self.starts, strict=True):
-            states = creep_states(each[part], self.time[part], start, self.moved_in(part))
+            states = creep_states(np.eye(len(followed))[part], self.time[part], start, self.moved_in(part))
             for row, state in zip(followed[part], states, strict=True):
                 row[:] = state
         return followed
