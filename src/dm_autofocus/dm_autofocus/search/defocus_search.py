@@ -204,9 +204,9 @@ class DepthFromDefocus:
         """Place of the focus and its standard error by the images around a centre [1/m].
 
         Aberrations change the images in focus most, and what they say of the place least: those count only where there
-        are too few on either side of them. A place far from the centre becomes the centre: at the
-        end of what is thought of it would seem certain. The error is what the images say themselves, and by how much
-        the place moves when one of them is left out.
+        are too few on either side of them. A place far from the centre becomes the centre: at the end of what is
+        thought of it would seem certain. The error is what the images say themselves, and by how much the place moves
+        when one of them is left out.
         """
         powers = np.array(self._powers)
 
