@@ -14,7 +14,7 @@ from dm_bringup.suite import ConfigError, load_config
 from dm_calibration.procedure.forecast import GoodEnough
 from dm_tools import cli
 from dm_tools.parameter_changes import source_of, write_parameters
-from dm_tools.verbs.calibrate import REACHED, metres, show_result
+from dm_tools.verbs.calibrate import REACHED, after_run, metres, show_result
 from dm_tools.verbs.up import shared_config
 
 FOUND = "/**/interferometer:\n  ros__parameters:\n    orientation.rotate_deg: -35.010000\n    orientation.flip_x: true"
@@ -69,6 +69,14 @@ def test_the_promise_is_what_requests_will_be_told(
 ) -> None:
     show_result(Calibrate.Result(hysteresis_model=model, hysteresis_held_out_max_zernike=2e-9))
     assert f"promise: {promised} nm (95 % bound" in capsys.readouterr().out
+
+
+def test_wrong_wiring_is_put_right_before_the_mirror_is_used() -> None:
+    found = Calibrate.Result(id="c1", parameters=FOUND)
+    assert after_run(found, Path("found.yaml")) == "start the nodes with found.yaml, and calibrate again"
+    assert after_run(found, None) == "start the nodes with these parameters, and calibrate again"
+    assert after_run(Calibrate.Result(id="c1"), None) == "./dm focus 0.02"
+    assert after_run(Calibrate.Result(poke_check_passed=True), None) == "./dm calibrate"
 
 
 def test_what_was_reached_is_one_part_of_a_result_message() -> None:

@@ -33,7 +33,7 @@ from dm_tools.verbs import status as verb_status
 from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
 from dm_tools.verbs.report import folder_with, newest_store
-from dm_tools.verbs.up import end, lacks, only_suite
+from dm_tools.verbs.up import end, first_command, lacks, only_suite
 from test_console_external_goals import EXECUTING, FakeNode, Goal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -273,6 +273,12 @@ def test_a_calibration_that_was_not_heard_is_not_called_none() -> None:
     assert verb_status._calibration(Calibration()) == "none in use"
 
 
+def test_status_knows_no_negative_zero() -> None:
+    """Mid range is a step of the converter beside 0."""
+    said = verb_status._now(None, None, ActuatorState(applied=[-6e-6, -4e-6]))
+    assert said == "signals +0.00 to +0.00, not asked for as a curvature"
+
+
 def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> None:
     said: dict[str, Any] = {"actuator_state": ActuatorState(driver_state=ActuatorState.STATE_ACTIVE)}
     said |= {"mirror_info": MirrorInfo(), "calibration": Calibration(id="c1")}
@@ -287,6 +293,13 @@ def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> Non
         assert (lacks(said) == "") == ready
     said |= {"calibration": Calibration(), "capabilities": Capabilities(error_code=ErrorCode.NOT_CALIBRATED)}
     assert lacks(said) == ""
+
+
+def test_of_another_bench_the_wiring_comes_first() -> None:
+    """As docs/my-own-bench.md has it: four minutes of calibration on wrong wiring are lost."""
+    check = parsed("calibrate", *first_command(False, Path("my_bench.yaml")).split()[1:])
+    assert check["plan"] == "poke-check" and check["config"] == Path("my_bench.yaml") and check["write"] is not None
+    assert first_command(True, Path("my_bench.yaml")) == "focus 0.02" and first_command(False, None) == "calibrate"
 
 
 def test_up_ends_those_who_wait_before_the_process_does() -> None:

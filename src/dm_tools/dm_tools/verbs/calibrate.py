@@ -111,6 +111,13 @@ def show_result(result: Any) -> None:
         console.print("poke check: wiring and orientation are as configured")
 
 
+def after_run(result: Any, written: Path | None) -> str:
+    """What to do next, with the parameters that were found `written` to a file or not; "" = nothing to advise."""
+    if result.parameters:  # with them limits count for the true neighbours, and the aperture is where the mirror is
+        return f"start the nodes with {written or 'these parameters'}, and calibrate again"
+    return "./dm focus 0.02" if result.id else "./dm calibrate" if result.poke_check_passed else ""
+
+
 def _foretold(result: Any) -> str:
     expected = result.expected_max_zernike
     return f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
@@ -243,9 +250,5 @@ def calibrate(
         write_parameters(result.parameters, write, source)
     if dry_run:
         next_step("the same without --dry-run measures")
-    elif result.id:
-        next_step("./dm focus 0.02")
-    elif result.poke_check_passed:
-        next_step("./dm calibrate")
-    elif result.parameters:
-        next_step(f"start the nodes with {write or 'these parameters'}, and check again")
+    elif then := after_run(result, write):
+        next_step(then)

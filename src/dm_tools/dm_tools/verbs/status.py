@@ -84,7 +84,7 @@ def _now(by: Any, shape: SettledShape | None, state: Any) -> str:
         )
     if state is None or not state.applied:
         return "nothing was commanded yet, or the driver is not heard"
-    low, high = min(state.applied), max(state.applied)
+    low, high = (round(signal, 2) + 0.0 for signal in (min(state.applied), max(state.applied)))  # no "-0.00"
     return f"signals {low:+.2f} to {high:+.2f}, not asked for as a curvature{', moving' if state.moving else ''}"
 
 

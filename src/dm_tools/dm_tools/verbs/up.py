@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import fcntl
+import itertools
 import os
 import signal
 import tempfile
@@ -77,7 +78,10 @@ def up(
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""], camera)
-    watchers = [threading.Thread(target=say_when_ready, args=(name, stop), daemon=True) for name in mirrors]
+    watchers = [
+        threading.Thread(target=say_when_ready, args=(name, file, stop), daemon=True)
+        for name, file in itertools.zip_longest(mirrors, config or [])
+    ]
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
         for name in mirrors:
             stack.enter_context(only_suite(name))
@@ -157,8 +161,8 @@ def lacks(messages: Mapping[str, Any]) -> str:
     return ""
 
 
-def say_when_ready(namespace: str, stop: threading.Event) -> None:
-    """Wait until the suite of this namespace takes requests, and say so and what to do next."""
+def say_when_ready(namespace: str, file: Path | None, stop: threading.Event) -> None:
+    """Wait until the suite of this namespace, configured by `file`, takes requests; say so and what to do next."""
     from dm_client import DeformableMirrorClient
 
     started, late = time.monotonic(), False
@@ -175,8 +179,15 @@ def say_when_ready(namespace: str, stop: threading.Event) -> None:
         f"[bold green]ready[/] after {time.monotonic() - started:.0f} s: {mirror.name} {mirror.serial}, "
         + (f"calibration {capabilities.calibration_id}" if capabilities.calibration_id else "not calibrated yet")
     )
-    verb = "focus 0.02" if capabilities.calibration_id else "calibrate"
-    next_step(f"in another terminal: ./dm {verb}{option}; ./dm status{option} says how things are")
+    first = first_command(bool(capabilities.calibration_id), file)
+    next_step(f"in another terminal: ./dm {first}{option}; ./dm status{option} says how things are")
+
+
+def first_command(calibrated: bool, file: Path | None) -> str:
+    """What to do first with a suite that `file` configures; None = the virtual bench that ships, whose wiring holds."""
+    if calibrated:
+        return "focus 0.02"
+    return f"calibrate --plan poke-check --config {file} --write found.yaml" if file is not None else "calibrate"
 
 
 def configurations(files: list[Path], namespaces: list[str], camera: bool = False) -> dict[str, Config]:
