@@ -164,10 +164,11 @@ def fit_influence(
     budget = int(screening.DROPPED_MAX * len(maps))
     doubtful = False
     while not doubtful:
+        rest = good.applied[good.reference].mean(axis=0) if good.reference.any() else 0.0
         outlier = screening.worst_outlier(
             rms(fitted.residual[:, maps.terms :], maps.points.weight),
             fitted.leverage,
-            good.applied,
+            good.applied - rest,
             _response(fitted, design, good),
             options.outlier_sigmas,
             options.hysteresis_allowance,

@@ -50,7 +50,7 @@ def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
 def worst_outlier(
     residual_rms: Floats,
     leverage: Floats,
-    applied: Floats,
+    moved: Floats,
     response: Floats,
     outlier_sigmas: float,
     hysteresis_allowance: float,
@@ -65,7 +65,7 @@ def worst_outlier(
     Args:
         residual_rms: (M,) m.
         leverage: (M,).
-        applied: (M, N) normalised.
+        moved: (M, N) signals from where the mirror rests, normalised.
         response: (N,) rms sag per unit signal, m.
     """
     judged = leverage < LEVERAGE_MAX
@@ -74,7 +74,7 @@ def worst_outlier(
     scaled = np.where(judged, residual_rms / np.sqrt(np.maximum(1.0 - leverage, 1.0 - LEVERAGE_MAX)), 0.0)
     median = float(np.median(scaled[judged]))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(scaled[judged] - median)))
-    move = np.sqrt(np.square(applied) @ np.square(response))
+    move = np.sqrt(np.square(moved) @ np.square(response))
     allowance = hysteresis_allowance * np.maximum.accumulate(move)
     limit = np.maximum(np.maximum(median + outlier_sigmas * sigma, RESIDUAL_FLOOR), allowance)
     outside = scaled > limit
