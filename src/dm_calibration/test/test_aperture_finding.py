@@ -61,6 +61,13 @@ def test_two_mirrors_in_view_are_refused() -> None:
         find_aperture(both)
 
 
+@pytest.mark.parametrize("apart", [150, 140])
+def test_two_mirrors_that_touch_are_refused(apart: float) -> None:
+    both = disc((200, 400), 100, 100, 90) | disc((200, 400), 100 + apart, 100, 60)
+    with pytest.raises(InsufficientDataError, match=r"no disc: beside a circle of 90 pixels .* another mirror in view"):
+        find_aperture(both)
+
+
 def test_no_valid_pixel_is_refused() -> None:
     with pytest.raises(InsufficientDataError, match="no valid pixel"):
         find_aperture(np.zeros((5, 5), dtype=bool))

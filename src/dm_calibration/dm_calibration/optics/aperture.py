@@ -17,6 +17,9 @@ _ROUND = 0.02
 #: A second region of valid pixels of more than this share of the largest may be the mirror as well.
 SECOND_SHARE = 0.3
 
+#: How both refusals end.
+_SECOND_MIRROR = "is another mirror in view? Mask it, or tell which one by aperture.radius and aperture.centre_*"
+
 #: Fewest rim points for a circle fit.
 _FEWEST_RIM_POINTS = 16
 
@@ -85,7 +88,7 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
         valid: (height, width), True where there is data.
 
     Raises:
-        InsufficientDataError: no valid pixels to speak of, or two regions of like size.
+        InsufficientDataError: no valid pixels to speak of, or two regions of like size, also where they touch.
     """
     region = _filled_largest_region(valid)
     x, y = _rim(region)
@@ -93,7 +96,14 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
         circle, scatter = _fit_circle(x, y)
         if scatter <= _ROUND * circle.radius_px and _is_disc(region, circle):
             return circle
-    return _inscribed_circle(region)
+    circle = _inscribed_circle(region)
+    other = _inscribed_circle(region & ~circle.disc(region.shape))
+    if other.radius_px > max(1.0, math.sqrt(SECOND_SHARE) * circle.radius_px):
+        raise InsufficientDataError(
+            f"the outline of the map is no disc: beside a circle of {circle.radius_px:.0f} pixels one of "
+            f"{other.radius_px:.0f} fits into it: {_SECOND_MIRROR}"
+        )
+    return circle
 
 
 def _filled_largest_region(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -104,10 +114,7 @@ def _filled_largest_region(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     sizes[0] = 0
     second, largest = np.sort(sizes)[-2:]
     if second > SECOND_SHARE * largest:
-        raise InsufficientDataError(
-            f"the map shows two regions of {largest} and {second} pixels: is another mirror in view? Mask it, or tell "
-            "which one by aperture.radius and aperture.centre_*"
-        )
+        raise InsufficientDataError(f"the map shows two regions of {largest} and {second} pixels: {_SECOND_MIRROR}")
     region = labels == sizes.argmax()
     # Holes are the parts outside the region that do not touch the border; much quicker than binary_fill_holes.
     gaps, _count = ndimage.label(np.pad(~region, 1, constant_values=True))
