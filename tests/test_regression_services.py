@@ -22,6 +22,8 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.weights import surface_control_error
+from dm_calibration.regression import error_prediction
+from dm_calibration.regression.predictor import fit_predictor
 from dm_calibration.regression.surface_error import SURFACES
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.limits import Limits
@@ -190,6 +192,23 @@ def test_maps_that_do_not_do_are_refused_and_what_was_in_use_stays(node: NodePro
     assert "Traceback" not in node.output, node.output
     # The controller asks of each calibration, and a clean start warns of nothing.
     assert "predict_error: calibration pokes" not in node.output
+
+
+def test_why_a_calibration_tells_no_error_is_found_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[str]()
+
+    def fitted(*arguments: Any) -> Any:
+        asked.append("fit_predictor")
+        return fit_predictor(*arguments)
+
+    monkeypatch.setattr(error_prediction, "fit_predictor", fitted)
+    maps, fit = calibrated_by_pokes()
+    manager: Any = SimpleNamespace(in_use=stored("pokes", maps, fit, 1), mirror=MIRROR)
+    service = error_prediction.ErrorPrediction(manager, {})
+    request = PredictError.Request(signals=doubles(np.zeros(37)))
+    answers = [service.predict(request, PredictError.Response()) for _ in range(3)]
+    assert [answer.error_code for answer in answers] == [ErrorCode.TOO_FEW_MAPS] * 3
+    assert len({answer.message for answer in answers}) == 1 and asked == ["fit_predictor"]
 
 
 def test_epsilon_is_a_parameter(node: NodeProcess, observer: Observer, tmp_path: Path) -> None:

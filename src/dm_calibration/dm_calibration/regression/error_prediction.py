@@ -30,7 +30,7 @@ class ErrorPrediction:
         self._manager, self._values = manager, values
         self._lock = threading.Lock()
         self._of = ""
-        self._predictor: ErrorPredictor | None = None
+        self._predictor: ErrorPredictor | Refusal | None = None  # why there is none, so as not to find out again
 
     def fit(self, request: Any, response: Any) -> Any:
         """Serve `fit_regression`.
@@ -71,13 +71,15 @@ class ErrorPrediction:
                 try:
                     self._predictor = self._fitted(calibration, calibration.fit.method, None)
                 except Refusal as error:
-                    if error.error_code != ErrorCode.TOO_FEW_MAPS:
-                        raise
-                    # Of pokes alone, for instance: nothing to warn of, for the controller asks of each calibration.
-                    response.error_code, response.message = error.error_code, str(error)
-                    return response
+                    self._predictor = error
                 self._of = calibration.id
             predictor = self._predictor
+        if isinstance(predictor, Refusal):
+            if predictor.error_code != ErrorCode.TOO_FEW_MAPS:
+                raise Refusal(predictor.error_code, str(predictor))
+            # Of pokes alone, for instance: nothing to warn of, for the controller asks of each calibration.
+            response.error_code, response.message = predictor.error_code, str(predictor)
+            return response
         response.predicted_rms, response.lower, response.upper = predictor.predict(signals)
         method = predictor.influence.method
         response.message = f"by {method} on calibration {calibration.id}, over many histories before this command"
