@@ -220,28 +220,29 @@ class Planner:
 
         return CreepError(self.law, self._zernike, self.mirror.sag_root, whole)
 
-    def error_bound(self, known: bool) -> float:
-        """m, 95 % bound of the largest coefficient error, but for creep, with the history `known` or not."""
-        if self.hysteresis is None:
-            return self.mirror.model.held_out_max_zernike
-        unknown = 0.0 if known else self.unknown_max_zernike
-        return math.hypot(self.law.in_use * self.hysteresis.held_out_max_zernike, unknown)
+    def error_bound(self, known: bool, error: float | None = None) -> float:
+        """m, 95 % bound of the largest coefficient error, but for creep, with the history `known` or not.
+
+        Args:
+            error: the same of this shape with a known history, m; None = as of any.
+        """
+        if error is None:
+            found, model = self.hysteresis, self.mirror.model
+            error = model.held_out_max_zernike if found is None else self.law.in_use * found.held_out_max_zernike
+        return math.hypot(error, 0.0 if known else self.unknown_max_zernike)
 
     def _bounded(
         self, plan: Plan, signals: Floats, known: bool, creep: tuple[float, float], error: float | None
     ) -> Plan:
-        rms_spread = self.mirror.model.held_out_rms
-        largest_spread = self.error_bound(True) if error is None else error - plan.max_zernike
-        if not known:
-            rms_spread = float(np.hypot(rms_spread, self._unknown_rms))
-            largest_spread = float(np.hypot(largest_spread, self.unknown_max_zernike))
-        rms_lower, rms_upper = rms_bounds(plan.rms, float(np.hypot(rms_spread, creep[1] / 1.96)))
+        rms_spread = math.hypot(self.mirror.model.held_out_rms, 0.0 if known else self._unknown_rms, creep[1] / 1.96)
+        largest_spread = self.error_bound(known, None if error is None else error - plan.max_zernike)
+        rms_lower, rms_upper = rms_bounds(plan.rms, rms_spread)
         return replace(
             plan,
             signals=signals,
             rms_lower=rms_lower,
             rms_upper=rms_upper,
-            max_zernike_upper=plan.max_zernike + float(np.hypot(largest_spread, creep[0])),
+            max_zernike_upper=plan.max_zernike + math.hypot(largest_spread, creep[0]),
             saturated=self.mirror.limits.at_limit(signals),
         )
 
