@@ -205,8 +205,8 @@ def test_who_holds_the_mirror_is_named() -> None:
 def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixture[str]) -> None:
     assert "promised 97 nm (95 % bound, λ/7), measured 1.3 nm: " in verdict(97e-9, 1.3e-9)
     assert "inside" in verdict(97e-9, 1.3e-9) and "outside" in verdict(1e-9, 1.3e-9)
-    assert "promised 153 nm (95 % bound, λ/4), measured 100 nm: " in verdict(153.2e-9, 99.7e-9)
-    assert "1266 nm (95 % bound, 2 λ)" in verdict(1265.6e-9, 1e-9)
+    assert "promised 153 nm (95 % bound), measured 100 nm: " in verdict(153.2e-9, 99.7e-9)
+    assert "1266 nm (95 % bound), " in verdict(1265.6e-9, 1e-9)
     assert verdict(0.0, 1e-9) == "promised not known, measured 1 nm"
     _show(FocusState(curvature=0.02, power=0.04, predicted_max_zernike_upper=1.3e-9, history_known=True))
     said = capsys.readouterr().out

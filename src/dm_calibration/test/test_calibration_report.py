@@ -126,7 +126,7 @@ def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibra
     assert "absolute not known (instrument_error and scale_error of the interferometer not given)" in text
     known = replace(calibration, reference_surface="flat.dat, SHA-256 01", instrument_error=5e-9, scale_error=1e-4)
     absolute = one_html("", [certificate(known, {})])
-    assert "flat.dat, SHA-256 01" in absolute and " nm (" in absolute.partition("absolute to ")[2][:20]
+    assert "flat.dat, SHA-256 01" in absolute and " nm, limited by" in absolute.partition("absolute to ")[2][:20]
     dead = replace(calibration.fit, grades=np.array([2] + [0] * 36, dtype=np.uint8))
     assert "actuators 1 are dead" in doubts(replace(calibration, fit=dead))[0]
     assert people(tmp_path / "none.json") == {}
@@ -250,6 +250,6 @@ def test_interpolation_on_the_disc_keeps_a_smooth_shape() -> None:
     np.testing.assert_allclose(shown[inside], (x**2 - 0.5 * y)[inside], atol=5e-3)
 
 
-def test_a_length_above_the_wavelength_is_a_multiple_of_it() -> None:
-    assert content.length(2e-6, 632.8e-9) == "2000.00 nm (3.2 λ)"
+def test_a_length_is_put_by_the_wavelength_where_that_says_more() -> None:
+    assert content.length(2e-6, 632.8e-9) == "2000.00 nm"
     assert content.length(1.3e-9, 632.8e-9) == "1.30 nm (λ/487)"

@@ -17,10 +17,8 @@ def in_nanometres(length: float) -> str:
 
 
 def in_wavelengths(length: float, wavelength: float) -> str:
-    """A length (m) as a fraction of the wavelength, such as λ/50, or as a multiple where it is longer, such as 2 λ."""
-    if length > wavelength:
-        return f"{rounded(length / wavelength)} λ"
-    return f"λ/{wavelength / length:.0f}" if length > 0 else "0"
+    """A length (m) as a fraction of the wavelength, such as λ/50; "" above λ/5, which a whole number tells badly."""
+    return f"λ/{wavelength / length:.0f}" if 0.0 < 5.0 * length <= wavelength else ""
 
 
 def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
@@ -34,8 +32,8 @@ def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
     """
 
     def length(metres: float) -> str:
-        share = f" ({in_wavelengths(metres, calibration.wavelength)})" if calibration.wavelength > 0.0 else ""
-        return f"{in_nanometres(metres)}{share}"
+        share = in_wavelengths(metres, calibration.wavelength)
+        return f"{in_nanometres(metres)} ({share})" if share else in_nanometres(metres)
 
     if not (math.isfinite(repeatable) and repeatable > 0.0):
         return "repeatable to what is not known"

@@ -109,5 +109,5 @@ def nanometres(length: float) -> float:
 
 
 def as_wavelengths(length: float) -> str:
-    """A length (m) by the wavelength of the interferometer, such as λ/50."""
+    """A length (m) by the wavelength of the interferometer, such as λ/50; "" above λ/5."""
     return in_wavelengths(length, WAVELENGTH)

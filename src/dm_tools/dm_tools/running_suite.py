@@ -64,7 +64,9 @@ def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
 
 def promise(bound: float) -> str:
     """A 95 % bound on the largest coefficient error (m) in the one way all verbs put it."""
-    return f"{in_nanometres(bound)} (95 % bound, {as_wavelengths(bound)})" if bound > 0.0 else "not known"
+    if not bound > 0.0:
+        return "not known"
+    return f"{in_nanometres(bound)} ({', '.join(filter(None, ('95 % bound', as_wavelengths(bound))))})"
 
 
 def ago(seconds: float) -> str:

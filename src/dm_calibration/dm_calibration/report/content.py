@@ -29,8 +29,8 @@ def length(metres: float, wavelength: float) -> str:
     """A length in nm, and as a share of the wavelength where that is known."""
     if not np.isfinite(metres):
         return "not known"
-    share = f" ({in_wavelengths(metres, wavelength)})" if wavelength > 0.0 and metres > 0.0 else ""
-    return f"{metres * NM:.2f} nm{share}"
+    share = in_wavelengths(metres, wavelength)
+    return f"{metres * NM:.2f} nm ({share})" if share else f"{metres * NM:.2f} nm"
 
 
 def promise(calibration: Calibration) -> float:

@@ -130,7 +130,7 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
     worst = max(row["error"].max_zernike for row in rows)
     console.print(
         f"fitting limit of this mirror at the ends of the sweep: {nanometres(fitting_limit):.1f} nm rms; "
-        f"largest coefficient error of the sweep: {nanometres(worst):.2f} nm ({as_wavelengths(worst)})"
+        f"largest coefficient error of the sweep: {nanometres(worst):.2f} nm"
     )
 
 
