@@ -137,7 +137,7 @@ def run() -> Iterator[Answer]:
     with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:
         folder = Path(temporary)
         config = bench_config(folder, "off", 0.0, 3, 20.0)
-        config["virtual_bench"] |= {"clock.period": 0.02, "interferometer.pixels": 236}
+        config["virtual_bench"]["interferometer.pixels"] = 236
         config["virtual_bench"] |= {"camera.rate": 5.0, "camera.width": 64, "camera.height": 48}
         config["autofocus"] = {"optics.rest_distance": 10.0, "use_sim_time": True}
         config["calibration"]["write_report"] = False

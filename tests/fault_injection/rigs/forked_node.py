@@ -26,7 +26,15 @@ from dm_bringup.nodes import MODULES
 from dm_bringup.suite import Suite
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(list(MODULES.values()))
+#: Packages whose messages nodes speak. Each node loads their libraries when it is made, and the generator of interfaces
+#: with its parser of grammars.
+_SPOKEN = (
+    *("action_msgs", "builtin_interfaces", "diagnostic_msgs", "dm_msgs", "lifecycle_msgs", "rcl_interfaces"),
+    *("sensor_msgs", "service_msgs", "std_msgs", "std_srvs", "type_description_interfaces", "unique_identifier_msgs"),
+)
+_LIBRARIES = [f"{package}.{package}_s__rosidl_typesupport_c" for package in _SPOKEN]
+_GENERATOR = ["rosidl_generator_py", "service_msgs.msg", "type_description_interfaces.msg"]
+_CONTEXT.set_forkserver_preload([__name__, *MODULES.values(), *_GENERATOR, *_LIBRARIES])
 
 
 class ForkedNode:

@@ -78,7 +78,7 @@ def bench_config(
     (folder / "maps").mkdir(parents=True, exist_ok=True)
     if speed > 0:
         if law == "off":  # such actuators care for no time between two ticks, each of which wakes every node
-            bench["clock.period"] = 0.005
+            bench["clock.period"] = 0.02
         # Ages are in ROS time, in which the same delay between two processes is `speed` times as long.
         config["pdm_driver"] |= {"limits.command_age": max(1.0, speed), "limits.command_lead": max(0.5, speed)}
         config["focus_controller"]["request_age"] = max(1.0, speed)
