@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -59,6 +60,19 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, files: int, names: list[st
 def test_a_template_that_nobody_has_filled_in_is_refused() -> None:
     with pytest.raises(ValueError, match=r"hardware\.yaml: still CHANGE: pdm_driver\.mirror\.serial, .*watch_folder"):
         configurations([shared_config("hardware.yaml")], [""])
+
+
+def test_a_second_bench_on_the_same_ports_is_refused(tmp_path: Path, domain: int) -> None:
+    config = bench_config(tmp_path, "off", 0.0, 1, 0.0)
+    port = config["virtual_bench"]["electronics.tcp_port"]
+    save_config(config, tmp_path / "config.yaml")
+    command = [sys.executable, "-m", "dm_tools", "up", "--config", str(tmp_path / "config.yaml")]
+    environment = os.environ | {"ROS_HOME": str(tmp_path), "ROS_DOMAIN_ID": str(domain)}
+    with socket.create_server(("127.0.0.1", port)):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == 1 and "starting" not in done.stdout, done.stdout + done.stderr
+    assert f"electronics.tcp_port = {port}: Address already in use" in done.stderr
+    assert "stop the ./dm up that is running" in done.stderr
 
 
 def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:

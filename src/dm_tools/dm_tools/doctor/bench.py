@@ -230,7 +230,8 @@ def free_ports(bench: Mapping[str, Any]) -> Finding | None:
     if taken:
         return Finding(
             "; ".join(taken),
-            "stop the ./dm up that is running, or the program that holds the port (ss -lntup shows it); or take others",
+            "stop the ./dm up that is running, or the program that holds the port (ss -lntup shows it); or give the "
+            "virtual bench and what connects to it others in a parameter file",
         )
     return None
 
