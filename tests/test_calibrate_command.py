@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from dm_msgs.action import Calibrate
+from dm_msgs.msg import Calibration as CalibrationMsg
 from typer.testing import CliRunner
 
 from dm_bringup.suite import ConfigError, load_config
+from dm_calibration.calibration_messages import hysteresis_message
+from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.procedure.forecast import GoodEnough
+from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_tools import cli
 from dm_tools.parameter_changes import source_of, write_parameters
-from dm_tools.verbs.calibrate import REACHED, after_run, metres, show_result
+from dm_tools.verbs.calibrate import REACHED, after_run, figures_of, metres, show_result
 from dm_tools.verbs.up import shared_config
+from example_hysteresis import plays
 
 FOUND = "/**/interferometer:\n  ros__parameters:\n    orientation.rotate_deg: -35.010000\n    orientation.flip_x: true"
 
@@ -63,12 +71,34 @@ def test_the_file_of_another_mirror_is_refused(tmp_path: Path) -> None:
         source_of(tmp_path / "new.yaml", source, "T-7")
 
 
-@pytest.mark.parametrize(("model", "promised"), [("Preisach, each actuator its own", "2.8"), ("static", "2")])
+@pytest.mark.parametrize(
+    ("model", "law", "promised"),
+    [
+        ("Preisach, each actuator its own", plays(), "2.8 nm (95 % bound"),
+        ("linear", HysteresisModel.linear(), "2 nm (95 % bound"),
+        ("linear", replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES), "2.8 nm (95 % bound"),
+        ("linear", None, "none while it is not in use"),
+    ],
+)
 def test_the_promise_is_what_requests_will_be_told(
-    model: str, promised: str, capsys: pytest.CaptureFixture[str]
+    model: str, law: HysteresisModel | None, promised: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    show_result(Calibrate.Result(hysteresis_model=model, hysteresis_held_out_max_zernike=2e-9))
-    assert f"promise: {promised} nm (95 % bound" in capsys.readouterr().out
+    found = law and HysteresisFit(model, law, np.full(21, 1e-9), 2e-9, 0.05, 120, ())
+    calibration = CalibrationMsg(hysteresis=hysteresis_message(found)) if found else None
+    show_result(Calibrate.Result(hysteresis_model=model, hysteresis_held_out_max_zernike=2e-9), calibration)
+    assert f"promise: {promised}" in capsys.readouterr().out
+
+
+def test_what_a_run_does_not_have_is_no_zero() -> None:
+    figures = figures_of(Calibrate.Result(maps=90, held_out_rms=3e-9))
+    assert figures["held_out_rms_nm"] == pytest.approx(3.0)
+    lacking = {name for name, value in figures.items() if isinstance(value, float) and math.isnan(value)}
+    assert lacking == {
+        "in_sample_rms_nm",
+        "condition_number",
+        "hysteresis_held_out_max_zernike_nm",
+        "expected_max_zernike_nm",
+    }
 
 
 def test_wrong_wiring_is_put_right_before_the_mirror_is_used() -> None:

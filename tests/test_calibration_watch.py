@@ -22,6 +22,7 @@ from calibration_stand_in import StandIn
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
+from dm_tools.running_suite import promise_of
 from linear_mirror import LinearMirror
 from steady_mirror import NOISE, SteadyMirror, without_effect
 from support import NodeProcess, Observer, wait_until
@@ -176,6 +177,7 @@ def test_the_command_checks_and_tells_by_its_exit_status(suite: Suite, tmp_path:
     assert done.returncode == 0, done.stdout + done.stderr
     check = json.loads(figures.read_text())["check"]
     assert check["revision"] == 1
+    assert check["promised_nm"] == pytest.approx(1e9 * promise_of(suite.calibration))  # no controller is there
     suite.bench.plant.figure_coefficients[4] += 1e-9 * (check["promised_nm"] + check["max_zernike_nm"])
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1 and "outside" in done.stdout and "the map disagrees" not in done.stdout, done.stdout

@@ -69,6 +69,16 @@ def promise(bound: float) -> str:
     return f"{in_nanometres(bound)} ({', '.join(filter(None, ('95 % bound', as_wavelengths(bound))))})"
 
 
+def promise_of(calibration: Any) -> float:
+    """m, 95 % bound on the largest coefficient error of a request but for creep, as a calibration's message tells."""
+    from dm_common.messages import hysteresis_model_from
+
+    law = hysteresis_model_from(calibration.hysteresis)
+    if law is None:
+        return float(calibration.held_out_max_zernike)
+    return float(law.in_use * calibration.hysteresis.held_out_max_zernike)
+
+
 def ago(seconds: float) -> str:
     """A time that has passed, in the unit that fits it."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):

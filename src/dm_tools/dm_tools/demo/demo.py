@@ -138,13 +138,13 @@ def identify_hysteresis(client: Any, maps: int, settle: float) -> tuple[Any, lis
     """Identify hysteresis and creep, degauss, sweep again; returns the result of the run and the rows."""
     from dm_msgs.action import Calibrate
 
-    from dm_tools.verbs.calibrate import run_calibration, show_result
+    from dm_tools.verbs.calibrate import made_by, run_calibration, show_result
 
     goal = Calibrate.Goal(
         plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=maps, activate=True, note="demo, hysteresis"
     )
     result = run_calibration(client, goal)
-    show_result(result)
+    show_result(result, made_by(client, result))
     wait_for_calibration(client, result.id)
     client.degauss()
     return result, sweep(client, settle)

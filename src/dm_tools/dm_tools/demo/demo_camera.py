@@ -82,7 +82,7 @@ def demo_camera(
     from dm_common.ros.domains import own_domain
     from dm_tools.demo.pictures import save_animation, save_contact_sheet
     from dm_tools.verbs.calibrate import figures_of as calibration_figures
-    from dm_tools.verbs.calibrate import run_calibration, show_result
+    from dm_tools.verbs.calibrate import made_by, run_calibration, show_result
 
     started = time.monotonic()
     folder = new_folder(out)
@@ -97,7 +97,7 @@ def demo_camera(
                 plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=MAPS, activate=True, note="camera"
             )
             calibrated = run_calibration(client, goal)
-        show_result(calibrated)
+            show_result(calibrated, made_by(client, calibrated))
     shutil.rmtree(folder / "maps")
     # A domain of its own: the first suite's time ran ahead, and nothing of it must be taken for news.
     with own_domain() as domain:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from contextlib import suppress
 from enum import StrEnum
@@ -22,10 +23,8 @@ from dm_tools.output import (
     write_json,
 )
 from dm_tools.parameter_changes import set_parameter, source_of, write_parameters
-from dm_tools.running_suite import naming_holder, promise, running_suite
+from dm_tools.running_suite import REPORT_S, naming_holder, promise, promise_of, running_suite
 
-#: How laws are called under which what was commanded before does not count.
-NO_HISTORY = ("linear", "static")
 #: What tells the sentence of a result on what --until asked for.
 REACHED = re.compile(r"^\S+ nm is (not )?reached")
 
@@ -84,21 +83,26 @@ def start_fresh(client: Any, fresh: bool = True) -> None:
     set_parameter(client, "calibration", "start_fresh", fresh)
 
 
-def show_result(result: Any) -> None:
-    """Print a calibration's figures and everything a person should know about it."""
+def made_by(client: Any, result: Any) -> Any:
+    """The message of the calibration that a run made; None where it is not in use."""
+    client.wait(lambda: getattr(client.messages.get("calibration"), "id", "") == result.id, REPORT_S)
+    calibration = client.messages.get("calibration")
+    return calibration if result.id and calibration is not None and calibration.id == result.id else None
+
+
+def show_result(result: Any, calibration: Any = None) -> None:
+    """Print a calibration's figures and everything a person should know about it; `calibration`: see `made_by`."""
     if result.id:
         console.print(
             f"calibration [bold]{result.id}[/]: {result.maps} maps in {result.duration:.0f} s, residual "
             f"{nanometres(result.held_out_rms):.2f} nm rms on maps held out"
         )
     if result.hysteresis_model:
-        from dm_common.hysteresis.model import IN_USE
-
-        held_out = result.hysteresis_held_out_max_zernike
-        in_use = 1.0 if result.hysteresis_model.startswith(NO_HISTORY) else IN_USE
+        promised = promise(promise_of(calibration)) if calibration is not None else "none while it is not in use"
         console.print(
-            f"promise: {promise(in_use * held_out)} for the largest coefficient, from {in_nanometres(held_out)} of "
-            f"moves held out{_foretold(result)}; hysteresis {result.hysteresis_model}"
+            f"promise: {promised} for the largest coefficient, from "
+            f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{_foretold(result)}; hysteresis "
+            f"{result.hysteresis_model}"
         )
     for entry in result.dropped:
         console.print(f"[yellow]dropped[/] {entry}")
@@ -124,18 +128,22 @@ def _foretold(result: Any) -> str:
 
 
 def figures_of(result: Any) -> dict[str, Any]:
-    """A calibration's figures for JSON."""
+    """A calibration's figures for JSON; NaN for what it does not have, as a dry run has no residual."""
+
+    def length(metres: float) -> float:
+        return nanometres(metres) if metres > 0.0 else math.nan
+
     return {
         "id": result.id,
         "maps": result.maps,
         "maps_dropped": result.maps_dropped,
         "seconds": result.duration,
-        "in_sample_rms_nm": nanometres(result.in_sample_rms),
-        "held_out_rms_nm": nanometres(result.held_out_rms),
-        "condition_number": result.condition_number,
+        "in_sample_rms_nm": length(result.in_sample_rms),
+        "held_out_rms_nm": length(result.held_out_rms),
+        "condition_number": result.condition_number or math.nan,
         "hysteresis_model": result.hysteresis_model,
-        "hysteresis_held_out_max_zernike_nm": nanometres(result.hysteresis_held_out_max_zernike),
-        "expected_max_zernike_nm": nanometres(result.expected_max_zernike),
+        "hysteresis_held_out_max_zernike_nm": length(result.hysteresis_held_out_max_zernike),
+        "expected_max_zernike_nm": length(result.expected_max_zernike),
         "expected_seconds": result.expected_duration,
         "poke_findings": list(result.poke_findings),
         "parameters": result.parameters,
@@ -228,6 +236,7 @@ def calibrate(
             start_fresh(client)
         try:
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
+            calibration = made_by(client, result) if activate and not dry_run else None
         except DeformableMirrorError as error:
             if error.response is not None:
                 show_result(error.response)
@@ -242,7 +251,7 @@ def calibrate(
     else:
         if result.message.startswith("resumed run"):
             console.print(result.message.partition(";")[0])
-        show_result(result)
+        show_result(result, calibration)
         if until:
             console.print(next((part for part in result.message.split("; ") if REACHED.search(part)), ""))
     write_json(json, {"calibration": figures_of(result)})

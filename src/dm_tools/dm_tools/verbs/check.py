@@ -8,7 +8,16 @@ import typer
 
 from dm_common.figures import two_fold
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, nanometres, next_step, write_json
-from dm_tools.running_suite import REPORT_S, hear_health, kept, naming_holder, running_suite, settled_shape, verdict
+from dm_tools.running_suite import (
+    REPORT_S,
+    hear_health,
+    kept,
+    naming_holder,
+    promise_of,
+    running_suite,
+    settled_shape,
+    verdict,
+)
 
 
 def check(
@@ -43,8 +52,8 @@ def check(
         promised = shape.bound
     elif capabilities is not None:
         promised = capabilities.error_bound
-    else:  # without a focus controller, what the calibration's own maps showed
-        promised = calibration.hysteresis.held_out_max_zernike or calibration.held_out_max_zernike
+    else:  # without a focus controller, what one would promise
+        promised = promise_of(calibration)
     if forget:
         console.print(response.message)
     else:
