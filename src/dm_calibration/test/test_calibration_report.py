@@ -114,6 +114,16 @@ def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) ->
     assert '<th scope="col">SHA' not in page[: page.index("<h2>Files")]
 
 
+def test_a_figure_that_asks_too_much_of_neighbours_does_not_put_flat_out_of_reach(calibration: Calibration) -> None:
+    """A bump over one actuator, a little higher than it may stand away from its neighbours: these share the rest."""
+    fit = calibration.fit
+    bump = replace(fit, zernike_offset=0.25 * fit.influence_zernike[:, 0], sag_offset=0.25 * fit.influence_sag[:, 0])
+    applied = np.zeros_like(calibration.maps.applied)
+    applied[:, 0] = 0.2
+    low, high = curvatures(replace(calibration, fit=bump, maps=replace(calibration.maps, applied=applied)))
+    assert low < -0.01 and high > 0.01
+
+
 def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibration, tmp_path: Path) -> None:
     file = tmp_path / "people.json"
     keep_people({"operator": "A. N. Other", "instrument": ""}, file)

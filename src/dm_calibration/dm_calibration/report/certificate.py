@@ -80,9 +80,10 @@ def curvatures(calibration: Calibration) -> tuple[float, float]:
     mirror = Mirror(calibration.mirror_name, calibration.mirror_serial, x, y, radius, limits)
 
     def reached(curvature: float) -> bool:
-        signals, _left = solve_shape(conic_sag(radius * fit.points.x, radius * fit.points.y, curvature), fit, mirror)
+        sag = conic_sag(radius * fit.points.x, radius * fit.points.y, curvature)
+        signals, _left = solve_shape(sag, fit, mirror, limits)
         error = fit.influence_zernike @ signals + fit.zernike_offset - conic_coefficients(curvature, 0.0, radius)
-        return bool(np.abs(error[PISTON_TILT:]).max() <= TOLERANCE) and limits.allow_neighbours(signals)
+        return bool(np.abs(error[PISTON_TILT:]).max() <= TOLERANCE)
 
     def edge(far: float) -> float:
         near = 0.0
