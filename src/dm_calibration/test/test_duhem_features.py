@@ -33,16 +33,18 @@ def test_nothing_is_said_of_an_operator_without_weight() -> None:
     assert own_slopes(common, np.full(ACTUATORS, 1e-3), np.full((6, ACTUATORS), 0.1)) == pytest.approx(common)
 
 
-def test_weights_are_those_of_the_whole_normal_equations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only their lower half is put together: whatever memory held before in the other counts for nothing."""
+@pytest.mark.parametrize("near", [None, np.full((3, ACTUATORS), 0.5)])
+def test_weights_are_those_of_the_normal_equations(near: np.ndarray | None) -> None:
     rng = np.random.default_rng(3)
     features, left, gains = (rng.standard_normal(shape) for shape in ((40, 3, ACTUATORS), (40, 6), (ACTUATORS, 6)))
-    between = np.eye(ACTUATORS) + 0.1
+    own, common = 100.0, 100.0 / (ACTUATORS + 0.01)
+    root = np.array([[1.0, 0.0, 0.0], [0.3, 0.5, 0.0], [0.0, 0.1, 2.0]])
+    between = own * np.eye(ACTUATORS) - common
     columns = np.einsum("mfn,nd->mdnf", features, gains).reshape(40 * 6, -1)
-    normal = columns.T @ columns + np.kron(between, np.eye(3))
+    normal = columns.T @ columns + np.kron(between, np.linalg.inv(root @ root.T))
     expected = np.linalg.solve(normal, columns.T @ left.ravel()).reshape(ACTUATORS, 3).T
-    monkeypatch.setattr(np, "empty", lambda shape, *_arguments, **_keywords: np.full(shape, np.nan))
-    np.testing.assert_allclose(weights_of(features, left, gains, np.eye(3), between), expected, rtol=1e-9)
+    found = weights_of(features, left, gains, root, (own, common), near)
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("own", [True, False])

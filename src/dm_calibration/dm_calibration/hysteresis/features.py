@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse.linalg import LinearOperator, cg
 
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
@@ -18,6 +18,8 @@ PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIM
 #: Creep rate that a prior takes where a law has found less.
 RATE_MIN = 1e-3
 
+#: Residual of the solved weights, relative: effective signals are within 1e-7 then.
+SOLVED = 1e-7
 #: Fewest coefficients of a Duhem operator of its own, the step for derivatives by them, their largest change, and the
 #: weight of an operator below which nothing can be said of them.
 DUHEM_ORDERS, SLOPE_STEP, CHANGE_MAX, DUHEM_WEIGHT_MIN = 3, 0.02, 1.0, 0.01
@@ -181,21 +183,44 @@ def follow(
     return result, state
 
 
-def weights_of(features: Floats, left: Floats, gains: Floats, prior: Floats, between: Floats) -> Floats:
-    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md and the inverse prior covariance
-    `between` (N, N) over actuators times `prior` (F, F) over features.
+def weights_of(
+    features: Floats,
+    left: Floats,
+    gains: Floats,
+    root: Floats,
+    between: tuple[float, float],
+    near: Floats | None = None,
+) -> Floats:
+    """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md in the least squares.
+
+    Their prior covariance is `root` `root`' over features (F, F), times that over actuators whose inverse is
+    own I - common 1 1'. Found by conjugate gradients; their preconditioner leaves out how actuators' responses overlap.
+
+    Args:
+        between: own, common.
+        near: (F, N) weights to begin with; None = 0.
     """
+    own, common = between
     count, actuators = features.shape[1:]
-    by_actuator = np.ascontiguousarray(features.transpose(2, 1, 0)).reshape(actuators * count, -1)
+    # Of unknowns u with w = root u, whose prior is 1.
+    columns = np.ascontiguousarray(features.transpose(2, 0, 1)) @ root
+    rows = np.ascontiguousarray(columns.transpose(0, 2, 1))
     seen = gains @ gains.T
-    normal = np.zeros((actuators * count, actuators * count))
-    for number in range(actuators):  # the lower triangle alone, block by block: it is symmetric
-        rows, end = slice(number * count, (number + 1) * count), (number + 1) * count
-        block = (by_actuator[rows] @ by_actuator[:end].T).reshape(count, -1, count)
-        block *= seen[number, : number + 1, None]
-        block += between[number, : number + 1, None] * prior[:, None, :]
-        normal[rows, :end] = block.reshape(count, end)
-    right = np.einsum("mfn,mn->nf", features, left @ gains.T)
-    # In the order in which LAPACK can overwrite it: transposed, the upper triangle is there.
-    factor = cho_factor(normal.T, overwrite_a=True, check_finite=False)
-    return np.asarray(cho_solve(factor, right.ravel()).reshape(actuators, count).T)
+    alone = np.linalg.inv(np.diag(seen)[:, None, None] * (rows @ columns) + own * np.eye(count))
+    together = common * np.linalg.inv(np.eye(count) - common * alone.sum(axis=0))
+
+    def evidence(flat: Floats) -> Floats:
+        unknown = flat.reshape(actuators, count, 1)
+        shown = (rows @ (seen @ (columns @ unknown)[..., 0])[..., None])[..., 0]
+        return np.asarray(shown + own * unknown[..., 0] - common * unknown[..., 0].sum(axis=0)).ravel()
+
+    def nearly_solved(flat: Floats) -> Floats:
+        solved = (alone @ flat.reshape(actuators, count, 1))[..., 0]
+        return np.asarray(solved + alone @ (together @ solved.sum(axis=0))).ravel()
+
+    right = (rows @ (gains @ left.T)[..., None]).ravel()
+    begin = None if near is None else np.linalg.solve(root, near).T.ravel()
+    shape = (right.size, right.size)
+    preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
+    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, begin, rtol=SOLVED, M=preconditioner)
+    return np.asarray(root @ unknown.reshape(actuators, count).T)

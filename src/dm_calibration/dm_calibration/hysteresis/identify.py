@@ -9,7 +9,7 @@ are alike keeps its common law.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,8 @@ class Identification:
         fit: of the chosen candidate, to all maps.
         held_out: (M, D) residual of maps that had no part in the fit: the test maps, or where there are none, each part
             of the run in turn; NaN = not predicted.
-        scores: held-out error of each candidate in units of the scatter of the best.
+        scores: held-out error of each candidate relative to the best; estimated where a richer one than the best leaves
+            hardly less in the maps it was fitted to.
         refused: candidates that cannot be inverted, with the reason.
     """
 
@@ -98,6 +99,9 @@ def identify(
     refused: dict[str, str] = {}
     reach = float(run.signals.min()), float(run.signals.max())
 
+    def size(residual: Floats) -> float:
+        return float(np.sqrt(np.mean(np.square(residual[train] / scatter))))
+
     def consider(problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
         nonlocal best
         name = problem.candidate.name
@@ -109,13 +113,17 @@ def identify(
         if slope < slope_min:
             refused[name] = f"its slope falls to {slope:.2f}: it could not be inverted safely"
             return
-        held_out = np.full_like(whole.residual, np.nan)
-        for fold in range(folds):
-            left_out = train & (part == fold)
-            held_out[left_out] = problem.fit(train & ~left_out, whole).residual[left_out]
-        scores[name] = float(np.sqrt(np.mean(np.square(held_out[train] / scatter))))
-        if best is None or PARSIMONY * scores[name] < best[0]:
-            best = (scores[name], problem, whole, held_out)
+        gain = size(best[2].residual) / size(whole.residual) if best else np.inf
+        if best and _contains(whole.candidate, best[2].candidate) and gain < PARSIMONY:
+            scores[name] = best[0] / gain  # what it leaves of its own maps is no less: nor will be what it predicts
+        else:
+            held_out = np.full_like(whole.residual, np.nan)
+            for fold in range(folds):
+                left_out = train & (part == fold)
+                held_out[left_out] = problem.fit(train & ~left_out, whole).residual[left_out]
+            scores[name] = size(held_out)
+            if best is None or PARSIMONY * scores[name] < best[0]:
+                best = (scores[name], problem, whole, held_out)
         refused.pop(name, None)
         if not whole.candidate.own:
             common.append((scores[name], whole))
@@ -162,6 +170,11 @@ def _begun(
     left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
     for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
         yield made[number]
+
+
+def _contains(richer: Candidate, simpler: Candidate) -> bool:
+    """Whether the laws of `richer` are those of `simpler` and more."""
+    return all(more >= less for more, less in zip(astuple(richer)[1:], astuple(simpler)[1:], strict=True))
 
 
 def check_excitation(run: Run) -> None:

@@ -122,7 +122,7 @@ class OwnLaws:
         number = np.arange(LAGS)
         lag = LAG**2 * np.exp(-np.abs(np.subtract.outer(number, number)) / SPECTRUM_CORRELATION)
         prior = block_diag(prior_of_creep, lag, CREEP_SLOPE**2)
-        self._creep_prior = np.asarray(np.linalg.inv(prior), dtype=np.float64)
+        self._creep_root = np.asarray(np.linalg.cholesky(prior), dtype=np.float64)
         self._signal_states = self._creep_states(signals)
         self._creep_between = _alike(count, SPECTRUM_SPREAD)
         self._figure = figure_columns(run.time, self._parts, self._starts)
@@ -138,7 +138,7 @@ class OwnLaws:
         else:
             patterns = np.eye(self._plain.shape[1], 1) * np.ones(actuators)
             # Where the maps show no common creep, no actuator has any.
-            creep = np.zeros((len(self._creep_prior), actuators))
+            creep = np.zeros((len(self._creep_root), actuators))
             creep[: len(CREEP_TIMES)] = self._creep if self._creeps else 0.0
             scatter, slope = self._scatter, self._slope
             if slope.size:
@@ -171,7 +171,7 @@ class OwnLaws:
         more = features.shape[1] - self._plain.shape[1]
         sigma = np.concatenate((np.ones(self._basis.shape[1]), np.full(min(more, 1), DUHEM_WEIGHT)))
         sigma = np.concatenate((sigma, np.full(max(more - 1, 0), DUHEM_CHANGE)))
-        prior = np.diag(sigma**-2.0)
+        root = np.diag(sigma)
         patterns = np.vstack((patterns, np.zeros((features.shape[1] - len(patterns), features.shape[2]))))
         free = basis_of(self._figure[keep])
         crept = self._with_creep(features, creep, patterns)
@@ -179,7 +179,7 @@ class OwnLaws:
         for number in range(self._rounds_needed):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
-            patterns = self._patterns(crept[keep], gains / scatter, measured, free, prior)
+            patterns = self._patterns(crept[keep], patterns, gains / scatter, measured, free, root)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
@@ -249,10 +249,12 @@ class OwnLaws:
         size = MAD_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
         return self.run.responses.scatter(size)
 
-    def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats, prior: Floats) -> Floats:
+    def _patterns(
+        self, crept: Floats, near: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats
+    ) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior."""
         left = measured - crept[:, 0] @ gains
-        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, prior, self._between)
+        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, root, self._between, near[1:])
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(
@@ -266,7 +268,10 @@ class OwnLaws:
         elements = np.concatenate((elements, sloped[:, None]), axis=1)[keep]
         count = len(CREEP_TIMES)
         left = measured - (position[keep] + self._creep * elements[:, :count].sum(axis=1)) @ gains
-        found = weights_of(without(elements, free), without(left, free), gains, self._creep_prior, self._creep_between)
+        near = creep.copy()
+        near[:count] -= self._creep
+        elements, left = without(elements, free), without(left, free)
+        found = weights_of(elements, left, gains, self._creep_root, self._creep_between, near)
         found[:count] += self._creep
         return found
 
@@ -283,6 +288,7 @@ def pattern_basis(radius: Floats, orders: int) -> Floats:
     return np.asarray(axes[:, strongest] * np.sqrt(size[strongest]))
 
 
-def _alike(actuators: int, spread: float) -> Floats:
-    """(N, N) inverse prior covariance over actuators that share a common part and differ by `spread` of it."""
-    return np.asarray(np.linalg.inv(np.ones((actuators, actuators)) + spread**2 * np.eye(actuators)))
+def _alike(actuators: int, spread: float) -> tuple[float, float]:
+    """What :func:`weights_of` takes where actuators share a common part and differ by `spread` of it."""
+    own = spread**-2.0
+    return own, own / (actuators + spread**2)
