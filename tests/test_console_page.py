@@ -44,7 +44,7 @@ class RunningConsole:
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningConsole]:
     folder = tmp_path_factory.mktemp("console")
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 3, 20.0)
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
     with own_domain() as domain, served(domain, folder) as address:
         bench = RunningConsole(config, folder, domain, address, ForkedSuite(config, folder, domain).__enter__())
         try:

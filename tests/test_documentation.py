@@ -46,7 +46,7 @@ SHELL = [(str(block), command) for block in BLOCKS if block.kind == "shell" for 
 ROS = sorted({command for _, command in SHELL if command.startswith("ros2 ")})
 INTERFACES = (ROOT / "docs" / "interfaces.md").read_text()
 #: The longest that a command of the scene may take on a busy machine.
-PATIENCE_S = 300.0
+PATIENCE_S = 900.0
 WAVELENGTH = 632.8e-9
 #: Exit status of a command that Ctrl-C ended before it could prepare for it.
 INTERRUPTED = 130

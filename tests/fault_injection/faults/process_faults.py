@@ -28,6 +28,8 @@ from fault_injection.rigs.process_rig import CURVATURE, ProcessRig, calibrated_r
 
 #: Longest time for which a node is stopped, s.
 STOPPED_S = 2.0
+#: The longest that a calibration of pokes may take to its end, s: on an idle machine it is half a minute.
+RUN_S = 300.0
 #: Requests that wait while the interferometer reads; a service keeps ten.
 FILES = 8
 #: Focus requests per second of a stream.
@@ -94,7 +96,7 @@ def calibration_idle(rig: ProcessRig, random: Random) -> Activity:
 @_state("calibration", "in the middle of a run: the mirror is safe, and after Ctrl-C back at mid range")
 def calibration_in_run(rig: ProcessRig, random: Random) -> Activity:
     steps: list[int] = []
-    goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, skip_degauss=True)
+    goal = Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, skip_degauss=True, settle_time=0.1)
     answer = rig.goal(Calibrate, goal, lambda message: steps.append(message.feedback.step))
     step = random.randint(1, 12)
     rig.wait(lambda: steps and steps[-1] >= step, f"step {step} of a calibration")
@@ -176,7 +178,7 @@ def _strike(rig: ProcessRig, node: str, number: int, activity: Activity, random:
         time.sleep(random.uniform(0.2, STOPPED_S))
         rig.processes[node].send_signal(signal.SIGCONT)
         for answer in activity.answers:
-            rig.wait(answer.done, f"an answer of {node}, which went on")
+            rig.wait(answer.done, f"an answer of {node}, which went on", RUN_S)
         return ""
     status = rig.end_node(node, number)
     wrong = ""
