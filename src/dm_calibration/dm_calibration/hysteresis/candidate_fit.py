@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from dm_calibration.hysteresis.features import PER_ELEMENT, creep_states, fading_feature, play_features
+from dm_calibration.hysteresis.features import CreepBlock, creep_blocks, crept, fading_feature, play_features
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of, without
 from dm_common.hysteresis.duhem import DuhemOperator
@@ -136,14 +136,9 @@ class Run:
         return None if self.moved is None else self.moved[part]
 
     @cached_property
-    def followed(self) -> Floats:
-        """(M, J, M) what each creep element has followed at each map of what stood at all; parts begin rested."""
-        followed = np.empty((len(self.time), len(CREEP_TIMES), len(self.time)))  # 480 MB for 2000 maps: made in place
-        for part, start in zip(self.parts, self.starts, strict=True):
-            states = creep_states(np.eye(len(followed))[part], self.time[part], start, self.moved_in(part))
-            for row, state in zip(followed[part], states, strict=True):
-                row[:] = state
-        return followed
+    def creep_blocks(self) -> list[CreepBlock]:
+        """What the creep elements follow."""
+        return creep_blocks(self.parts, self.starts, self.time, self.moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +163,10 @@ class CandidateProblem:
         self.run, self.candidate = run, candidate
         self.radius = candidate.radius
         self._parts, self._starts = run.parts, run.starts
-        self._creep = PER_ELEMENT * run.followed.sum(axis=1)  # (M, M) per unit of creep rate
+        unit = np.eye(len(run.time))
+        self._creep = self._in_parts(  # (M, M) per unit of creep rate
+            lambda part, start: crept(unit[part], run.time[part], start, run.moved_in(part))
+        )
         self._plays = self._in_parts(
             lambda part, start: play_features(run.signals[part], self.radius, candidate.powers)
         )

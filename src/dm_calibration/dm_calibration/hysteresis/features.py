@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ Floats = NDArray[np.float64]
 
 #: Weight of each element of an even creep spectrum per unit of creep rate.
 PER_ELEMENT = float(np.log10(CREEP_TIMES[-1] / CREEP_TIMES[0])) / (len(CREEP_TIMES) - 1)
+#: Maps whose creep is made at once: room, and work, grow as the maps do, not as their square.
+MAPS_AT_ONCE = 64
 #: Creep rate that a prior takes where a law has found less.
 RATE_MIN = 1e-3
 
@@ -123,6 +126,38 @@ def creep_states(values: Floats, time: Floats, start: float, moved: Floats | Non
         state = now + (state - now) * still[2 * row + 1].reshape(shape)
         yield state
         before = now
+
+
+class CreepBlock(NamedTuple):
+    """Some maps of a run that follow each other, and what the creep elements have followed by each of them.
+
+    Attributes:
+        rows: of the run, these maps.
+        stood: of the run, the shapes that stood since the block before: that of its last map, where its part of the run
+            goes on here, and those of `rows`.
+        followed: (B, J, S) of each shape of `stood`.
+        left: (B, J) of what they had followed by the last map of the block before.
+    """
+
+    rows: slice
+    stood: slice
+    followed: Floats
+    left: Floats
+
+
+def creep_blocks(parts: list[slice], starts: list[float], time: Floats, moved: Floats | None) -> list[CreepBlock]:
+    """All maps of a run of such parts, which begin rested at `starts`; arrays as of :func:`creep_states`."""
+    blocks = []
+    for part, start in zip(parts, starts, strict=True):
+        for first in range(part.start, part.stop, MAPS_AT_ONCE):
+            rows, goes_on = slice(first, min(first + MAPS_AT_ONCE, part.stop)), first > part.start
+            stood = slice(first - goes_on, rows.stop)
+            before = float(time[stood.start]) if goes_on else start
+            unit = np.eye(stood.stop - stood.start)
+            states = list(creep_states(unit, time[stood], before, None if moved is None else moved[stood]))
+            left = np.exp((before - time[rows, None]) / CREEP_TIMES)
+            blocks.append(CreepBlock(rows, stood, np.array(states[goes_on:]), left))
+    return blocks
 
 
 def crept(features: Floats, time: Floats, start: float, moved: Floats | None = None) -> Floats:

@@ -27,6 +27,7 @@ from scipy.linalg import block_diag
 from dm_calibration.hysteresis.candidate_fit import Candidate, LawFit, Run
 from dm_calibration.hysteresis.features import (
     PER_ELEMENT,
+    creep_states,
     fading_changes,
     fading_feature,
     own_slopes,
@@ -67,8 +68,6 @@ CREEP_SLOPE = 0.3
 #: less well, come to rest as much later: of 100 maps errors are up to a quarter smaller with 60 rounds than with 20, on
 #: some mirrors a tenth larger.
 ROUNDS, ROUNDS_MAPS = 20, 300
-#: Maps whose creep is made at once: of all at once it is twice the work, and much room.
-MAPS_AT_ONCE = 64
 #: Standard deviation of the patterns between actuators, relative to that of the common ones: from a third to three
 #: times of it errors change by less than a tenth.
 SPREAD = 0.1
@@ -215,8 +214,10 @@ class OwnLaws:
 
     def _creep_states(self, values: Floats) -> Floats:
         """(M, J, N) what the creep elements have followed of `values` (M, N) at each map."""
-        followed = self.run.followed
-        return (followed.reshape(-1, len(values)) @ values).reshape(*followed.shape[:2], -1)
+        run = self.run
+        return self._in_parts(
+            lambda part, start: np.array(list(creep_states(values[part], run.time[part], start, run.moved_in(part))))
+        )
 
     def _with_creep(self, features: Floats, creep: Floats, patterns: Floats) -> Floats:
         """`features` (M, F, N) with the creep that the spectra `creep` (J + L + 1, N) add."""
@@ -227,10 +228,15 @@ class OwnLaws:
         loops[:LAGS] += creep[count:-1]
         by_actuator = np.ascontiguousarray(features.transpose(2, 0, 1))
         added = np.empty_like(features)
-        for first in range(0, len(features), MAPS_AT_ONCE):
-            end = first + MAPS_AT_ONCE  # maps after these add nothing to them
-            followed = np.tensordot(loops.T, self.run.followed[first:end, :, :end], (1, 1))
-            added[first:end] = (followed @ by_actuator[:, :end]).transpose(1, 2, 0)
+        state = np.zeros((len(by_actuator), count, features.shape[1]))
+        for block in self.run.creep_blocks:
+            stood = by_actuator[:, block.stood]
+            if block.stood == block.rows:  # a part begins, rested
+                state[:] = 0.0
+            followed = np.tensordot(loops.T, block.followed, (1, 1)) @ stood
+            followed += (loops.T[:, None, :] * block.left) @ state
+            added[block.rows] = followed.transpose(1, 2, 0)
+            state = block.left[-1][:, None] * state + block.followed[-1] @ stood
         added[:, 0] = np.einsum("mjn,jn->mn", self._signal_states, creep[:count])
         slope = creep[-1] * np.einsum("mfn,fn->mn", added, patterns)
         return features * (1.0 + slope[:, None]) + added
