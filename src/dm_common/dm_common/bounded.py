@@ -24,6 +24,7 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dgels, dtrtrs
 from scipy.optimize import lsq_linear, nnls
 
+from dm_common import Floats
 from dm_common.limits import SLACK, Limits
 
 #: A signal this close to an end of its range is taken to be bound there.
@@ -67,7 +68,7 @@ class BoundedProgramme:
         self.limits = limits
         self._constraints, self._constraint_limits = self._linear_constraints(count)
 
-    def _linear_constraints(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _linear_constraints(self, count: int) -> tuple[Floats, Floats]:
         """(C, c) of C y >= c0 - C d in terms of y = R s - d, see `_least_distance`."""
         limits, identity = self.limits, np.eye(count)
         pairs = limits.pairs if limits.neighbours_can_bind else limits.pairs[:0]
@@ -82,11 +83,11 @@ class BoundedProgramme:
         )
         return solve_triangular(self._triangle, constraints.T, trans="T").T, bounds
 
-    def unlimited(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+    def unlimited(self, wanted: Floats) -> Floats:
         """The best signals (N,) or (N, K) for right-hand sides (M,) or (M, K), as if there were no limits."""
         return np.asarray(solve_triangular(self._triangle, self._projection @ wanted))
 
-    def solve(self, wanted: ArrayLike) -> NDArray[np.float64]:
+    def solve(self, wanted: ArrayLike) -> Floats:
         """Return the best signals (N,) for the right-hand side `wanted` (M,).
 
         Raises:
@@ -97,7 +98,7 @@ class BoundedProgramme:
             raise ValueError(f"right-hand side: must be {self._projection.shape[1]} finite numbers")
         projected = self._projection @ target
         # The triangle is known to be regular: the checks of `solve_triangular` would take longer than this.
-        signals: NDArray[np.float64] = dtrtrs(self._triangle, projected)[0]
+        signals: Floats = dtrtrs(self._triangle, projected)[0]
         if self.limits.allow(signals):
             return signals
         if not self.limits.neighbours_can_bind:
@@ -115,9 +116,7 @@ class BoundedProgramme:
             signals = lsq_linear(self._triangle, projected, ends, "bvls", tol=1e-14, max_iter=50 * len(signals)).x
         return np.clip(signals, self.limits.low, self.limits.high)
 
-    def _pivoted(
-        self, unconstrained: NDArray[np.float64], projected: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
+    def _pivoted(self, unconstrained: Floats, projected: Floats) -> Floats | None:
         """The optimum inside the range by block principal pivoting; None when it does not settle."""
         low, high, triangle = self.limits.low, self.limits.high, self._triangle
         tolerance = ROUNDING * np.abs(triangle.T @ projected).max()
@@ -139,9 +138,7 @@ class BoundedProgramme:
             at_low, at_high = below, above
         return None
 
-    def _with_bound(
-        self, at_low: NDArray[np.bool_], at_high: NDArray[np.bool_], projected: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _with_bound(self, at_low: NDArray[np.bool_], at_high: NDArray[np.bool_], projected: Floats) -> Floats:
         """Signals (N,) with some at an end of the range and the least-squares solution for the others."""
         signals = np.where(at_low, self.limits.low, np.where(at_high, self.limits.high, 0.0))
         free = ~(at_low | at_high)
@@ -152,7 +149,7 @@ class BoundedProgramme:
             signals[free] = solution[:count]
         return signals
 
-    def _optimal(self, signals: NDArray[np.float64], projected: NDArray[np.float64]) -> bool:
+    def _optimal(self, signals: Floats, projected: Floats) -> bool:
         """Whether the gradient vanishes for signals inside the range, and pushes outwards for those at an end."""
         gradient = self._triangle.T @ (self._triangle @ signals - projected)
         inward = np.where(signals <= self.limits.low, -gradient, np.where(signals >= self.limits.high, gradient, 0.0))
@@ -160,7 +157,7 @@ class BoundedProgramme:
         worst = np.abs(gradient[inside]).max(initial=inward.max(initial=0.0))
         return bool(worst <= OPTIMALITY * np.abs(self._triangle.T @ projected).max())
 
-    def _polished(self, signals: NDArray[np.float64], projected: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _polished(self, signals: Floats, projected: Floats) -> Floats:
         """Put the signals that stand at an end of the range exactly there and solve for the others once more.
 
         The multipliers above are found to the accuracy of an ill-conditioned problem; with the set of bound signals
@@ -174,7 +171,7 @@ class BoundedProgramme:
         result = self._with_bound(bound & (signals < middle), bound & (signals >= middle), projected)
         return result if self.limits.allow(result) else signals
 
-    def _least_distance(self, projected: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _least_distance(self, projected: Floats) -> Floats:
         """Problem LDP of [9]: the shortest y = R s - d that satisfies all constraints."""
         right = self._constraint_limits - self._constraints @ projected
         system = np.vstack([self._constraints.T, right])
@@ -182,5 +179,5 @@ class BoundedProgramme:
         unit[-1] = 1.0
         multipliers, _norm = nnls(system, unit, maxiter=20 * len(right))
         residual = system @ multipliers - unit
-        signals: NDArray[np.float64] = solve_triangular(self._triangle, projected - residual[:-1] / residual[-1])
+        signals: Floats = solve_triangular(self._triangle, projected - residual[:-1] / residual[-1])
         return signals

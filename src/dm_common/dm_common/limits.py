@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Violations below this are rounding, far below a DAC step (1.5e-5).
 SLACK = 1e-9

@@ -6,11 +6,9 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.optics.sampling import SamplePoints
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from dm_msgs.msg import ActuatorEstimate as ActuatorEstimateMsg
 from dm_msgs.msg import ActuatorHysteresis, ActuatorState, MirrorInfo, ZernikeCoefficients
 from dm_msgs.msg import Recipe as RecipeMsg
 from dm_msgs.msg import RecipeBook as RecipeBookMsg
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.hysteresis.observer import ActuatorEstimate, Applied, HysteresisObserver
 from dm_common.limits import Limits
@@ -21,8 +21,6 @@ from dm_common.recipes import Recipe, RecipeBook
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
-
-Floats = NDArray[np.float64]
 
 
 def doubles(values: Floats) -> array[float]:

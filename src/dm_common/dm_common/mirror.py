@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.limits import Limits
-
-Floats = NDArray[np.float64]
 
 #: Relative difference between the aperture radius of a calibration and the mirror's up to which it belongs to it.
 APERTURE_TOLERANCE = 0.02

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.optics.zernike import SPOKEN
-
-Floats = NDArray[np.float64]
 
 
 class RecipeError(ValueError):

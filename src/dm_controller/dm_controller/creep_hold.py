@@ -16,13 +16,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_types import CommandedShape, DriverReport, Moment, SendCommand
-
-Floats = NDArray[np.float64]
 
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
 #: much from 0.05 to 0.5 s as from 1 to 10 s.

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from dm_common import Floats
 from dm_common.errors import Refusal
 from dm_common.hysteresis.observer import Applied
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move, Planner
 from dm_controller.planning.target import Request
-
-Floats = NDArray[np.float64]
 
 
 class Moment(NamedTuple):

@@ -14,17 +14,15 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.srv import PredictError
-from numpy.typing import NDArray
 from rclpy.node import Node
 
+from dm_common import Floats
 from dm_common.errors import ErrorCode
 from dm_common.messages import doubles
 from dm_common.optics.zernike import basis
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
-
-Floats = NDArray[np.float64]
 
 #: Number of curvatures over the reachable range for which the share of hysteresis is fetched.
 GRID = 11

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.optics.sampling import SamplePoints
-
-Floats = NDArray[np.float64]
 
 
 def fit_plane(sag: Floats) -> Floats:

@@ -13,12 +13,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from dm_common import Floats
 from dm_common.errors import ErrorCode
 from dm_common.optics.sampling import SamplePoints
-
-Floats = NDArray[np.float64]
 
 #: Shares of the aperture's area, 10 % to 100 % (Fig. 4 in [1]).
 AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))

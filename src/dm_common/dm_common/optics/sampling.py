@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from dm_common import Floats
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -23,9 +24,9 @@ class SamplePoints:
         weight: (P,), share of the disc's area that each point stands for; sums to 1.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    x: Floats
+    y: Floats
+    weight: Floats
 
     def __len__(self) -> int:
         return len(self.x)
@@ -60,9 +61,7 @@ def edge_clustered_points(count: int = 500) -> SamplePoints:
     )
 
 
-def sample_map(
-    sag: NDArray[np.float64], centre_x_px: float, centre_y_px: float, radius_px: float, points: SamplePoints
-) -> NDArray[np.float64]:
+def sample_map(sag: Floats, centre_x_px: float, centre_y_px: float, radius_px: float, points: SamplePoints) -> Floats:
     """Read a map at the sampling points by the four-neighbour rule of section 2.2.
 
     A point on a pixel takes its value; a point on the line between two adjacent pixels the mean of the two; any other
@@ -92,7 +91,7 @@ def sample_map(
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _snapped(position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _snapped(position: Floats) -> Floats:
     """Positions in pixels, those that coincide with a pixel row or column made exactly so."""
     nearest = np.rint(position)
     return np.where(np.abs(position - nearest) <= _COINCIDENT, nearest, position)

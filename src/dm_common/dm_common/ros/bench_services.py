@@ -14,12 +14,12 @@ import rclpy
 from dm_msgs.action import Degauss
 from dm_msgs.msg import ActuatorState, MirrorInfo, SurfaceMapInfo
 from dm_msgs.srv import Measure, SetSignals
-from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
@@ -28,8 +28,6 @@ from dm_common.ros.worker import sleep
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
-
-Floats = NDArray[np.float64]
 
 #: Failures of a measurement that another try does not mend.
 _FATAL = (ErrorCode.INTERFEROMETER_INACTIVE, ErrorCode.NOT_SUPPORTED, ErrorCode.INVALID_ARGUMENT)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.msg import Calibration, MirrorInfo
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
@@ -129,16 +129,14 @@ def active_calibration(
     return ActiveCalibration(calibration, calibrated, certain, planner, recipes, middle, slew_rate, high - low)
 
 
-def model_of(
-    calibration: Any, actuator_x: NDArray[np.float64] | None = None, actuator_y: NDArray[np.float64] | None = None
-) -> InfluenceModel:
+def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Floats | None = None) -> InfluenceModel:
     """The influence model of a dm_msgs/Calibration of a mirror whose actuators stand there, (N,) m.
 
     Raises ValueError when its arrays do not fit together.
     """
     actuators, terms, points = calibration.actuators, calibration.terms, calibration.points
 
-    def matrix(name: str, rows: int) -> NDArray[np.float64]:
+    def matrix(name: str, rows: int) -> Floats:
         values = np.asarray(getattr(calibration, name), dtype=float)
         if values.size != rows * actuators:
             raise ValueError(f"calibration: {name} has {values.size} values, must be {rows} x {actuators}")

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-
-Floats = NDArray[np.float64]
 
 #: Ages of a shape that a bound holds for, s, beside the moment when it is to be right.
 AGES = (1.0, 10.0, 100.0)

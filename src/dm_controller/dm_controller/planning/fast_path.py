@@ -18,8 +18,8 @@ from __future__ import annotations
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.inverse import LAG_ROUNDS, Pieces, horner, pieces
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
@@ -27,8 +27,6 @@ from dm_common.optics.conic import disc_coefficients
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
-
-Floats = NDArray[np.float64]
 
 #: Error of an effective signal from which a piece is not used: a third of a DAC step. Preisach laws stay a hundred
 #: times below, the tables of Duhem operators reach half of it.

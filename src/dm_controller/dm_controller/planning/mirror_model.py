@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, curvature_of_defocus, tilt_influence
@@ -40,17 +41,17 @@ class InfluenceModel:
     """
 
     aperture_radius: float
-    influence_zernike: NDArray[np.float64]  # (K, N) m per unit signal
-    zernike_offset: NDArray[np.float64]  # (K,) m
-    sample_x: NDArray[np.float64]  # (P,)
-    sample_y: NDArray[np.float64]
-    sample_weight: NDArray[np.float64]  # (P,) sums to 1
-    influence_sag: NDArray[np.float64]  # (P, N) m per unit signal
-    sag_offset: NDArray[np.float64]  # (P,) m
+    influence_zernike: Floats  # (K, N) m per unit signal
+    zernike_offset: Floats  # (K,) m
+    sample_x: Floats  # (P,)
+    sample_y: Floats
+    sample_weight: Floats  # (P,) sums to 1
+    influence_sag: Floats  # (P, N) m per unit signal
+    sag_offset: Floats  # (P,) m
     held_out_rms: float  # m
     held_out_max_zernike: float  # m
-    actuator_x: NDArray[np.float64] | None = None  # (N,) m; None = tilt cannot be held
-    actuator_y: NDArray[np.float64] | None = None
+    actuator_x: Floats | None = None  # (N,) m; None = tilt cannot be held
+    actuator_y: Floats | None = None
 
     def __post_init__(self) -> None:
         terms, actuators = self.influence_zernike.shape
@@ -79,7 +80,7 @@ class Plan:
     Lengths in m; `lower` and `upper` are 95 % bounds that include the calibration's held-out error.
     """
 
-    signals: NDArray[np.float64]
+    signals: Floats
     rms: float
     rms_lower: float
     rms_upper: float
@@ -94,7 +95,7 @@ def rms_bounds(rms: float, spread: float) -> tuple[float, float]:
     return math.sqrt(max(rms**2 - reach, 0.0)), math.sqrt(rms**2 + reach)
 
 
-def coefficient_rows(influence: NDArray[np.float64]) -> NDArray[np.float64]:
+def coefficient_rows(influence: Floats) -> Floats:
     """(K - 3, K - 3) rows that weigh coefficients beyond tilt: COEFFICIENT_WEIGHT where the actuators have authority.
 
     Args:
@@ -107,7 +108,7 @@ def coefficient_rows(influence: NDArray[np.float64]) -> NDArray[np.float64]:
     if not weak.any():
         return COEFFICIENT_WEIGHT * np.eye(len(influence))
     # Without authority a unit is the rms sag it stands for, as in the rows of the sag below.
-    rows: NDArray[np.float64] = np.where(weak, 1.0, COEFFICIENT_WEIGHT)[:, None] * modes.T * rms
+    rows: Floats = np.where(weak, 1.0, COEFFICIENT_WEIGHT)[:, None] * modes.T * rms
     return rows
 
 
@@ -148,7 +149,7 @@ class CalibratedMirror:
         self._tilt_free = self._terms[:, :PISTON_TILT]
         self._coefficient_rows = coefficient_rows(model.influence_zernike[PISTON_TILT:])
         reduced = self._reduce(model.influence_sag, self._tilt_free)
-        self.sag_root: NDArray[np.float64] = np.linalg.qr(reduced)[1]
+        self.sag_root: Floats = np.linalg.qr(reduced)[1]
         response = np.linalg.norm(reduced, axis=0)
         self.tilt = None
         if hold_tilt and model.actuator_x is not None and model.actuator_y is not None:
@@ -159,15 +160,13 @@ class CalibratedMirror:
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
 
-    def _reduce(self, sag: NDArray[np.float64], removed: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _reduce(self, sag: Floats, removed: Floats) -> Floats:
         """Weighted sag (P,) or (P, N) with the span of `removed` (P, k, orthonormal) projected out."""
         weighted = (sag.T * self._weights).T
-        result: NDArray[np.float64] = weighted - removed @ (removed.T @ weighted)
+        result: Floats = weighted - removed @ (removed.T @ weighted)
         return result
 
-    def rows(
-        self, coefficients: NDArray[np.float64], sag: NDArray[np.float64], tilt: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
+    def rows(self, coefficients: Floats, sag: Floats, tilt: Floats | None = None) -> Floats:
         """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
 
         Where tilt is held, two rows above them are the wanted one, whatever tilt was measured.
@@ -186,7 +185,7 @@ class CalibratedMirror:
             kept = TILT_WEIGHT * tilt
         return np.concatenate([kept, weighted, self._reduce(sag, self._terms)])
 
-    def solve(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def solve(self, rows: Floats) -> Floats:
         """The signals (N,) inside the limits whose `matrix @ signals` comes nearest to `rows`.
 
         Raises:
@@ -202,7 +201,7 @@ class CalibratedMirror:
         """
         return self.predict(target, self.command(target)[0])
 
-    def command(self, target: FocusTarget) -> tuple[NDArray[np.float64], float]:
+    def command(self, target: FocusTarget) -> tuple[Floats, float]:
         """The command (N,) for `target`, and the largest coefficient error that it leaves, m.
 
         Raises:
@@ -212,13 +211,11 @@ class CalibratedMirror:
         signals = self.solve(self.rows(coefficients, sag, self._wanted_tilt(target)))
         return signals, float(np.abs(self.coefficient_errors(signals, coefficients)).max())
 
-    def unlimited(
-        self, coefficients: NDArray[np.float64], sag: NDArray[np.float64], tilt: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def unlimited(self, coefficients: Floats, sag: Floats, tilt: Floats) -> Floats:
         """Commands (N, M) for `rows` of coefficients (K, M), sag (P, M) and tilt (2, M), m, without any limit."""
         return self._programme.unlimited(self.rows(coefficients, sag, tilt))
 
-    def predict(self, target: FocusTarget, signals: NDArray[np.float64]) -> Plan:
+    def predict(self, target: FocusTarget, signals: Floats) -> Plan:
         """What `signals` (N,) are expected to do when `target` is wanted.
 
         Raises:
@@ -239,7 +236,7 @@ class CalibratedMirror:
             saturated=self.limits.at_limit(signals),
         )
 
-    def wanted_rows(self, target: FocusTarget) -> NDArray[np.float64]:
+    def wanted_rows(self, target: FocusTarget) -> Floats:
         """(R,) `rows` of `target` less those at zero signals.
 
         Raises:
@@ -247,23 +244,21 @@ class CalibratedMirror:
         """
         return self.rows(*self._wanted(target), self._wanted_tilt(target))
 
-    def _wanted(self, target: FocusTarget) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _wanted(self, target: FocusTarget) -> tuple[Floats, Floats]:
         """Coefficients (K,) and sag (P,) of `target` less those at zero signals, m."""
         model = self.model
         coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
         return coefficients, target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
 
-    def _wanted_tilt(self, target: FocusTarget) -> NDArray[np.float64]:
+    def _wanted_tilt(self, target: FocusTarget) -> Floats:
         """Tilt (2,) of `target`, m: its own, less the slope that its sphere has on the axis."""
         own = np.array(target.zernike[1:PISTON_TILT]) if target.zernike else np.zeros(2)
-        tilt: NDArray[np.float64] = own - target.curvature * self.model.aperture_radius * self.axis
+        tilt: Floats = own - target.curvature * self.model.aperture_radius * self.axis
         return tilt
 
-    def coefficient_errors(
-        self, signals: NDArray[np.float64], coefficients: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def coefficient_errors(self, signals: Floats, coefficients: Floats) -> Floats:
         """Coefficient errors beyond tilt, m: (K - 3,) of signals (N,), or columns of each."""
-        errors: NDArray[np.float64] = self.model.influence_zernike[PISTON_TILT:] @ signals - coefficients[PISTON_TILT:]
+        errors: Floats = self.model.influence_zernike[PISTON_TILT:] @ signals - coefficients[PISTON_TILT:]
         return errors
 
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_msgs.msg import FocusRequest
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.inverse import ConstrainedInverse, invert, within
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.optics.zernike import PISTON_TILT
@@ -26,8 +26,6 @@ from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
     from dm_controller.planning.creep_error import CreepError
-
-Floats = NDArray[np.float64]
 
 #: When a shape is to be right unless configured otherwise, s after the way.
 SETTLE_S = 0.05

@@ -15,14 +15,12 @@ from functools import cached_property
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import RecipeBook, RecipeError, shape_text, terms_text
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.target import FocusTarget
-
-Floats = NDArray[np.float64]
 
 #: Surfaces whose coefficients differ less are the same shape, m.
 SAME_SHAPE = 3e-12

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.limits import SLACK, Limits
 from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
-
-Floats = NDArray[np.float64]
 
 #: Share by which an actuator may miss a move: hysteresis of such piezos ([1], section 1: about 10 %).
 MISS = 0.10

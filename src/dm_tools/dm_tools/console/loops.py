@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_common.hysteresis.law_shape import closed_cycle, opening
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-
-Floats = NDArray[np.float64]
 
 #: Points of each branch of a loop.
 STEPS = 41

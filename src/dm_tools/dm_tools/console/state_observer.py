@@ -7,13 +7,11 @@ from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_common.messages import estimate_from, hysteresis_model_from, seconds
-
-Floats = NDArray[np.float64]
 
 #: Estimates kept for maps that arrive late.
 ESTIMATES_KEPT = 500

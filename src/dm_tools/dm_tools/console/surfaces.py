@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
+from dm_common import Floats
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.zernike import basis
 from dm_controller.planning.active_calibration import model_of
-
-Floats = NDArray[np.float64]
 
 #: Points of the grid along each side. Finer than the print-through of the actuators, coarse enough for a phone.
 GRID = 101

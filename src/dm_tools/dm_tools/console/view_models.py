@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import ActuatorState, Calibration, FocusRequest
 from matplotlib import colormaps
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.figures import with_point
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
 from dm_common.recipes import terms_text
-
-Floats = NDArray[np.float64]
 
 NM = 1e9
 #: Half-width of a 95 % interval in standard deviations.
