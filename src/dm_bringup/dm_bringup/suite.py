@@ -17,6 +17,7 @@ from typing import Any, NoReturn, Self
 import yaml
 
 from dm_bringup.nodes import MODULES, NAMES, nodes_of, remapping
+from dm_common.ros import SUPERVISOR
 
 Config = dict[str, dict[str, Any]]
 
@@ -159,7 +160,7 @@ class Suite:
                 [sys.executable, "-m", MODULES[name], *arguments],
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env={**self._environment, "DM_SUPERVISOR": str(os.getpid())},
+                env={**self._environment, SUPERVISOR: str(os.getpid())},
                 start_new_session=True,
             )
 

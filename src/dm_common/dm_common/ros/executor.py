@@ -38,14 +38,14 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from dm_common.ros import SUPERVISOR
+
 #: Signals that end a node in order.
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 #: Longest time the loop sleeps without an event; only bounds the reaction to a shutdown from another thread.
 WAKE_PERIOD_S = 1.0
 #: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
 SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
-#: Environment variable: process id of the parent that a node goes with, for one that is killed cannot stop its nodes.
-SUPERVISOR = "DM_SUPERVISOR"
 
 
 def make_executor(*nodes: Node) -> Executor:
