@@ -153,10 +153,6 @@ def test_the_response_ratio_counts_terms_by_their_rms() -> None:
     assert math.isnan(response_ratio(tiny, seen))
 
 
-def test_bad_options_are_refused(solver: Solver) -> None:
-    with pytest.raises(ValueError, match="tolerance = 0 m: must be above 0"):
-        LoopOptions(0.0)
-    with pytest.raises(ValueError, match="max_maps = 0: must be at least 1"):
-        LoopOptions(1e-9, 0)
+def test_a_surface_that_does_not_exist_is_refused(solver: Solver) -> None:
     with pytest.raises(TargetError):
         converge(solver, FocusTarget(200.0), LinearPlant())

@@ -187,12 +187,3 @@ def test_a_shape_that_only_the_law_denies_is_told(stand: Stand) -> None:
     with pytest.raises(UnreachableError, match=r"actuator \d+ stands at its limit"):
         RecipeBuilder(weaker, plant, lambda: plant.time).build(FocusTarget(0.02))
     assert "measure" not in plant.calls
-
-
-def test_bad_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="tolerance = 0 m: must be above 0"):
-        BuildOptions(tolerance=0.0)
-    with pytest.raises(ValueError, match="average = 1 maps: must be at least 2"):
-        BuildOptions(average=1)
-    with pytest.raises(ValueError, match="maps_max = 15: must be at least 16"):
-        BuildOptions(maps_max=15)

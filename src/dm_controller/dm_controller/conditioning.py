@@ -65,9 +65,10 @@ class Conditioning:
         for known, seconds in self._learnt.items():
             if known and steps:
                 return seconds * steps / known
-        if not math.isfinite(active.slew_rate):
+        slew_rate, half_span = active.planner.slew_rate, active.mirror.limits.half_range
+        if not math.isfinite(slew_rate):
             return 0.0
-        return (0.5 * active.span * (steps or STEPS_ASSUMED) + active.span) / active.slew_rate
+        return half_span * ((steps or STEPS_ASSUMED) + 2) / slew_rate
 
     def prospect(self, active: ActiveCalibration, configured: int, now: float) -> Degauss:
         """The next degauss to end: the one under way, or one of as many half-swings as `configured`."""

@@ -155,7 +155,7 @@ class FocusController:
         target, settle, budget = request.target(), values["settle_time"], request.time_budget or values["time_budget"]
         if active is None:
             raise self.not_calibrated
-        estimate = self._at_rest or self.observer.estimate(now.time, active.slew_rate)
+        estimate = self._at_rest or self.observer.estimate(now.time, active.planner.slew_rate)
         if degaussed is not None:
             degauss = Degauss(degaussed, True, 0.0)
         elif self.conditioning.run is not None or request.mode == _CONDITIONED or budget:

@@ -96,7 +96,6 @@ BOOK = book(*[recipe(curvature) for curvature in CURVATURES])
 def test_a_stored_recipe_is_found_as_it_is() -> None:
     found = Corrections(BOOK, PLANNER).find(FocusTarget(0.02))
     np.testing.assert_array_equal(found.effective, own(FocusTarget(0.02)))
-    assert not found.interpolated
     assert found.error == pytest.approx(3e-10 + REPEAT_SHARE * 1e-9)
 
 
@@ -107,7 +106,6 @@ def test_between_recipes_what_the_neighbours_show_corrects_the_model() -> None:
         found = Corrections(corrected, PLANNER).find(FocusTarget(curvature))
         effective = own(FocusTarget(curvature))
         error = largest(found.effective - effective - law(effective))
-        assert found.interpolated
         assert error < 0.15 * largest(law(effective))
         assert error < found.error
 
@@ -206,7 +204,6 @@ def test_a_shape_with_added_terms_has_recipes_as_a_sphere_has() -> None:
     for shape in shapes:
         # A conic constant changes nothing of a plane.
         found = corrections.find(replace(shape, conic_constant=-1.0))
-        assert not found.interpolated
         assert largest(found.effective - own(shape) - law(own(shape))) < 1e-15
     between = FocusTarget(0.0, 0.0, added(astigmatism_cos=0.5e-6))
     found = corrections.find(between)
@@ -225,8 +222,8 @@ def test_nothing_is_extrapolated_and_far_from_all_recipes_there_is_none() -> Non
     )
     with pytest.raises(RecipeError, match=rf"curvature = \+0\.0510 1/m: nothing is extrapolated; {there}"):
         Corrections(alone, PLANNER).find(FocusTarget(0.051))
-    edge = FocusTarget(float(np.nextafter(-0.02, 0.0)), -2.0)  # the range ends with the shape, not with the last digit
-    assert Corrections(alone, PLANNER).find(edge).interpolated
+    # The range ends with the shape, not with the last digit.
+    Corrections(alone, PLANNER).find(FocusTarget(float(np.nextafter(-0.02, 0.0)), -2.0))
     with pytest.raises(RecipeError, match=rf"curvature = -0\.0250 1/m: no recipe is near this shape; {there}"):
         Corrections(alone, PLANNER).find(FocusTarget(-0.025, 3000.0))
 
@@ -235,7 +232,7 @@ def test_an_empty_book_says_so() -> None:
     with pytest.raises(RecipeError, match="there are no recipes"):
         Corrections(NO_RECIPES, PLANNER).find(FocusTarget(0.0))
     none: Any = None
-    assert ActiveCalibration(none, none, none, PLANNER, NO_RECIPES, 0.0, 1.0, 2.0).conditioned_error == 0.0
+    assert ActiveCalibration(none, none, none, PLANNER, NO_RECIPES).conditioned_error == 0.0
 
 
 def test_recipes_whose_answer_was_lost_are_stored_again(monkeypatch: pytest.MonkeyPatch) -> None:

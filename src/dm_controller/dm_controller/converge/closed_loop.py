@@ -71,12 +71,6 @@ class LoopOptions:
     max_maps: int = 5
     correct_last: bool = False
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
-            raise ValueError(f"tolerance = {self.tolerance:g} m: must be above 0 and finite")
-        if self.max_maps < 1:
-            raise ValueError(f"max_maps = {self.max_maps}: must be at least 1")
-
 
 @dataclass(frozen=True, eq=False)
 class Creep:

@@ -10,7 +10,6 @@ re-measures them. In the end each recipe rests on its neighbours' maps too.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -19,8 +18,8 @@ import numpy as np
 
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
-from dm_common.measurement import Measurement
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
+from dm_controller.converge.closed_loop import Plant
 from dm_controller.converge.defects import Defects, mean_of
 from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.planner import Planner
@@ -34,20 +33,11 @@ MISS_IGNORED = 1e-3
 SURE_SHARE, MAPS_MIN = 0.2, 3
 
 
-class ConditionedPlant(Protocol):
-    """What is driven; `dm_common.measurement.Bench` is one."""
+class ConditionedPlant(Plant, Protocol):
+    """What is driven."""
 
     def degauss(self) -> None:
         """Wipe the hysteresis over the full range and end at mid range."""
-
-    def apply(self, signals: Floats) -> Floats:
-        """Command `signals` (N,), wait until they stand, return what was written (N,)."""
-
-    def settle(self) -> bool:
-        """Wait the settle time; False when cancelled meanwhile."""
-
-    def measure(self, label: str) -> Measurement:
-        """Take one map."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +46,8 @@ class BuildOptions:
 
     Attributes:
         tolerance: largest coefficient error beyond tilt, m, re-measured.
-        maps_max: maps that one recipe may take.
-        average: most maps of one round.
+        maps_max: maps that one recipe may take: at least one round to correct by and one to re-measure.
+        average: most maps of one round; of fewer than 2 the noise is not known.
         settle_time: s after the move at which the shape is to be right.
         reachable: largest coefficient error, m, by which limits may deny a shape from the condition.
     """
@@ -67,17 +57,6 @@ class BuildOptions:
     average: int = 8
     settle_time: float = 0.5
     reachable: float = 2e-8
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
-            raise ValueError(f"tolerance = {self.tolerance:g} m: must be above 0 and finite")
-        if self.average < 2:
-            raise ValueError(f"average = {self.average} maps: must be at least 2, or their noise is not known")
-        if self.maps_max < 2 * self.average:
-            raise ValueError(
-                f"maps_max = {self.maps_max}: must be at least {2 * self.average}, one round of {self.average} to "
-                "correct by and one to re-measure"
-            )
 
 
 @dataclass(frozen=True)

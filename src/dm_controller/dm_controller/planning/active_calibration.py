@@ -38,9 +38,6 @@ class ActiveCalibration:
         certain: the same inside what is within reach whatever the actuators remember.
         planner: of its moves.
         recipes: may be empty.
-        middle: signal of mid range, where a degauss ends.
-        slew_rate: 1/s, of the signals; infinite = not limited.
-        span: of the signals.
     """
 
     calibration: Calibration
@@ -48,9 +45,11 @@ class ActiveCalibration:
     certain: CalibratedMirror
     planner: Planner
     recipes: RecipeBook
-    middle: float
-    slew_rate: float
-    span: float
+
+    @property
+    def middle(self) -> float:
+        """Signal of mid range, where a degauss ends."""
+        return self.mirror.limits.middle
 
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
         """See :meth:`CalibratedMirror.reachable_range`; within reach from any history."""
@@ -124,9 +123,7 @@ def active_calibration(
             certain = CalibratedMirror(model, certain_limits(planner.law, limits), hold_tilt, axis)
     except (ValueError, np.linalg.LinAlgError) as error:
         raise Refusal(ErrorCode.CALIBRATION_UNREADABLE, f"calibration {calibration.id}: {error}") from error
-    low, high = mirror.signal_min, mirror.signal_max
-    middle = 0.5 * (low + high)
-    return ActiveCalibration(calibration, calibrated, certain, planner, recipes, middle, slew_rate, high - low)
+    return ActiveCalibration(calibration, calibrated, certain, planner, recipes)
 
 
 def model_of(calibration: Any, actuator_x: Floats | None = None, actuator_y: Floats | None = None) -> InfluenceModel:

@@ -45,12 +45,10 @@ class FoundRecipe:
         effective: (N,) effective signals.
         error: m, bound of the largest coefficient error but for creep: as re-measured at the recipes that it rests on,
             and what the correction may have changed by since the nearest of them.
-        interpolated: there is no recipe of this very shape.
     """
 
     effective: Floats
     error: float
-    interpolated: bool
 
 
 class Kriging:
@@ -131,7 +129,7 @@ class Corrections:
         apart = np.abs(self._surfaces - surface).max(axis=1)
         if apart.min() <= SAME_SHAPE:
             recipe = self._recipes[int(apart.argmin())]
-            return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0), False)
+            return FoundRecipe(recipe.effective, self._bound(recipe.max_zernike, 0.0))
         curvatures = [recipe.curvature for recipe in self._recipes]
         inside = target.with_curvature(float(np.clip(target.curvature, min(curvatures), max(curvatures))))
         if inside.deviation(target, self._mirror.model.aperture_radius) > SAME_SHAPE:
@@ -144,7 +142,7 @@ class Corrections:
             )
         near = np.abs(weights) >= SLIGHT * np.abs(weights).max()
         error = self._bound(float(self._measured[near].max()), left)
-        return FoundRecipe(own + weights @ self._corrections, error, True)
+        return FoundRecipe(own + weights @ self._corrections, error)
 
     @cached_property
     def worst(self) -> float:
