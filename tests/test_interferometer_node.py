@@ -18,7 +18,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from sensor_msgs.msg import Image
 
 from dm_common.errors import ErrorCode
-from dm_common.optics.zernike import basis, born_wolf_to_fringe
+from dm_common.optics.zernike import TERMS, basis
 from dm_common.ros import qos
 from map_fixtures import WAVELENGTH, dat_bytes, disc_counts, write_datx
 from support import NodeProcess, Observer, wait_until
@@ -345,7 +345,8 @@ def test_a_sensor_on_a_topic_takes_the_place_of_map_files(observer: Observer, st
     publisher = observer.node.create_publisher(ZernikeCoefficients, "wavefront/zernike", 10)
     coefficients = 1e-7 * np.arange(21.0)
     seen = ZernikeCoefficients(convention=ZernikeCoefficients.FRINGE, radius=0.011, residual_rms=5e-9)
-    seen.coefficients = born_wolf_to_fringe(coefficients).tolist()
+    fringe = dict(zip([term.fringe_index for term in TERMS], coefficients.tolist(), strict=True))
+    seen.coefficients = [fringe.get(index, 0.0) for index in range(1, max(fringe) + 1)]
 
     def stream() -> None:
         seen.header.stamp = observer.node.get_clock().now().to_msg()

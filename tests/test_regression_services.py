@@ -247,9 +247,9 @@ def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, obs
     wait_until(ready, 60, node.output)
     share = client.share
     assert share is not None
-    forecast = share.forecast(0.015, 5e-9)
-    assert 5e-9 <= forecast.lower < forecast.rms < forecast.upper < 1e-6
-    assert share.forecast(0.015, 50e-9).rms == pytest.approx(np.sqrt(forecast.rms**2 - 25e-18 + 2500e-18))
+    lower, upper = share.interval(0.015, 5e-9)
+    assert 5e-9 <= lower < upper < 1e-6
+    assert share.interval(0.015, 50e-9)[1] == pytest.approx(np.sqrt(upper**2 - 25e-18 + 2500e-18))
     client.use(active, 2e-8)
     assert client.share is share
     client.use(None, 2e-8)
@@ -257,13 +257,9 @@ def test_the_controller_gets_its_forecast_without_waiting(node: NodeProcess, obs
 
 
 def test_share_of_the_hysteresis() -> None:
-    share = hysteresis_share(
-        np.array([0.02, 0.0]), np.array([[50e-9, 40e-9, 60e-9], [5e-9, 3e-9, 8e-9]]), np.array([30e-9, 4e-9])
-    )
-    at_end = share.forecast(0.02, 0.0)
-    assert (at_end.rms, at_end.upper) == pytest.approx((40e-9, np.sqrt(2700.0) * 1e-9))
-    assert share.forecast(0.0, 4e-9).rms == pytest.approx(5e-9)
-    assert share.forecast(0.0, 4e-9).lower == pytest.approx(4e-9)  # never below the model's own
+    share = hysteresis_share(np.array([0.02, 0.0]), np.array([[50e-9, 60e-9], [3e-9, 5e-9]]), np.array([30e-9, 4e-9]))
+    assert share.interval(0.02, 0.0) == pytest.approx((40e-9, np.sqrt(2700.0) * 1e-9))
+    assert share.interval(0.0, 4e-9) == pytest.approx((4e-9, 5e-9))  # never below the model's own
 
 
 def test_modelled_error_agrees_with_the_calibrations_own() -> None:

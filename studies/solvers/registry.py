@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from numpy.typing import ArrayLike
+
+from dm_common import Floats
 from dm_common.limits import Limits
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import SOLVERS as OFFERED
-from dm_controller.solvers.registry import Factory, MirrorFacts, named
+from dm_controller.solvers.registry import make_solver as make_offered
+from dm_controller.solvers.registry import named
 from studies.solvers.plate_model import PlateModel
 from studies.solvers.sparse import SparseSampling
 from studies.solvers.steepest_descent import SteepestDescent
 
 
-def _plate(model: InfluenceModel, limits: Limits, facts: MirrorFacts) -> Solver:
-    if facts.actuator_x is None or facts.actuator_y is None:
-        raise ValueError("plate_model needs the actuator positions: give actuator_x and actuator_y (m)")
-    return PlateModel(model, limits, facts.actuator_x, facts.actuator_y)
+@dataclass(frozen=True, eq=False)
+class MirrorFacts:
+    """What some methods need beside the influence function.
+
+    Attributes:
+        actuator_x, actuator_y: (N,) m; None = unknown.
+        region_weights: (10,) Eq. (8); None = all equal.
+    """
+
+    actuator_x: Floats | None = None
+    actuator_y: Floats | None = None
+    region_weights: ArrayLike | None = None
 
 
-_COMPARED: dict[str, Factory] = OFFERED | {
-    SteepestDescent.name: lambda model, limits, facts: SteepestDescent(model, limits),
-    SparseSampling.name: lambda model, limits, facts: SparseSampling(model, limits),
-    PlateModel.name: _plate,
-}
+_COMPARED = OFFERED | {solver.name: solver for solver in (SteepestDescent, SparseSampling, PlateModel)}
 _ORDER = (
     "pseudo_inverse",
     "steepest_descent",
@@ -33,7 +43,7 @@ _ORDER = (
     "AZWreg",
     "bounded",
 )
-#: Makers by name, in the order of [1].
+#: In the order of [1].
 SOLVERS = {name: _COMPARED[name] for name in sorted(_COMPARED, key=_ORDER.index)}
 
 
@@ -49,4 +59,11 @@ def make_solver(name: str, model: InfluenceModel, limits: Limits, facts: MirrorF
         UnknownNameError: no such method, listing all.
         ValueError: the model, or what is known of the mirror, does not do for the method.
     """
-    return SOLVERS[check_method(name)](model, limits, facts or MirrorFacts())
+    facts, solver = facts or MirrorFacts(), SOLVERS[check_method(name)]
+    if solver is PlateModel:
+        if facts.actuator_x is None or facts.actuator_y is None:
+            raise ValueError("plate_model needs the actuator positions: give actuator_x and actuator_y (m)")
+        return PlateModel(model, limits, facts.actuator_x, facts.actuator_y)
+    if solver.name in OFFERED:
+        return make_offered(solver.name, model, limits, facts.region_weights)
+    return solver(model, limits)

@@ -15,16 +15,25 @@ from dm_calibration.acquisition.interferometer_messages import sensor_map
 from dm_calibration.acquisition.reference_surface import MapRejectedError
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.optics import zernike
-from dm_common.optics.zernike import basis
+from dm_common.optics.zernike import TERM_RMS, TERMS, basis
 
 RADIUS = 0.011
 WANTED = 1e-7 * np.random.default_rng(5).standard_normal(21)
+
+
+def placed(values: np.ndarray, indices: list[int]) -> np.ndarray:
+    result = np.zeros(max(indices) + 1)
+    result[indices] = values
+    return result
+
+
 CONVERTED = {
     ZernikeCoefficients.BORN_WOLF: WANTED,
-    ZernikeCoefficients.NOLL: np.append(zernike.born_wolf_to_noll(WANTED), [3e-8] * 15),
-    ZernikeCoefficients.ANSI: zernike.born_wolf_to_ansi(WANTED),
-    ZernikeCoefficients.FRINGE: np.append(zernike.born_wolf_to_fringe(WANTED), [3e-8] * 10),
+    ZernikeCoefficients.NOLL: np.append(
+        placed(WANTED * TERM_RMS, [term.noll_index - 1 for term in TERMS]), [3e-8] * 15
+    ),
+    ZernikeCoefficients.ANSI: placed(WANTED * TERM_RMS, [term.ansi_index for term in TERMS]),
+    ZernikeCoefficients.FRINGE: np.append(placed(WANTED, [term.fringe_index - 1 for term in TERMS]), [3e-8] * 10),
 }
 
 

@@ -100,7 +100,7 @@ def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatc
     def full(*_arguments: object) -> int:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "write", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StoreError, match=r"known was not stored in .*: No space left on device") as caught:
         stand.manager.add_recipes("known", book(0.01))
     monkeypatch.undo()

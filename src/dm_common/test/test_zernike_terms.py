@@ -6,9 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from dm_common.optics import zernike
 from dm_common.optics.zernike import TERMS, basis
@@ -68,8 +65,8 @@ def test_rms_over_the_disc_is_the_integral() -> None:
 
 @pytest.mark.parametrize("convention", ["noll", "ansi"])
 def test_converters_describe_the_same_surface(convention: str) -> None:
-    coefficients = np.random.default_rng(3).normal(size=21)
-    converted = getattr(zernike, f"born_wolf_to_{convention}")(coefficients)
+    converted = np.random.default_rng(3).normal(size=21)
+    coefficients = getattr(zernike, f"{convention}_to_born_wolf")(converted)
     surface = sum(c * value for c, value in zip(coefficients, VALUES, strict=True))
     again = np.zeros_like(R)
     for (n, m, _kind, _radial, noll, ansi), value in zip(TABLE, VALUES, strict=True):
@@ -78,15 +75,6 @@ def test_converters_describe_the_same_surface(convention: str) -> None:
     np.testing.assert_allclose(again, surface, atol=1e-12)
     # rms-normalised coefficients add up to the surface's rms directly
     assert np.linalg.norm(converted[1:]) == pytest.approx(np.linalg.norm((coefficients * zernike.TERM_RMS)[1:]))
-
-
-@settings(max_examples=20, deadline=None)
-@given(arrays(float, (3, 21), elements=st.floats(-1e3, 1e3)))
-def test_converters_there_and_back(coefficients: np.ndarray) -> None:
-    for name in ("noll", "ansi", "fringe"):
-        there = getattr(zernike, f"born_wolf_to_{name}")(coefficients)
-        back = getattr(zernike, f"{name}_to_born_wolf")(there)
-        np.testing.assert_allclose(back, coefficients, rtol=1e-12, atol=1e-12)
 
 
 def test_fringe_order_is_that_of_the_book() -> None:
@@ -102,7 +90,7 @@ def test_fringe_order_is_that_of_the_book() -> None:
 
 def test_wrong_number_of_coefficients_is_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \(20,\).*21 terms"):
-        zernike.born_wolf_to_noll(np.zeros(20))
+        zernike.noll_to_born_wolf(np.zeros(20))
 
 
 def test_rms_beyond_tilt_is_that_of_the_surface_without_its_plane() -> None:

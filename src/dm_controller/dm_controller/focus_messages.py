@@ -63,9 +63,8 @@ def state_message(outcome: Outcome, values: Mapping[str, Any], share: Hysteresis
         state.predicted_rms = plan.rms
         state.predicted_rms_lower, state.predicted_rms_upper = plan.rms_lower, plan.rms_upper
         if share is not None:
-            forecast = share.forecast(request.curvature, plan.rms)
-            state.predicted_rms_lower = forecast.lower
-            state.predicted_rms_upper = max(plan.rms_upper, forecast.upper)
+            state.predicted_rms_lower, upper = share.interval(request.curvature, plan.rms)
+            state.predicted_rms_upper = max(plan.rms_upper, upper)
         state.predicted_max_zernike = plan.max_zernike
         state.predicted_max_zernike_upper = plan.max_zernike_upper
         state.predicted_duration = move.duration

@@ -31,32 +31,22 @@ GRID = 11
 RETRY_S = 10.0
 
 
-@dataclass(frozen=True)
-class Forecast:
-    """Rms residual to expect, with a 95 % interval; m."""
-
-    rms: float
-    lower: float
-    upper: float
-
-
 @dataclass(frozen=True, eq=False)
 class HysteresisShare:
     """Mean square residual that the actuators' hysteresis adds, over curvature.
 
     Attributes:
         curvature: (K,) 1/m, rising.
-        square: (K, 3) m^2: mean, lower and upper end of the 95 % interval.
+        square: (K, 2) m^2: lower and upper end of the 95 % interval.
     """
 
     curvature: Floats
     square: Floats
 
-    def forecast(self, curvature: float, model_rms: float) -> Forecast:
-        """The residual to expect: what the influence function predicts (`Plan.rms`, m) and hysteresis, independent."""
-        squares = [np.interp(curvature, self.curvature, column) + model_rms**2 for column in self.square.T]
-        rms, lower, upper = (float(value) for value in np.sqrt(squares))
-        return Forecast(rms, lower, upper)
+    def interval(self, curvature: float, model_rms: float) -> tuple[float, float]:
+        """95 % interval of the rms residual, m: by the influence function (`Plan.rms`, m) and by hysteresis."""
+        lower, upper = (np.interp(curvature, self.curvature, column) + model_rms**2 for column in self.square.T)
+        return float(np.sqrt(lower)), float(np.sqrt(upper))
 
 
 def hysteresis_share(curvature: Floats, answers: Floats, modelled: Floats) -> HysteresisShare:
@@ -64,7 +54,7 @@ def hysteresis_share(curvature: Floats, answers: Floats, modelled: Floats) -> Hy
 
     Args:
         curvature: (K,) 1/m of the commands.
-        answers: (K, 3) m, predicted_rms, lower, upper.
+        answers: (K, 2) m, lower, upper.
         modelled: (K,) m, :func:`surface_control_error_rms` of the same commands.
     """
     order = np.argsort(curvature)
@@ -129,7 +119,7 @@ class ForecastClient:
         grid = np.linspace(*curvatures, GRID)
         commands = [mirror.plan(FocusTarget(float(curvature))).signals for curvature in grid]
         modelled = np.array([surface_control_error_rms(mirror.model, signals) for signals in commands])
-        answers = np.full((GRID, 3), np.nan)
+        answers = np.full((GRID, 2), np.nan)
         for row, signals in enumerate(commands):
             future = self._client.call_async(PredictError.Request(signals=doubles(signals)))
             self._pending.append(future)
@@ -148,6 +138,6 @@ class ForecastClient:
                 self._node.get_logger().info(f"no prediction of the surface error: {answer.message}")
             self._refused = True
             return
-        answers[row] = answer.predicted_rms, answer.lower, answer.upper
+        answers[row] = answer.lower, answer.upper
         if self.share is None and np.isfinite(answers).all():
             self.share = hysteresis_share(grid, answers, modelled)

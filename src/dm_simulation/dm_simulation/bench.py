@@ -17,7 +17,7 @@ from dm_simulation.electronics.monitor import Monitor, MonitorConfig
 from dm_simulation.electronics.server import OFF, ElectronicsServer, PortsConfig
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.trigger_server import TriggerServer
-from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx, prune
+from dm_simulation.interferometer.zygo_files import FORMATS, deliver, encode_dat, encode_datx, prune
 from dm_simulation.mirror.membrane import Membrane, MembraneConfig
 from dm_simulation.mirror.piezo import DRAWN, PiezoActuators, PiezoConfig
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
@@ -77,8 +77,6 @@ class VirtualBench:
         now: Callable[[], float] = time.monotonic,
         on_event: Callable[[bool, str], None] = lambda severe, text: None,
     ) -> None:
-        if config.files.format not in FORMATS or config.files.datx_unit not in UNITS:
-            raise ValueError(f"output_format: must be one of {', '.join(FORMATS)}, datx_unit one of {', '.join(UNITS)}")
         self.config = config
         self._now = now
         self._on_event = on_event

@@ -82,11 +82,6 @@ def test_datx(sag: NDArray[np.float64], unit: str, metres: float) -> None:
         assert group.attrs["Subtract System Error"][0] == 0
 
 
-def test_datx_refuses_an_unknown_unit(sag: NDArray[np.float64]) -> None:
-    with pytest.raises(ValueError, match="unit = 'Furlongs'"):
-        encode_datx(sag, 0.0, WAVELENGTH, 0, unit="Furlongs")
-
-
 def test_a_file_appears_whole(tmp_path: Path) -> None:
     content = bytes(range(256)) * 4000
     target = tmp_path / "map.dat"

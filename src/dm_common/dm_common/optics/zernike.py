@@ -1,4 +1,4 @@
-"""The 21 Zernike terms to order 5 in the convention of Born & Wolf, and converters to Noll, OSA/ANSI and Fringe order.
+"""The 21 Zernike terms to order 5 in the convention of Born & Wolf, and from the orders of Noll, OSA/ANSI and Fringe.
 
 Born & Wolf ([2], section 9.2.1): peak-normalised, every term is 1 at most on the unit disc. The order
 is that of [1]: n rising, m rising, cosine before sine. x points right, y up, the angle counts from x to y. Coefficients
@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from dm_common import Floats
 
 MAX_ORDER = 5
 
@@ -94,7 +96,7 @@ SPOKEN: tuple[str, ...] = tuple(term.spoken for term in TERMS)
 DEFOCUS = TERMS.index(Term(2, 0, ""))
 
 #: Root mean square of each term over the unit disc.
-TERM_RMS: NDArray[np.float64] = np.array([term.rms for term in TERMS])
+TERM_RMS: Floats = np.array([term.rms for term in TERMS])
 TERM_RMS.flags.writeable = False
 
 
@@ -104,7 +106,7 @@ def _radial_factor(n: int, m: int) -> list[float]:
     return [(-1) ** s * math.comb(n - s, s) * math.comb(n - 2 * s, top - s) for s in range(top, -1, -1)]
 
 
-def basis(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
+def basis(x: ArrayLike, y: ArrayLike) -> Floats:
     """Evaluate all terms.
 
     Args:
@@ -146,7 +148,7 @@ def rms_beyond_tilt(coefficients: ArrayLike, residual: float = 0.0) -> float:
     return float(np.hypot(np.linalg.norm((_checked(coefficients) * TERM_RMS)[PISTON_TILT:]), residual))
 
 
-def _checked(coefficients: ArrayLike, count: int = len(TERMS), more: bool = False) -> NDArray[np.float64]:
+def _checked(coefficients: ArrayLike, count: int = len(TERMS), more: bool = False) -> Floats:
     """As an array, with `count` terms on the last axis, or `more`."""
     values = np.asarray(coefficients, dtype=float)
     if values.ndim < 1 or not (values.shape[-1] == count or (more and values.shape[-1] > count)):
@@ -160,49 +162,27 @@ _FROM_ANSI = np.array([term.ansi_index for term in TERMS])
 _FROM_FRINGE = np.array([term.fringe_index - 1 for term in TERMS])
 
 
-def born_wolf_to_noll(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """(..., 21) peak-normalised in Born & Wolf's order to (..., 21) rms-normalised, Noll index 1 to 21."""
-    return _in_order(_checked(coefficients) * TERM_RMS, _FROM_NOLL)
-
-
-def noll_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """Inverse of :func:`born_wolf_to_noll`; terms beyond order 5 are left out."""
+def noll_to_born_wolf(coefficients: ArrayLike) -> Floats:
+    """(..., 21) or more, rms-normalised, Noll index 1 on, to (..., 21) peak-normalised in Born & Wolf's order."""
     return _from_order(coefficients, _FROM_NOLL) / TERM_RMS
 
 
-def born_wolf_to_ansi(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """(..., 21) peak-normalised in Born & Wolf's order to (..., 21) rms-normalised, OSA/ANSI index 0 to 20."""
-    return _in_order(_checked(coefficients) * TERM_RMS, _FROM_ANSI)
-
-
-def ansi_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """Inverse of :func:`born_wolf_to_ansi`; terms beyond order 5 are left out."""
+def ansi_to_born_wolf(coefficients: ArrayLike) -> Floats:
+    """(..., 21) or more, rms-normalised, OSA/ANSI index 0 on, to (..., 21) peak-normalised in Born & Wolf's order."""
     return _from_order(coefficients, _FROM_ANSI) / TERM_RMS
 
 
-def born_wolf_to_fringe(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """(..., 21) in Born & Wolf's order to (..., 27) in Fringe order, peak-normalised both; 0 beyond order 5."""
-    return _in_order(_checked(coefficients), _FROM_FRINGE)
-
-
-def fringe_to_born_wolf(coefficients: ArrayLike) -> NDArray[np.float64]:
-    """Inverse of :func:`born_wolf_to_fringe`, of (..., 27) or more; terms beyond order 5 are left out."""
+def fringe_to_born_wolf(coefficients: ArrayLike) -> Floats:
+    """(..., 27) or more in Fringe order to (..., 21) in Born & Wolf's, peak-normalised both."""
     return _from_order(coefficients, _FROM_FRINGE)
 
 
-def _in_order(values: NDArray[np.float64], position: NDArray[np.intp]) -> NDArray[np.float64]:
-    result = np.zeros((*values.shape[:-1], position.max() + 1))
-    result[..., position] = values
-    return result
-
-
-def _from_order(coefficients: ArrayLike, position: NDArray[np.intp]) -> NDArray[np.float64]:
+def _from_order(coefficients: ArrayLike, position: NDArray[np.intp]) -> Floats:
+    """Terms beyond order 5 are left out."""
     return _checked(coefficients, int(position.max()) + 1, more=True)[..., position]
 
 
-def tilt_influence(
-    measured: NDArray[np.float64], places: NDArray[np.float64], response: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def tilt_influence(measured: Floats, places: Floats, response: Floats) -> Floats:
     """The tilt that each actuator makes, (2, N) m per unit signal, from maps that show it under the instrument's own.
 
     The instrument stands otherwise in each map: 0.3 um at the edge leave 0.12 um per unit signal in what 159 maps say.
@@ -219,5 +199,5 @@ def tilt_influence(
     square = np.square(places).sum(axis=0)
     shapes = np.column_stack([(lever * square**order).ravel() for order in range(TILT_ORDERS)])
     weights = np.linalg.lstsq(shapes, measured.ravel(), rcond=None)[0]
-    fitted: NDArray[np.float64] = (shapes @ weights).reshape(places.shape)
+    fitted: Floats = (shapes @ weights).reshape(places.shape)
     return fitted

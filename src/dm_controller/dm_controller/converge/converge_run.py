@@ -22,7 +22,7 @@ from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, L
 from dm_controller.converge.goals import ending
 from dm_controller.loop_actions import LoopBench
 from dm_controller.solvers.base import Solver
-from dm_controller.solvers.registry import MirrorFacts, make_solver
+from dm_controller.solvers.registry import make_solver
 
 #: What requests are told meanwhile.
 BUSY = "a closed loop (action converge) is running"
@@ -102,8 +102,7 @@ class ConvergeRun:
     def _solver(self, method: str) -> Solver:
         active = self._bench.host.active_calibration()
         weights = active.calibration.region_weights
-        facts = MirrorFacts(region_weights=np.asarray(weights, dtype=float) if len(weights) else None)
-        return make_solver(method, active.mirror.model, active.mirror.limits, facts)
+        return make_solver(method, active.mirror.model, active.mirror.limits, weights if len(weights) else None)
 
     def _judge(self, outcome: LoopResult) -> tuple[str, int, str]:
         best = outcome.best

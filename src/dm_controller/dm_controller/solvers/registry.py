@@ -2,48 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection
 
 from numpy.typing import ArrayLike
 
 from dm_common.limits import Limits
 from dm_common.names import UnknownNameError
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.solvers.base import Floats, Solver
+from dm_controller.solvers.base import Solver
 from dm_controller.solvers.least_squares import AZreg, AZWreg, Bounded, IterativeLearning, PseudoInverse
 
 #: The method taken when none is named.
 DEFAULT = Bounded.name
-
-
-@dataclass(frozen=True, eq=False)
-class MirrorFacts:
-    """What some methods need beside the influence function.
-
-    Attributes:
-        actuator_x, actuator_y: (N,) m; None = unknown.
-        region_weights: (10,) Eq. (8); None = all equal.
-    """
-
-    actuator_x: Floats | None = None
-    actuator_y: Floats | None = None
-    region_weights: ArrayLike | None = None
-
-
-Factory = Callable[[InfluenceModel, Limits, MirrorFacts], Solver]
-
-#: Makers by name, in the order of [1].
-SOLVERS: dict[str, Factory] = {
-    PseudoInverse.name: lambda model, limits, facts: PseudoInverse(model, limits),
-    IterativeLearning.name: lambda model, limits, facts: IterativeLearning(model, limits),
-    AZreg.name: lambda model, limits, facts: AZreg(model, limits),
-    AZWreg.name: lambda model, limits, facts: AZWreg(model, limits, facts.region_weights),
-    Bounded.name: lambda model, limits, facts: Bounded(model, limits),
+#: In the order of [1].
+SOLVERS: dict[str, type[Solver]] = {
+    solver.name: solver for solver in (PseudoInverse, IterativeLearning, AZreg, AZWreg, Bounded)
 }
 
 
-def named(name: str, solvers: Mapping[str, Factory]) -> str:
+def named(name: str, solvers: Collection[str]) -> str:
     """`name`, or the default for "".
 
     Raises:
@@ -56,11 +33,15 @@ def named(name: str, solvers: Mapping[str, Factory]) -> str:
     return name
 
 
-def make_solver(name: str, model: InfluenceModel, limits: Limits, facts: MirrorFacts | None = None) -> Solver:
+def make_solver(name: str, model: InfluenceModel, limits: Limits, region_weights: ArrayLike | None = None) -> Solver:
     """The solver of that name ("" = the default) for one mirror.
+
+    Args:
+        region_weights: (10,) Eq. (8), for AZWreg; None = all equal.
 
     Raises:
         UnknownNameError: no such method, listing all.
-        ValueError: the model, or what is known of the mirror, does not do for the method.
+        ValueError: the model does not do for the method.
     """
-    return SOLVERS[named(name, SOLVERS)](model, limits, facts or MirrorFacts())
+    solver = SOLVERS[named(name, SOLVERS)]
+    return AZWreg(model, limits, region_weights) if solver is AZWreg else solver(model, limits)

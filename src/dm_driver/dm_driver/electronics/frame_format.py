@@ -63,7 +63,7 @@ class FrameFormat:
         frame_rate: most frames per second, Hz; 0 = as fast as the line carries them.
 
     Raises:
-        ValueError: naming the parameter, its value and what is allowed.
+        ValueError: values that are each allowed and do not fit each other, naming the parameters.
     """
 
     channels: int = 40
@@ -86,22 +86,6 @@ class FrameFormat:
     frame_rate: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value, choices in (
-            ("byte_order", self.byte_order, BYTE_ORDERS),
-            ("checksum", self.checksum, tuple(CHECK_SUMS)),
-            ("checksum_byte_order", self.checksum_byte_order, BYTE_ORDERS),
-            ("parity", self.parity, PARITIES),
-        ):
-            if value not in choices:
-                raise ValueError(f"framed_serial.{name} = {value!r}: must be one of {', '.join(choices)}")
-        for name, number, low, high in (
-            ("channels", self.channels, 1, 4096),
-            ("bits", self.bits, 1, MOST_BITS),
-            ("baud_rate", self.baud_rate, 50, 10_000_000),
-            ("stop_bits", self.stop_bits, 1, 2),
-        ):
-            if not low <= number <= high:
-                raise ValueError(f"framed_serial.{name} = {number}: must be {low} to {high}")
         for name in ("header", "terminator", "opening", "reply"):
             parse_hex(f"framed_serial.{name}", getattr(self, name))
         if len(self.channel_order) and sorted(self.channel_order) != list(range(self.channels)):

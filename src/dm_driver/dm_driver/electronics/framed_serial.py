@@ -56,7 +56,7 @@ class FramedSerial(DriveElectronics):
         if pause > 0.0:
             time.sleep(pause)
         if self._reply:
-            self._drop_received()  # a late answer is not the answer to this frame
+            self._do_check()  # a late answer is not the answer to this frame
         self._link.write(self._frame.encode(codes))
         self._free_at = time.monotonic() + self._period_s
         if self._reply:
@@ -68,9 +68,6 @@ class FramedSerial(DriveElectronics):
                 )
 
     def _do_check(self) -> None:
-        self._drop_received()
-
-    def _drop_received(self) -> None:
         """Empty the system's buffer; fails on a device that has been unplugged."""
         waiting = self._link.in_waiting
         if waiting:

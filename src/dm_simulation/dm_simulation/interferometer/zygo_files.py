@@ -29,6 +29,8 @@ NO_DATA = 1.7976931348623157e308
 FORMATS = ("dat", "datx")
 MAP_NAMES = tuple(f"{name}_[0-9]*.{suffix}" for name in ("map", "measure") for suffix in FORMATS)
 UNITS = ("Fringes", "NanoMeters")
+#: In which a file grows on a slow network share.
+PIECES = 8
 
 
 def encode_dat(
@@ -40,7 +42,6 @@ def encode_dat(
     intensity: bool = False,
     phase_resolution: int = 2,
     part_name: str = "PDM30-37",
-    comment: str = "virtual bench",
 ) -> bytes:
     """A whole `.dat` file.
 
@@ -74,7 +75,7 @@ def encode_dat(
         put(60, ">I", frame.nbytes)
     put(68, ">HHI", width, height, counts.nbytes)
     put(76, ">I", unix_time & 0xFFFFFFFF)
-    put(80, "82s", comment.encode("ascii", "replace"))
+    put(80, "82s", b"virtual bench")
     put(164, ">ff", SCALE_FACTOR, wavelength)
     put(176, ">f", 1.0)
     put(184, ">f", pitch)
@@ -93,13 +94,7 @@ def encode_datx(
     unit: str = "NanoMeters",
     part_name: str = "PDM30-37",
 ) -> bytes:
-    """A whole `.datx` file: sag (h, w) in m, row 0 = top, NaN = no data; `unit` one of UNITS.
-
-    Raises:
-        ValueError: unknown unit.
-    """
-    if unit not in UNITS:
-        raise ValueError(f"unit = {unit!r}: must be one of {', '.join(UNITS)}")
+    """A whole `.datx` file: sag (h, w) in m, row 0 = top, NaN = no data; `unit` one of UNITS."""
     per_metre = 1e9 if unit == "NanoMeters" else 1 / (SCALE_FACTOR * wavelength)
     values = np.where(np.isfinite(sag), sag * per_metre, NO_DATA)
     measurement, surface, attributes = "{6F1A-M}", "{6F1A-S}", "{6F1A-A}"
@@ -141,21 +136,21 @@ def encode_datx(
     return buffer.getvalue()
 
 
-def deliver(content: bytes, path: Path, seconds: float = 0.0, pieces: int = 8) -> None:
+def deliver(content: bytes, path: Path, seconds: float = 0.0) -> None:
     """Put a file in its place.
 
     With `seconds` = 0 it appears whole: written under a temporary name in the same folder, then renamed. Otherwise it
-    grows under its own name in `pieces` over that many seconds of wall time, as on a slow network share.
+    grows under its own name in PIECES over that many seconds of wall time, as on a slow network share.
 
     Raises:
         OSError: the folder is missing or full; no part of a file is left behind.
     """
     if seconds > 0:
-        step = -(-len(content) // pieces)
+        step = -(-len(content) // PIECES)
         with path.open("wb") as file:
             for start in range(0, len(content), step):
                 if start:
-                    time.sleep(seconds / (pieces - 1))
+                    time.sleep(seconds / (PIECES - 1))
                 file.write(content[start : start + step])
                 file.flush()
         return
