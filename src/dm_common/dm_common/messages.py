@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from typing import TYPE_CHECKING, Any
 
@@ -135,6 +136,15 @@ def applied_from(message: ActuatorState) -> Applied:
     )
 
 
+def _of_actuators(name: str, values: array[float], *shape: int) -> Floats:
+    """A field that has this shape for all actuators alike, or once for each of them; empty = there is none."""
+    field, one = np.array(values, dtype=np.float64), math.prod(shape)
+    if field.size and (not one or field.size % one):
+        wanted = " x ".join(map(str, shape))
+        raise ValueError(f"hysteresis: {name} has {field.size} values, must be {wanted} (for each)")
+    return field.reshape(-1, *shape) if field.size > one else field.reshape(shape) if field.size else field
+
+
 def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None:
     """The hysteresis model in a message; None when none was identified.
 
@@ -144,25 +154,14 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     radius = np.array(message.play_radius, dtype=np.float64)
     if not radius.size:
         return None
-    weight = np.array(message.play_weight, dtype=np.float64)
-    one = radius.size * message.powers
-    if not one or not weight.size or weight.size % one:
-        raise ValueError(
-            f"hysteresis: play_weight has {weight.size} values, must be {radius.size} x {message.powers} (for each)"
-        )
+    weight = _of_actuators("play_weight", message.play_weight, radius.size, message.powers)
+    if not weight.size:
+        raise ValueError(f"hysteresis: play_weight has 0 values, must be {radius.size} x {message.powers} (for each)")
     duhem_weight = np.array(message.duhem_weight, dtype=np.float64)
     duhem_slope = np.array(message.duhem_slope, dtype=np.float64)
     if duhem_weight.size > 1 and duhem_slope.size % (2 * duhem_weight.size):
         raise ValueError(f"hysteresis: duhem_slope has {duhem_slope.size} values, must be {duhem_weight.size} x 2 x A")
     creep_time = np.array(message.creep_time, dtype=np.float64)
-    spectrum = np.array(message.creep_spectrum, dtype=np.float64)
-    if spectrum.size and (not creep_time.size or spectrum.size % creep_time.size):
-        raise ValueError(
-            f"hysteresis: creep_spectrum has {spectrum.size} values, must be {creep_time.size} or for each"
-        )
-    lag = np.array(message.lag_spectrum, dtype=np.float64)
-    if lag.size and (not message.lags or lag.size % message.lags):
-        raise ValueError(f"hysteresis: lag_spectrum has {lag.size} values, must be {message.lags} or for each")
     covariance = np.array(message.creep_covariance, dtype=np.float64)
     if covariance.size not in (0, 2 * (1 + creep_time.size) ** 2):
         raise ValueError(
@@ -170,16 +169,16 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         )
     return HysteresisModel(
         radius,
-        weight.reshape((-1, radius.size, message.powers) if weight.size > one else (radius.size, message.powers)),
+        weight,
         duhem_slope.reshape(duhem_weight.size, 2, -1) if duhem_weight.size > 1 and duhem_slope.size else duhem_slope,
         duhem_weight if duhem_weight.size > 1 else float(duhem_weight.sum()),
         message.creep_rate,
         creep_time,
-        spectrum.reshape(-1, creep_time.size) if spectrum.size > creep_time.size else spectrum,
+        _of_actuators("creep_spectrum", message.creep_spectrum, creep_time.size),
         1e-9 * stamp_ns(message.crept_at),
         np.array(message.crept, dtype=np.float64),
         covariance.reshape(2, 1 + creep_time.size, -1) if covariance.size else covariance,
-        lag.reshape(-1, message.lags) if lag.size > message.lags else lag,
+        _of_actuators("lag_spectrum", message.lag_spectrum, message.lags),
         message.creep_slope,
     )
 
@@ -217,19 +216,17 @@ def estimate_from(message: ActuatorEstimateMsg) -> ActuatorEstimate:
     return ActuatorEstimate(HysteresisState(seconds(message.header.stamp), **values), message.message)
 
 
+#: Fields of Recipe that a dm_msgs/Recipe has under the same names.
+_ARRAYS, _NUMBERS = (
+    ("effective", "signals", "zernike"),
+    ("curvature", "conic_constant", "max_zernike", "rms", "maps"),
+)
+
+
 def recipe_book_message(book: RecipeBook) -> RecipeBookMsg:
     """Recipes as a message."""
     recipes = [
-        RecipeMsg(
-            curvature=recipe.curvature,
-            conic_constant=recipe.conic_constant,
-            effective=doubles(recipe.effective),
-            signals=doubles(recipe.signals),
-            max_zernike=recipe.max_zernike,
-            rms=recipe.rms,
-            maps=recipe.maps,
-            zernike=list(recipe.zernike),
-        )
+        RecipeMsg(**vars(recipe) | {name: doubles(np.array(getattr(recipe, name))) for name in _ARRAYS})
         for recipe in book.recipes
     ]
     return RecipeBookMsg(
@@ -248,14 +245,10 @@ def recipe_book_from(message: RecipeBookMsg) -> RecipeBook:
     """
     recipes = [
         Recipe(
-            recipe.curvature,
-            recipe.conic_constant,
-            np.array(recipe.effective, dtype=np.float64),
-            np.array(recipe.signals, dtype=np.float64),
-            recipe.max_zernike,
-            recipe.rms,
-            recipe.maps,
-            tuple(recipe.zernike),
+            effective=np.array(recipe.effective, dtype=np.float64),
+            signals=np.array(recipe.signals, dtype=np.float64),
+            zernike=tuple(recipe.zernike),
+            **{name: getattr(recipe, name) for name in _NUMBERS},
         )
         for recipe in message.recipes
     ]

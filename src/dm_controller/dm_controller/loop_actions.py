@@ -7,11 +7,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from dm_msgs.action import BuildRecipes, Converge
 from dm_msgs.msg import Calibration, FocusRequest
 from dm_msgs.srv import StoreRecipes
 from rclpy.node import Node
 
+from dm_common import Floats
 from dm_common.errors import MeasurementError
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros import qos
@@ -106,6 +108,11 @@ class LoopBench(BenchServices):
     def _missing(self) -> str:
         needed = self._needed
         return super()._missing() or (needed.text if needed is not None and needed.missing() else "")
+
+    def applied(self) -> Floats | None:
+        """(N,) signals at which the driver says that the mirror stands; None = it does not say."""
+        applied = np.array(self.state.applied if self.state is not None else (), dtype=np.float64)
+        return applied if applied.size and np.isfinite(applied).all() else None
 
     def degauss(self) -> None:
         """The condition that recipes begin with: the driver's own number of steps may be another."""

@@ -96,7 +96,7 @@ def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) ->
 )
 def test_fields_that_cannot_be(clock: Clock, code: ErrorCode, fields: dict[str, object]) -> None:
     with refused(code):
-        MirrorHold(clock).ask(**{"operation": Operation.HOLD, "holder": "operator"} | fields)  # type: ignore[arg-type]
+        MirrorHold(clock).ask(**{"operation": Operation.HOLD, "holder": "operator"} | fields)
 
 
 @pytest.mark.parametrize("between", ["nobody", "command", "own command, then another", "hold"])

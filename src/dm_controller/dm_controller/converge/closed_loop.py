@@ -30,7 +30,7 @@ from dm_common.measurement import Measurement
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, response, rms_sag, target_shape
 
 #: Bounds of the factor on a correction that the watched response may ask for.
 SCALE_MIN, SCALE_MAX = 0.6, 1.5
@@ -147,11 +147,6 @@ class StoppedLoop(Cancelled):
         self.steps = steps
 
 
-def _response(model: InfluenceModel, change: Floats) -> Shape:
-    """What the model says of a change of signals."""
-    return Shape(model.influence_zernike @ change, model.influence_sag @ change)
-
-
 class _Foresight:
     """Drift from the map just taken to the next, which will take as long as this one did."""
 
@@ -169,7 +164,7 @@ class _Foresight:
         self._state = law.advance(self._state, now)
         then = law.advance(self._state, 2.0 * now - self._last)
         self._last = now
-        return _response(self._model, law.effective(then) - law.effective(self._state))
+        return response(self._model, law.effective(then) - law.effective(self._state))
 
 
 def response_ratio(asked: Shape, seen: Shape) -> float:
@@ -215,7 +210,7 @@ def converge(
     foresight = _Foresight(creep, model) if creep is not None and creep.law.creep_rate else None
     steps: list[LoopStep] = []
     damping, scale = 1.0, 1.0
-    drift = _response(model, np.zeros_like(signals))
+    drift = response(model, np.zeros_like(signals))
     while True:
         if cancelled():
             raise StoppedLoop(tuple(steps))
@@ -229,7 +224,7 @@ def converge(
         error = measured_shape(measured.coefficients, measured.sag, model) - wanted
         step = LoopStep(number, signals, error, error.max_zernike, rms_sag(error, model), overflow)
         if steps:
-            asked = _response(model, signals - steps[-1].signals)
+            asked = response(model, signals - steps[-1].signals)
             ratio = response_ratio(asked, error - steps[-1].error - drift)
             if math.isfinite(ratio):
                 scale = float(np.clip(1.0 / ratio, SCALE_MIN, SCALE_MAX)) if ratio > 0.0 else SCALE_MIN

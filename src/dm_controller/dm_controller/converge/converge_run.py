@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 from dm_msgs.action import Converge
 from rclpy.node import Node
 
@@ -74,24 +73,21 @@ class ConvergeRun:
         clock = self._node.get_clock()
         wait_for_clock(clock)
         bench.settle_time = float(self._values["converge.settle_time"])
-        creep = self._creep(solver, lambda: clock.now().nanoseconds * 1e-9)
+        creep = self._creep(lambda: clock.now().nanoseconds * 1e-9)
         try:
             return converge(solver, target, bench, options, creep=creep, on_step=report, cancelled=bench.cancelled)
         except Refusal as error:
             raise Refusal(error.error_code, f"{error}; the mirror holds the last command") from error
 
-    def _creep(self, solver: Solver, now: Callable[[], float]) -> Creep | None:
+    def _creep(self, now: Callable[[], float]) -> Creep | None:
         """By the law in use and what is known of the actuators; without a law of creep, by the configured rate."""
         bench, law = self._bench, self._bench.host.active_calibration().planner.law
         if law.creep_rate:
             state = bench.host.hysteresis()
             return Creep(law, state, now) if state is not None else None
-        report = bench.state
-        count = solver.model.influence_zernike.shape[1]
         # A mirror that is not known to stand somewhere gives no move to foresee creep from.
-        if report is None or len(report.applied) != count or not np.isfinite(report.applied).all():
-            return None
-        return Creep.of_rate(self._values["converge.creep"], np.asarray(report.applied, dtype=float), now)
+        applied = bench.applied()
+        return None if applied is None else Creep.of_rate(self._values["converge.creep"], applied, now)
 
     def _options(self, goal: Any) -> LoopOptions:
         """What the goal asks for, 0 = configured."""

@@ -25,7 +25,7 @@ from dm_controller.converge.goals import UnreachableError
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, measured_shape, response, rms_sag, target_shape
 
 #: Effective signals that limits deny count from here on.
 MISS_IGNORED = 1e-3
@@ -186,12 +186,8 @@ class RecipeBuilder:
         change = wanted if near is None else wanted - self._defects.at(near)
         return mirror.solve(mirror.rows(change.coefficients, change.sag))
 
-    def _response(self, effective: Floats) -> Shape:
-        model = self._loop.mirror.model
-        return Shape(model.influence_zernike @ effective, model.influence_sag @ effective)
-
     def _predicted(self, effective: Floats) -> Shape:
-        return self._offset + self._response(effective)
+        return self._offset + response(self._loop.mirror.model, effective)
 
     def _go(self, target: FocusTarget, aim: Floats) -> tuple[Floats, Floats]:
         """Condition the mirror and move it to the effective signals `aim`.
@@ -209,7 +205,7 @@ class RecipeBuilder:
         applied = plant.apply(move.plan.signals)
         self.state = law.move(self.state, applied, self._now())
         missed = law.effective(law.advance(self.state, self._now() + self._options.settle_time)) - aim
-        worst, denied = int(np.abs(missed).argmax()), self._response(missed).max_zernike
+        worst, denied = int(np.abs(missed).argmax()), response(self._loop.mirror.model, missed).max_zernike
         if denied > self._options.reachable:
             raise UnreachableError(
                 f"curvature = {target.curvature:+.4f} 1/m: actuator {worst + 1} stands at its limit and misses its "

@@ -164,10 +164,8 @@ class RecipeRun:
 
     def _guess(self, law: HysteresisModel, now: float, middle: float) -> HysteresisState | None:
         """The mirror long rested where the driver says it stands; None when it does not say."""
-        state = self._bench.state
-        if state is None or not len(state.applied) or not np.isfinite(state.applied).all():
-            return None
-        return rested(law, np.array(state.applied, dtype=float), now, middle)
+        applied = self._bench.applied()
+        return None if applied is None else rested(law, applied, now, middle)
 
     def _stored(self, handle: WorkerGoal, request: Any) -> tuple[int, str]:
         """What the calibration node answers: an ErrorCode and a sentence.

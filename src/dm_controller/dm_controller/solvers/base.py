@@ -71,6 +71,11 @@ def points_of(model: InfluenceModel) -> SamplePoints:
     return SamplePoints(model.sample_x, model.sample_y, model.sample_weight)
 
 
+def response(model: InfluenceModel, change: Floats) -> Shape:
+    """What a change of effective signals (N,) does to the surface, as the model says."""
+    return Shape(model.influence_zernike @ change, model.influence_sag @ change)
+
+
 def target_shape(target: FocusTarget, model: InfluenceModel) -> Shape:
     """The wanted surface over the aperture of `model`.
 

@@ -1,4 +1,4 @@
-"""One owner of the mirror at a time: who holds it, and what everybody else hears meanwhile. Knows no ROS.
+"""One owner of the mirror at a time: who holds it, and what everybody else hears meanwhile. Knows no node.
 
 A calibration that a stray focus request moves the mirror under is lost. So whoever needs the mirror for a while holds
 it: commands of others are refused, with a sentence that says who holds it, for how long, and how to end that. A hold is
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from enum import StrEnum
+
+from dm_msgs.srv import HoldMirror
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.values import real, text
@@ -20,16 +21,9 @@ LEASE_S = 3.0
 LEASE_MAX_S = 3600.0
 
 
-class Operation(StrEnum):
-    """The constants of dm_msgs/HoldMirror."""
-
-    HOLD = "hold"
-    RENEW = "renew"
-    TAKE_OVER = "take_over"
-    RELEASE = "release"
-
-
-_OPERATION = text("", choices=("", *Operation))
+#: What may be asked, as its constants HOLD, RENEW, TAKE_OVER and RELEASE.
+Operation = HoldMirror.Request
+_OPERATION = text("", choices=("", Operation.HOLD, Operation.RENEW, Operation.TAKE_OVER, Operation.RELEASE))
 _DURATION = real(0.0, 0.0, unit="s")
 _LEASE = real(0.0, 0.0, LEASE_MAX_S, "s")
 
