@@ -17,11 +17,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from rclpy.clock import Clock as SteadyClock
 from rclpy.clock import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, Temperature
 from std_msgs.msg import String
@@ -126,25 +126,23 @@ class VirtualBenchNode(Node):
     def _tick(self, period: float) -> None:
         assert self._fast_clock is not None
         while not self._stop.wait(period):
-            seconds, nanoseconds = divmod(self._fast_clock.now_ns(), 1_000_000_000)
-            self._clock_publisher.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+            self._clock_publisher.publish(Clock(clock=Time(nanoseconds=self._fast_clock.now_ns()).to_msg()))
 
     def _read_temperature(self) -> None:
-        seconds, nanoseconds = divmod(round(self._now() * 1e9), 1_000_000_000)
         reading = Temperature(temperature=self.bench.temperature())
-        reading.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
+        reading.header.stamp = Time(nanoseconds=round(self._now() * 1e9)).to_msg()
         self._temperature_publisher.publish(reading)
 
     def _film(self, period: float) -> None:
         while not self._stop.wait(period - time.monotonic() % period):
-            seconds, nanoseconds = divmod(round(self._now() * 1e9), 1_000_000_000)
+            now_ns = round(self._now() * 1e9)
             try:
                 picture = self.bench.photograph()
             except OSError:  # the bench is closing
                 return
             height, width = picture.shape
             message = Image(height=height, width=width, encoding="mono8", step=width)
-            message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
+            message.header.stamp = Time(nanoseconds=now_ns).to_msg()
             message.header.frame_id = self._camera_frame
             message.data = array.array("B", picture.tobytes())
             self._image_publisher.publish(message)

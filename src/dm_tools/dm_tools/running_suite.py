@@ -99,40 +99,24 @@ def verdict(promised: float, measured: float) -> str:
     return f"{found}: {judged}" if promised > 0.0 else found
 
 
-class Holder(NamedTuple):
-    """Who has the mirror for itself.
-
-    Attributes:
-        holding: who and since when, as the driver says it.
-        step, steps: how far it is; 0 = not known.
-    """
-
-    holding: str
-    step: int = 0
-    steps: int = 0
-
-    def __str__(self) -> str:
-        far = f" (step {self.step} of {self.steps})" if self.steps else f" (step {self.step})" if self.step else ""
-        return f"{self.holding}{far}"
-
-
-def holder(client: DeformableMirrorClient) -> Holder | None:
-    """Who has the mirror for itself; None = nobody."""
+def holder(client: DeformableMirrorClient) -> str:
+    """Who has the mirror for itself and since when, as the driver says it, and how far they are; "" = nobody."""
     from dm_client.client import INTERFACES
     from dm_tools.long_actions import LONG, ExternalGoals
 
     client.wait(lambda: "actuator_state" in client.messages, BUSY_S)
     state = client.messages.get("actuator_state")
     if state is None or not state.holder:
-        return None
+        return ""
     holding = state.holding.partition(": ")[0]  # how to end it is said in the words of the command
     goals = [ExternalGoals(client.node, INTERFACES[name], name) for name in LONG]
     client.wait(lambda: any(goal.running for goal in goals), 0.5)
     running = next((goal for goal in goals if goal.running), None)
     if running is None:
-        return Holder(holding)
+        return holding
     client.wait(lambda: running.feedback, REPORT_S)
-    return Holder(holding, *(getattr(running.feedback, field, 0) for field in ("step", "steps")))
+    step, steps = (getattr(running.feedback, field, 0) for field in ("step", "steps"))
+    return f"{holding} (step {step}{f' of {steps}' if steps else ''})" if step or steps else holding
 
 
 @contextmanager

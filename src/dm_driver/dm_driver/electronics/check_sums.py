@@ -26,10 +26,6 @@ class CheckSum:
     of: Callable[[bytes], int]
 
 
-def _reflected(value: int, bits: int) -> int:
-    return int(f"{value:0{bits}b}"[::-1], 2)
-
-
 def crc16(polynomial: int, start: int, reflect: bool) -> CheckSum:
     """A CRC of 16 bits without final inversion.
 
@@ -38,7 +34,7 @@ def crc16(polynomial: int, start: int, reflect: bool) -> CheckSum:
         start: of the register.
         reflect: bytes enter with their least significant bit first, and the value leaves mirrored.
     """
-    divisor = _reflected(polynomial, 16) if reflect else polynomial
+    divisor = int(f"{polynomial:016b}"[::-1], 2) if reflect else polynomial
 
     def step(register: int) -> int:
         if reflect:

@@ -138,15 +138,11 @@ def _mirror_and_signals(session: Session) -> tuple[Any, list[float]]:
     return mirror, requested
 
 
-def _still_poked(session: Session, requested: list[float]) -> bool:
-    """Whether the mirror stands where the last poke of this console left it."""
-    return session.base is not None and np.array_equal(requested, session.poked)
-
-
 async def poke(session: Session, actuator: int, amplitude: float, then_measure: bool) -> str:
     """Move one actuator away from the shape that stood before the first poke."""
     mirror, requested = _mirror_and_signals(session)
-    base = session.base if session.base is not None and _still_poked(session, requested) else requested
+    still_poked = np.array_equal(requested, session.poked)
+    base = session.base if session.base is not None and still_poked else requested
     signals = poke_signals(base, actuator, amplitude, mirror.signal_min, mirror.signal_max)
     await session.ros.call("set_signals", SetSignals.Request(signals=signals, wait=True), MOVE_S)
     session.base, session.poked = base, signals

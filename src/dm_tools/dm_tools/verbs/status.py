@@ -56,7 +56,7 @@ def status(namespace: NamespaceOption = "", json: JsonOption = None) -> None:
     figures = {
         "nodes": list(found),
         "mirror": mirror.serial if mirror is not None else None,
-        "held_by": str(by) if by else None,
+        "held_by": by or None,
         "curvature": shape.curvature if shape else None,
         "bound_nm": nanometres(shape.bound) if shape else None,
         "calibration": calibration.id if calibration is not None else None,
@@ -74,9 +74,9 @@ def _health(health: dict[str, Any]) -> str:
     return "; ".join(f"{', '.join(names)}: {message}" for message, names in said.items()) or "ok"
 
 
-def _now(by: Any, shape: SettledShape | None, state: Any) -> str:
-    if by is not None:
-        return str(by)
+def _now(by: str, shape: SettledShape | None, state: Any) -> str:
+    if by:
+        return by
     if shape is not None:
         return (
             f"{shape.curvature:+.4f} 1/m ({2 * shape.curvature:+.3f} dioptre) for {ago(shape.seconds)}, within "
@@ -118,14 +118,14 @@ def _absolute(capabilities: Any, calibration: Any) -> str:
     return f"{two_fold(capabilities.error_bound, calibration, farthest)}, at {farthest:+.4f} 1/m"
 
 
-def _next(lacking: list[str], by: Any, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
+def _next(lacking: list[str], by: str, state: Any, calibration: Any, shape: Any, capabilities: Any) -> str:
     if lacking:
         return "end ./dm up with Ctrl-C and start it again; ./dm doctor says more"
     if state is None or state.driver_state != state.STATE_ACTIVE:
         return "the driver must be active first: ./dm doctor --config FILE says what it lacks"
     if capabilities is not None and capabilities.error_code == ErrorCode.NODE_INACTIVE:
         return str(capabilities.message)
-    if by is not None:
+    if by:
         return "wait for its end; ./dm console shows how far it is, and can cancel it"
     if calibration is None or not calibration.hysteresis.play_radius:
         return "./dm calibrate"

@@ -34,11 +34,6 @@ DRAW_BAR = """(params, api) => {
 }"""
 
 
-def unit_for(extent: float) -> tuple[float, str]:
-    """(factor, unit) in which lengths up to `extent` m read well."""
-    return (1e6, "µm") if extent >= 1e-6 else (1e9, "nm")
-
-
 def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing:
     """`surface` on a symmetric scale -limit .. +limit (m).
 
@@ -49,7 +44,7 @@ def heat_map(surface: Surface, limit: float, colours: str, name: str) -> Drawing
         name: what is shown, for the description.
     """
     limit = limit if np.isfinite(limit) and limit > 0.0 else 1e-9
-    factor, unit = unit_for(limit)
+    factor, unit = (1e6, "µm") if limit >= 1e-6 else (1e9, "nm")
     reach, length = (surface.radius * 1e3, "mm") if surface.radius > 0 else (1.0, "aperture radii")
     high = limit * factor
     share = np.linspace(0.0, 1.0, 33)
