@@ -197,7 +197,7 @@ def test_who_holds_the_mirror_is_named() -> None:
     with pytest.raises(DeformableMirrorError, match=r"for 12 s \(.*Ctrl-C[^-]*$"), naming_holder(client):
         raise uncalibrated
     idle: Any = FakeClient(busy=False)
-    assert holder(idle) is None
+    assert not holder(idle)
     with pytest.raises(DeformableMirrorError, match="no calibration is in use"), naming_holder(idle):
         raise uncalibrated
 
