@@ -275,7 +275,7 @@ def test_a_calibration_that_was_not_heard_is_not_called_none() -> None:
 
 def test_status_knows_no_negative_zero() -> None:
     """Mid range is a step of the converter beside 0."""
-    said = verb_status._now(None, None, ActuatorState(applied=[-6e-6, -4e-6]))
+    said = verb_status._now("", None, ActuatorState(applied=[-6e-6, -4e-6]))
     assert said == "signals +0.00 to +0.00, not asked for as a curvature"
 
 
