@@ -78,9 +78,9 @@ PLAIN = frozenset(
         r"\w+",
         "active adds ago back beforehand beside better budget calibrate cancel changed clock compares "
         "connected could ctrl data done dropped fast fits forgotten go goal if info makes mb min needs newest none now "
-        "again doctor have long ok own pdf ready real running said sheets since soon start status taken terminal there "
+        "again config doctor have long ok own pdf ready real running said sheets since soon start status taken terminal there "
         "things took typical "
-        "valid whole writes written yet",
+        "valid whole write writes written yaml yet",
     )
 )
 #: Endings of a word, and what its stem has instead.

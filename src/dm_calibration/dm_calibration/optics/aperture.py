@@ -97,6 +97,8 @@ def find_aperture(valid: NDArray[np.bool_]) -> Aperture:
         if scatter <= _ROUND * circle.radius_px and _is_disc(region, circle):
             return circle
     circle = _inscribed_circle(region)
+    if region[[0, -1]].any() or region[:, [0, -1]].any():  # cut off there, as a rectangular field is
+        return circle
     other = _inscribed_circle(region & ~circle.disc(region.shape))
     if other.radius_px > max(1.0, math.sqrt(SECOND_SHARE) * circle.radius_px):
         raise InsufficientDataError(
