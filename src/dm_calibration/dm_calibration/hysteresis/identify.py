@@ -47,8 +47,8 @@ class Identification:
         fit: of the chosen candidate, to all maps.
         held_out: (M, D) residual of maps that had no part in the fit: the test maps, or where there are none, each part
             of the run in turn; NaN = not predicted.
-        scores: held-out error of each candidate relative to the best; estimated where a richer one than the best leaves
-            hardly less in the maps it was fitted to.
+        scores: held-out error of each candidate relative to the best; that of the best before it, of a richer one that
+            leaves hardly less in the maps it was fitted to.
         refused: candidates that cannot be inverted, with the reason.
     """
 
@@ -115,7 +115,7 @@ def identify(
             return
         gain = size(best[2].residual) / size(whole.residual) if best else np.inf
         if best and _contains(whole.candidate, best[2].candidate) and gain < PARSIMONY:
-            scores[name] = best[0] / gain  # what it leaves of its own maps is no less: nor will be what it predicts
+            scores[name] = best[0]  # what it leaves of its own maps is hardly less: nor is what it predicts
         else:
             held_out = np.full_like(whole.residual, np.nan)
             for fold in range(folds):
