@@ -211,8 +211,7 @@ class SimulatedBench:
         if self._fitter is None or not self._fitter.fits(valid, aperture):
             self._fitter = MapFitter(valid, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
         fit = self._fitter.fit(sag)
-        circle = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
-        samples = sample_map(sag, *circle, self._points, fit.coefficients)
+        samples = sample_map(sag, aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px, self._points)
         return Measurement(
             points=self._points,
             sag=samples,

@@ -144,7 +144,7 @@ class Ingest:
                 "(parameter aperture.minimum_valid_fraction)"
             )
         fit = self._fitter.fit(sag)
-        samples = sample_map(sag, *circle, self.points, fit.coefficients)
+        samples = sample_map(sag, *circle, self.points)
         left = np.abs(samples - self._terms @ fit.coefficients)
         if not source.phase_steps and np.fmax.reduce(left) > STEP_SHARE * source.wavelength > 0.0:
             mended, regions = mend_phase_steps(source.sag, 0.5 * source.wavelength)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dm_common import Floats
-from dm_common.optics.zernike import basis
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -62,14 +61,7 @@ def edge_clustered_points(count: int = 500) -> SamplePoints:
     )
 
 
-def sample_map(
-    sag: Floats,
-    centre_x_px: float,
-    centre_y_px: float,
-    radius_px: float,
-    points: SamplePoints,
-    coefficients: Floats | None = None,
-) -> Floats:
+def sample_map(sag: Floats, centre_x_px: float, centre_y_px: float, radius_px: float, points: SamplePoints) -> Floats:
     """Read a map at the sampling points by the four-neighbour rule of section 2.2.
 
     A point on a pixel takes its value; a point on the line between two adjacent pixels the mean of the two; any other
@@ -80,9 +72,6 @@ def sample_map(
         sag: (height, width), row 0 = top, NaN = no data.
         centre_x_px, centre_y_px: centre of the aperture from the left and top pixel's centre.
         radius_px: radius of the aperture.
-        coefficients: (21,) of the terms fitted to the map: then the rule reads what these leave of it, and they are
-            taken at the points themselves. A mean of neighbours is up to half a pixel away from its point: where the
-            rim of a sphere of 0.03 1/m rises by 36 nm a pixel, 10 nm rms. None = the rule as it stands.
 
     Returns:
         (P,), in the unit of the sag.
@@ -96,14 +85,10 @@ def sample_map(
     height, width = sag.shape
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     values = sag[np.where(inside, rows, 0), np.where(inside, columns, 0)]
-    smooth: Floats | float = 0.0
-    if coefficients is not None:
-        values = values - basis((columns - centre_x_px) / radius_px, (centre_y_px - rows) / radius_px) @ coefficients
-        smooth = basis(points.x, points.y) @ coefficients
     good = inside & np.isfinite(values)
     count = good.sum(axis=0)
     total = np.where(good, values, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan) + smooth
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _snapped(position: Floats) -> Floats:
