@@ -16,9 +16,9 @@ from dm_tools.output import JsonOption, console, write_json
 #: What `--fast` leaves out: nodes as processes, and whole comparisons, reports and identifications.
 FAST = "not processes and not slow"
 _CORES = os.cpu_count() or 1
-#: Most of a node's test is waiting, so several at once for each core, but not more nodes than fit into the memory of a
+#: Much of a node's test is waiting, so two at once for each core, but not more nodes than fit into the memory of a
 #: small machine. conftest.py has those first that take longest, and says which modules stay whole.
-WORKERS = max(_CORES, min(3 * _CORES, 12))
+WORKERS = min(2 * _CORES, 12)
 #: Little of the others is waiting; each worker imports the modules of all tests, which takes some ten seconds.
 FAST_WORKERS = _CORES + (_CORES + 1) // 2
 SCHEDULE = ("--dist", "loadfile", "--no-loadscope-reorder")

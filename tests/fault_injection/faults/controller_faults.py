@@ -253,7 +253,7 @@ def hundred_clients(rig: FocusRig, random: Random, record: FaultRecord) -> None:
         told = json.loads(output.splitlines()[-1])
         curvatures = set(told.pop("curvatures"))
         figures.update(told)
-        counts = Counter(state.curvature for state in rig.focus_states)
+        counts = Counter(state.curvature for state in list(rig.focus_states))
         figures["twice"] += sum(counts[curvature] > 1 for curvature in curvatures)
     unanswered = figures["asked"] - figures["answered"]
     if unanswered or figures["twice"] or figures["wrong"] or figures["wordless"]:
