@@ -62,8 +62,7 @@ def test_creep_block_by_block_is_that_of_the_whole_run_in_room_that_grows_with_i
             state = followed[-1]
 
 
-@pytest.mark.parametrize("near", [None, np.full((3, ACTUATORS), 0.5)])
-def test_weights_are_those_of_the_normal_equations(near: np.ndarray | None) -> None:
+def test_weights_are_those_of_the_normal_equations() -> None:
     rng = np.random.default_rng(3)
     features, left, gains = (rng.standard_normal(shape) for shape in ((40, 3, ACTUATORS), (40, 6), (ACTUATORS, 6)))
     own, common = 100.0, 100.0 / (ACTUATORS + 0.01)
@@ -72,7 +71,7 @@ def test_weights_are_those_of_the_normal_equations(near: np.ndarray | None) -> N
     columns = np.einsum("mfn,nd->mdnf", features, gains).reshape(40 * 6, -1)
     normal = columns.T @ columns + np.kron(between, np.linalg.inv(root @ root.T))
     expected = np.linalg.solve(normal, columns.T @ left.ravel()).reshape(ACTUATORS, 3).T
-    found = weights_of(features, left, gains, root, (own, common), near)
+    found = weights_of(features, left, gains, root, (own, common))
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 

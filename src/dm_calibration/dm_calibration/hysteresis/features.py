@@ -218,14 +218,7 @@ def follow(
     return result, state
 
 
-def weights_of(
-    features: Floats,
-    left: Floats,
-    gains: Floats,
-    root: Floats,
-    between: tuple[float, float],
-    near: Floats | None = None,
-) -> Floats:
+def weights_of(features: Floats, left: Floats, gains: Floats, root: Floats, between: tuple[float, float]) -> Floats:
     """(F, N) weights w of features (M, F, N) with sum_n w_fn x_mfn gains_nd = left_md in the least squares.
 
     Their prior covariance is `root` `root`' over features (F, F), times that over actuators whose inverse is
@@ -233,7 +226,6 @@ def weights_of(
 
     Args:
         between: own, common.
-        near: (F, N) weights to begin with; None = 0.
     """
     own, common = between
     count, actuators = features.shape[1:]
@@ -254,8 +246,7 @@ def weights_of(
         return np.asarray(solved + alone @ (together @ solved.sum(axis=0))).ravel()
 
     right = (rows @ (gains @ left.T)[..., None]).ravel()
-    begin = None if near is None else np.linalg.solve(root, near).T.ravel()
     shape = (right.size, right.size)
     preconditioner = LinearOperator(shape, nearly_solved, dtype=np.float64)
-    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, begin, rtol=SOLVED, M=preconditioner)
+    unknown, _ = cg(LinearOperator(shape, evidence, dtype=np.float64), right, rtol=SOLVED, M=preconditioner)
     return np.asarray(root @ unknown.reshape(actuators, count).T)

@@ -178,7 +178,7 @@ class OwnLaws:
         for number in range(self._rounds_needed):
             scatter = scatter if number == 0 else self._scatter_of(residual[keep])
             measured = self.run.responses.values[keep] / scatter
-            patterns = self._patterns(crept[keep], patterns, gains / scatter, measured, free, root)
+            patterns = self._patterns(crept[keep], gains / scatter, measured, free, root)
             if self._creeps:
                 position = np.einsum("mfn,fn->mn", features, patterns)
                 creep = self._spectra(position, creep, gains / scatter, measured, keep, free)
@@ -255,12 +255,10 @@ class OwnLaws:
         size = MAD_TO_SIGMA * np.sqrt(count / freedom) * np.median(np.abs(residual), axis=0)
         return self.run.responses.scatter(size)
 
-    def _patterns(
-        self, crept: Floats, near: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats
-    ) -> Floats:
+    def _patterns(self, crept: Floats, gains: Floats, measured: Floats, free: Floats, root: Floats) -> Floats:
         """(F, N): the signal itself counts 1, the others follow their prior."""
         left = measured - crept[:, 0] @ gains
-        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, root, self._between, near[1:])
+        solved = weights_of(without(crept[:, 1:], free), without(left, free), gains, root, self._between)
         return np.concatenate((np.ones((1, solved.shape[1])), solved))
 
     def _spectra(
@@ -274,10 +272,8 @@ class OwnLaws:
         elements = np.concatenate((elements, sloped[:, None]), axis=1)[keep]
         count = len(CREEP_TIMES)
         left = measured - (position[keep] + self._creep * elements[:, :count].sum(axis=1)) @ gains
-        near = creep.copy()
-        near[:count] -= self._creep
         elements, left = without(elements, free), without(left, free)
-        found = weights_of(elements, left, gains, self._creep_root, self._creep_between, near)
+        found = weights_of(elements, left, gains, self._creep_root, self._creep_between)
         found[:count] += self._creep
         return found
 
