@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import expected_accuracy
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, Run
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.identify import ExcitationError, Identification, _begun, identify
 from dm_calibration.hysteresis.responses import Responses
@@ -77,6 +77,22 @@ def test_held_out_moves_are_predicted_much_better_than_by_a_linear_law(law: str,
     found, linear = identify(run, check, COMMON), identify(run, check, [LINEAR])
     assert held_out_rms(linear) > factor * held_out_rms(found)
     assert slope_min(found.fit.law) > 0.1
+
+
+def test_a_richer_law_that_leaves_hardly_less_counts_as_the_simpler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its folds tell nothing more, and it comes after the simpler one, from which own laws begin."""
+    begun = list[str]()
+
+    def seen(run: Run, candidate: Candidate, starts: Any, *rest: Any) -> Any:
+        begun.extend(fit.candidate.name for fit in starts)
+        return _begun(run, candidate, starts, *rest)
+
+    monkeypatch.setattr("dm_calibration.hysteresis.identify._begun", seen)
+    own = next(candidate for candidate in CANDIDATES if candidate.own and candidate.kind == PREISACH.kind)
+    richer = replace(PREISACH, name="one power more", powers=PREISACH.powers + 1)
+    found = identify(*simulated_run("preisach"), [LINEAR, PREISACH, richer, own])
+    assert found.scores[richer.name] == found.scores[PREISACH.name]
+    assert begun == [PREISACH.name, richer.name]
 
 
 def test_the_creep_rate_is_found() -> None:
