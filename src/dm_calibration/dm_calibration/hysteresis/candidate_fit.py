@@ -121,19 +121,29 @@ class Run:
     def began(self) -> float:
         return float(self.time[0]) - 1.0 if self.start is None else min(self.start, float(self.time[0]))
 
-    @property
+    @cached_property
     def parts(self) -> list[slice]:
         """Rows of each part of the run, from one degauss to the next."""
         return parts_of(np.zeros(len(self.time), dtype=np.int64) if self.segment is None else self.segment)
 
-    @property
+    @cached_property
     def starts(self) -> list[float]:
         """When the degauss before each part had ended, s."""
         return starts_of(self.parts, self.began, self.time, self.moved)
 
+    def in_parts(self, work: Callable[[slice, float], Floats]) -> Floats:
+        """What `work` makes of each part and its start, one after the other."""
+        return in_parts(self.parts, self.starts, work)
+
     def moved_in(self, part: slice) -> Floats | None:
         """`moved` of the maps of a part."""
         return None if self.moved is None else self.moved[part]
+
+    @cached_property
+    def creep(self) -> Floats:
+        """(M, M) what creep of an even spectrum adds at each map of what stood at all, per unit of creep rate."""
+        unit = np.eye(len(self.time))
+        return self.in_parts(lambda part, start: crept(unit[part], self.time[part], start, self.moved_in(part)))
 
     @cached_property
     def creep_blocks(self) -> list[CreepBlock]:
@@ -162,16 +172,9 @@ class CandidateProblem:
     def __init__(self, run: Run, candidate: Candidate, scatter: Floats) -> None:
         self.run, self.candidate = run, candidate
         self.radius = candidate.radius
-        self._parts, self._starts = run.parts, run.starts
-        unit = np.eye(len(run.time))
-        self._creep = self._in_parts(  # (M, M) per unit of creep rate
-            lambda part, start: crept(unit[part], run.time[part], start, run.moved_in(part))
-        )
-        self._plays = self._in_parts(
-            lambda part, start: play_features(run.signals[part], self.radius, candidate.powers)
-        )
-        self._plays_crept = np.tensordot(self._creep, self._plays, 1)
-        self._figure = figure_columns(run.time, self._parts, self._starts)
+        self._plays = run.in_parts(lambda part, start: play_features(run.signals[part], self.radius, candidate.powers))
+        self._plays_crept = np.tensordot(run.creep, self._plays, 1)
+        self._figure = figure_columns(run.time, run.parts, run.starts)
         self._scale(scatter)
 
     def _scale(self, scatter: Floats) -> None:
@@ -183,9 +186,6 @@ class CandidateProblem:
         other = copy.copy(self)
         other._scale(scatter)
         return other
-
-    def _in_parts(self, work: Callable[[slice, float], Floats]) -> Floats:
-        return in_parts(self._parts, self._starts, work)
 
     def fit(self, keep: Rows, start: LawFit | None = None, evaluations: int | None = None) -> LawFit:
         """Fit to the rows in `keep` (M,), from `start` or from a guess.
@@ -236,8 +236,8 @@ class CandidateProblem:
         if not self.candidate.slopes:
             return features
         operator = DuhemOperator(slope)
-        fading = self._in_parts(lambda part, start: fading_feature(self.run.signals[part], operator))
-        fading = fading + rate * np.tensordot(self._creep, fading, 1)
+        fading = self.run.in_parts(lambda part, start: fading_feature(self.run.signals[part], operator))
+        fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
 
     def _solve(self, features: Floats, keep: Rows, weights: Floats | None) -> tuple[Floats, Floats]:

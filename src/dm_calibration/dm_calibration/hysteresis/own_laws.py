@@ -16,7 +16,6 @@ responses of neighbours overlap; its matrix is the elementwise product of the Gr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +36,7 @@ from dm_calibration.hysteresis.features import (
     weight_of,
     weights_of,
 )
-from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
+from dm_calibration.hysteresis.segments import basis_of, figure_columns, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.law_shape import normalised
@@ -102,11 +101,10 @@ class OwnLaws:
     def __init__(self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats) -> None:
         self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
         self.candidate = candidate
-        self._parts, self._starts = run.parts, run.starts
         self.radius = candidate.radius
         self._basis = pattern_basis(self.radius, candidate.powers)
         signals = run.signals
-        values = self._in_parts(lambda part, start: play_values(signals[part], self.radius))
+        values = self.run.in_parts(lambda part, start: play_values(signals[part], self.radius))
         orders = candidate.powers
         series = legendre.legvander(values, orders)[..., 1:] - legendre.legvander(np.zeros(1), orders)[0, 1:]
         flat = series.transpose(0, 2, 1, 3).reshape(*signals.shape, -1)
@@ -124,10 +122,7 @@ class OwnLaws:
         self._creep_root = np.asarray(np.linalg.cholesky(prior), dtype=np.float64)
         self._signal_states = self._creep_states(signals)
         self._creep_between = _alike(count, SPECTRUM_SPREAD)
-        self._figure = figure_columns(run.time, self._parts, self._starts)
-
-    def _in_parts(self, work: Callable[[slice, float], Floats]) -> Floats:
-        return in_parts(self._parts, self._starts, work)
+        self._figure = figure_columns(run.time, run.parts, run.starts)
 
     def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
         """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all."""
@@ -155,13 +150,13 @@ class OwnLaws:
         if not slope.size:
             return self._plain
         operator, signals = DuhemOperator(slope), self.run.signals
-        fading = self._in_parts(lambda part, start: fading_feature(signals[part], operator))
+        fading = self.run.in_parts(lambda part, start: fading_feature(signals[part], operator))
         return np.concatenate((self._plain, fading), axis=1)
 
     def _fading_changes(self, slope: Floats) -> Floats:
         """(M, 2 A, N) how the Duhem operator's value changes with its coefficients `slope` (N, 2, A)."""
         signals = self.run.signals
-        return self._in_parts(lambda part, start: fading_changes(signals[part], slope))
+        return self.run.in_parts(lambda part, start: fading_changes(signals[part], slope))
 
     def _rounds(
         self, features: Floats, keep: Rows, patterns: Floats, creep: Floats, scatter: Floats
@@ -215,7 +210,7 @@ class OwnLaws:
     def _creep_states(self, values: Floats) -> Floats:
         """(M, J, N) what the creep elements have followed of `values` (M, N) at each map."""
         run = self.run
-        return self._in_parts(
+        return run.in_parts(
             lambda part, start: np.array(list(creep_states(values[part], run.time[part], start, run.moved_in(part))))
         )
 
