@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dm_tools.output import as_wavelengths, console, nanometres, progress_bar
+from dm_common.figures import with_wavelengths
+from dm_tools.output import WAVELENGTH, as_wavelengths, console, nanometres, progress_bar
 
 #: Processes at most: a mirror takes a core and some 300 MB.
 WORKERS_MAX = 2
@@ -176,8 +177,7 @@ def _length(value: float | None) -> tuple[str, str]:
 
 def _both(value: float | None) -> str:
     """A length in nm, and in wavelengths; "-" where there were no requests."""
-    nm, wavelengths = _length(value)
-    return f"{nm} nm ({wavelengths})" if nm else "-"
+    return "-" if value is None else with_wavelengths(f"{value:.2f} nm", 1e-9 * value, WAVELENGTH)
 
 
 def _text(value: float | None, form: str) -> str:

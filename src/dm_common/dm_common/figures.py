@@ -21,6 +21,12 @@ def in_wavelengths(length: float, wavelength: float) -> str:
     return f"λ/{wavelength / length:.0f}" if 0.0 < 5.0 * length <= wavelength else ""
 
 
+def with_wavelengths(text: str, length: float, wavelength: float) -> str:
+    """A text that gives a length (m), and after it in brackets what that is by the wavelength, where that tells it."""
+    share = in_wavelengths(length, wavelength)
+    return f"{text} ({share})" if share else text
+
+
 def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
     """What a bound on open-loop moves comes to: how well they repeat, and how well they are right, by what limits it.
 
@@ -32,8 +38,7 @@ def two_fold(repeatable: float, calibration: Any, curvature: float) -> str:
     """
 
     def length(metres: float) -> str:
-        share = in_wavelengths(metres, calibration.wavelength)
-        return f"{in_nanometres(metres)} ({share})" if share else in_nanometres(metres)
+        return with_wavelengths(in_nanometres(metres), metres, calibration.wavelength)
 
     if not (math.isfinite(repeatable) and repeatable > 0.0):
         return "repeatable to what is not known"

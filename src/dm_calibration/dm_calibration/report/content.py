@@ -11,7 +11,7 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.report.document import Section, Table
-from dm_common.figures import in_wavelengths
+from dm_common.figures import with_wavelengths
 
 NM = 1e9
 #: What the sentences of a poke check begin with.
@@ -29,8 +29,7 @@ def length(metres: float, wavelength: float) -> str:
     """A length in nm, and as a share of the wavelength where that is known."""
     if not np.isfinite(metres):
         return "not known"
-    share = in_wavelengths(metres, wavelength)
-    return f"{metres * NM:.2f} nm ({share})" if share else f"{metres * NM:.2f} nm"
+    return with_wavelengths(f"{metres * NM:.2f} nm", metres, wavelength)
 
 
 def promise(calibration: Calibration) -> float:

@@ -11,8 +11,18 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_common.figures import with_wavelengths
 from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
-from dm_tools.output import JsonOption, as_wavelengths, console, nanometres, next_step, progress_bar, write_json
+from dm_tools.output import (
+    WAVELENGTH,
+    JsonOption,
+    as_wavelengths,
+    console,
+    nanometres,
+    next_step,
+    progress_bar,
+    write_json,
+)
 
 #: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
@@ -130,7 +140,7 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
     worst = max(row["error"].max_zernike for row in rows)
     console.print(
         f"fitting limit of this mirror at the ends of the sweep: {nanometres(fitting_limit):.1f} nm rms; "
-        f"largest coefficient error of the sweep: {nanometres(worst):.2f} nm"
+        f"largest coefficient error of the sweep: {with_wavelengths(f'{nanometres(worst):.2f} nm', worst, WAVELENGTH)}"
     )
 
 
