@@ -85,9 +85,11 @@ def start_fresh(client: Any, fresh: bool = True) -> None:
 
 def made_by(client: Any, result: Any) -> Any:
     """The message of the calibration that a run made; None where it is not in use."""
-    client.wait(lambda: getattr(client.messages.get("calibration"), "id", "") == result.id, REPORT_S)
-    calibration = client.messages.get("calibration")
-    return calibration if result.id and calibration is not None and calibration.id == result.id else None
+
+    def heard() -> bool:
+        return getattr(client.messages.get("calibration"), "id", "") == result.id
+
+    return client.messages["calibration"] if result.id and client.wait(heard, REPORT_S) else None
 
 
 def show_result(result: Any, calibration: Any = None) -> None:
