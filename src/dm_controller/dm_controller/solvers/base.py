@@ -127,11 +127,22 @@ class Solver(ABC):
         self.offset = Shape(model.zernike_offset, model.sag_offset)
 
     def solve(self, wanted: Shape) -> Command:
-        """Signals for a surface, without measuring (open loop)."""
+        """Signals for a surface, without measuring (open loop).
+
+        Raises:
+            ValueError: a shape of other size than the model's, or not finite.
+        """
+        self._check(wanted)
         return self.limited(self._signals(self._start(), wanted - self.offset))
 
     def correct(self, signals: Floats, error: Shape) -> Command:
-        """Better signals after `signals` were seen to leave `error` = measured minus wanted (one closed-loop step)."""
+        """Better signals after `signals` were seen to leave `error` = measured minus wanted (one closed-loop step).
+
+        Raises:
+            ValueError: signals or a shape of other size than the model's, or not finite.
+        """
+        self._check(error)
+        self._check_signals(signals)
         return self.limited(self._signals(signals, -error))
 
     @abstractmethod
@@ -141,6 +152,21 @@ class Solver(ABC):
     def _start(self) -> Floats:
         """Signals at which the model's offset is the surface."""
         return np.zeros(self.model.influence_zernike.shape[1])
+
+    def _check(self, shape: Shape) -> None:
+        for name, value, size in (
+            ("coefficients", shape.coefficients, self.model.zernike_offset.size),
+            ("sag", shape.sag, self.model.sag_offset.size),
+        ):
+            if value.shape != (size,) or not np.isfinite(value).all():
+                raise ValueError(
+                    f"{name} of shape {value.shape}: must be {size} finite numbers, as many as the calibration has"
+                )
+
+    def _check_signals(self, signals: Floats) -> None:
+        count = self.model.influence_zernike.shape[1]
+        if signals.shape != (count,) or not np.isfinite(signals).all():
+            raise ValueError(f"signals of shape {signals.shape}: must be {count} finite numbers, one per actuator")
 
     def limited(self, signals: Floats) -> Command:
         """Cut signals to the range, then draw them together about their mean until neighbours keep their limit."""

@@ -118,6 +118,8 @@ class AZWreg(Solver):
 
     def correct(self, signals: Floats, error: Shape) -> Command:
         """As in the base class, with moves priced by what the actuators miss of them."""
+        self._check(error)
+        self._check_signals(signals)
         return self.limited(signals - self._correction @ self._reduce(error.sag))
 
 
@@ -146,5 +148,7 @@ class Bounded(Solver):
 
     def correct(self, signals: Floats, error: Shape) -> Command:
         """As in the base class, with moves priced by what the actuators miss of them."""
+        self._check(error)
+        self._check_signals(signals)
         wanted = self._mirror.matrix @ signals - self._mirror.rows(error.coefficients, error.sag)
         return self.limited(self._correction.solve(np.concatenate([wanted, self._miss @ signals])))
