@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from dm_common.figures import with_wavelengths
-from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
+from dm_tools.demo.demo_bench import Hysteresis, bench_config, new_folder, running_bench, wait_for_calibration
 from dm_tools.output import (
     WAVELENGTH,
     JsonOption,
@@ -26,16 +25,6 @@ from dm_tools.output import (
 
 #: Curvatures of the sweep [1/m]: the range of [1], section 3.2.
 CURVATURES = tuple(round(-0.05 + 0.01 * step, 3) for step in range(11))
-
-
-class Hysteresis(StrEnum):
-    """Hysteresis of the simulated actuators."""
-
-    off = "off"
-    drawn_preisach = "drawn_preisach"
-    prandtl_ishlinskii = "prandtl_ishlinskii"
-    preisach = "preisach"
-    bouc_wen = "bouc_wen"
 
 
 def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:

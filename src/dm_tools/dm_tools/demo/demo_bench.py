@@ -6,6 +6,7 @@ import contextlib
 import shutil
 import socket
 from collections.abc import Iterator
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,16 @@ from typing import Any
 OFF = -1
 #: Parameters of a bench whose actuators follow one law.
 SAME_ACTUATORS = {f"piezo.{name}_spread": 0.0 for name in ("hysteresis", "creep", "spectrum")}
+
+
+class Hysteresis(StrEnum):
+    """Hysteresis of the simulated actuators."""
+
+    off = "off"
+    drawn_preisach = "drawn_preisach"
+    prandtl_ishlinskii = "prandtl_ishlinskii"
+    preisach = "preisach"
+    bouc_wen = "bouc_wen"
 
 
 def free_ports(count: int) -> list[int]:

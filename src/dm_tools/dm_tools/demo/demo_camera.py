@@ -6,15 +6,12 @@ import os
 import shutil
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dm_tools.demo.camera_runs import Focused, Recorder, focus_on, follow, image_now, sweep_of
-from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
+from dm_tools.demo.demo_bench import Hysteresis, bench_config, new_folder, running_bench, wait_for_calibration
 from dm_tools.output import console, next_step, write_json
 from dm_tools.verbs.up import DISTANCES, RATE, add_camera
-
-if TYPE_CHECKING:  # both are slow to import, and `dm --help` needs neither
-    from dm_tools.demo.demo import Hysteresis
 
 #: Of the calibration: fewer and smaller maps than a bench would take, for a quick demonstration.
 MAPS, PIXELS = 120, 472
