@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from dm_calibration import identify_response
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate
 from dm_calibration.hysteresis.identify import ExcitationError
+from dm_common import Floats
 from dm_simulation.mirror.membrane import Membrane, MembraneConfig
-
-Floats = NDArray[np.float64]
 
 pytestmark = pytest.mark.slow
 

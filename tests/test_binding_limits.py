@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel, HysteresisState
 from dm_common.limits import Limits
@@ -15,8 +15,6 @@ from dm_controller.planning.target import FocusTarget
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
 from linear_mirror import LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
-
-Floats = NDArray[np.float64]
 
 ACTUATORS = 37
 PAIRS = np.asarray(make_mirror().limits.pairs, dtype=np.intp)

@@ -6,19 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import Run
 from dm_calibration.hysteresis.creep_uncertainty import OWN, SHARED, SHARED_CORRELATION, creep_covariance
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.responses import Responses
+from dm_common import Floats
 from dm_common.hysteresis.creep_record import UNSEEN, rested
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_controller.planning.creep_error import IN_FIGURE_S, CreepError
 from linear_mirror import make_mirror
-
-Floats = NDArray[np.float64]
 
 MIRROR = make_mirror(rings=1)
 COUNT = MIRROR.actuators

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from dm_msgs.msg import MirrorInfo
-from numpy.typing import NDArray
 
 from dm_bringup.nodes import NODES
 from dm_bringup.suite import load_config
@@ -23,6 +22,7 @@ from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.hysteresis.excitation import excitation
+from dm_common import Floats
 from dm_common.messages import mirror_from
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
@@ -34,8 +34,6 @@ from dm_simulation.bench import VirtualBench
 from dm_simulation.parameters import bench_config
 from dm_tools.verbs.up import shared_config
 from dm_tools.verify import surface_error
-
-Floats = NDArray[np.float64]
 
 pytestmark = pytest.mark.slow
 

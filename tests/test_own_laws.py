@@ -12,14 +12,13 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
+from dm_common import Floats
 from dm_common.hysteresis import law_shape
 from dm_common.hysteresis.law_shape import slope_min, span
 from dm_common.hysteresis.model import HysteresisModel
 from linear_mirror import make_mirror
 
 pytestmark = pytest.mark.slow
-
-Floats = NDArray[np.float64]
 
 #: Relays of each actuator; one of them that flips moves it by a few 1e-6 of its range.
 RELAYS = 40_000

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.optics.aperture import Aperture
+from dm_common import Floats
 from dm_common.optics.zernike import TERMS, basis
-
-Floats = NDArray[np.float64]
 
 #: Side of the camera's map, pixels.
 CAMERA = 944

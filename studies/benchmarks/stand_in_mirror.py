@@ -10,7 +10,6 @@ from functools import cache
 
 import numpy as np
 from dm_msgs.msg import Calibration, MirrorInfo
-from numpy.typing import NDArray
 
 from dm_calibration.calibration_messages import hysteresis_message
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
@@ -18,6 +17,7 @@ from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses
+from dm_common import Floats
 from dm_common.geometry import hexagonal_positions, neighbour_pairs, ring_count
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.limits import Limits
@@ -30,8 +30,6 @@ from dm_controller.planning.planner import HysteresisFigures
 from dm_simulation.mirror.piezo import PiezoActuators, PiezoConfig
 from studies.benchmarks.jobs.bounded_solve import PITCH, STROKE
 from studies.solvers.plate_model import PlateProperties, plate_influence
-
-Floats = NDArray[np.float64]
 
 #: By the class of the law that is fitted: what the simulation's actuators follow.
 SIMULATED_LAWS = {

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, calibrate
@@ -21,6 +20,7 @@ from dm_calibration.optics.aperture import Aperture, configured_aperture
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
+from dm_common import Floats
 from dm_common.hysteresis.observer import Applied
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
@@ -36,8 +36,6 @@ from dm_simulation.interferometer.interferometer import Interferometer, Interfer
 from dm_simulation.mirror.piezo import PiezoActuators
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
 from studies.comparison.bench_config import SimulationConfig
-
-Floats = NDArray[np.float64]
 
 #: Pixels of the instrument that speck counts are stated for.
 FULL_CAMERA = InterferometerConfig().pixels

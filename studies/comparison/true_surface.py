@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, basis
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.simulated_bench import SimulatedBench
-
-Floats = NDArray[np.float64]
 
 
 class TrueSurface:

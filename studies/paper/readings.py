@@ -38,11 +38,10 @@ from dm_calibration.regression.surface_error import (
     regress,
     surface_errors,
 )
+from dm_common import Floats
 from dm_common.names import unknown_name
 from dm_common.optics.zernike import TERM_RMS, basis
 from studies.paper.reported import TEST_SURFACES
-
-Floats = NDArray[np.float64]
 
 
 class Reading(Enum):

@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
 from dm_calibration.regression.stepwise import leave_one_out, stepwise
 from dm_calibration.regression.surface_error import surface_errors
+from dm_common import Floats
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.paper.readings import Reading, ReadRegression, regress_surface_errors
 from studies.paper.reported import MODELS, TEST_SURFACES
 from studies.paper.samples import Samples
-
-Floats = NDArray[np.float64]
 
 #: The reading that the tables of the page are made of; the others stand beside it.
 TAKEN = Reading.HISTORY

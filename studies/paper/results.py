@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_controller.planning.target import FocusTarget
 from studies.comparison.simulated_bench import SimulationConfig
 from studies.paper.control import (
@@ -26,8 +26,6 @@ from studies.paper.regressions import Regressions, regress_samples, relative_err
 from studies.paper.reported import CURVATURE_RANGE
 from studies.paper.samples import Samples, measure_samples
 from studies.paper.sampling_study import SamplingStudy, study_samples
-
-Floats = NDArray[np.float64]
 
 STANDARD, IDEAL = "standard bench", "ideal actuators"
 #: Hysteresis laws that the play operators of the regression do not hold as a special case.

@@ -18,6 +18,7 @@ from dm_calibration.influence.region_weighting import RegionWeighting, weighting
 from dm_calibration.influence.weights import region_weights, surface_control_error
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.procedure.procedure import Progress
+from dm_common import Floats
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sample_regions import regional_rms
@@ -25,8 +26,6 @@ from dm_common.optics.zernike import PISTON_TILT
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5, levelled_rms
 from studies.paper.weights_cancel import weights_cancel_max_abs
-
-Floats = NDArray[np.float64]
 
 #: Ways to read Fig. 5: rms about zero over the sampling points, or over all pixels, each with piston and tilt removed
 #: once over the whole aperture; and over the points with every region levelled on its own.

@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 
 from dm_calibration.optics.aperture import Aperture
 from dm_calibration.optics.map_fit import MapFitter
+from dm_common import Floats
 from dm_common.optics.sampling import GOLDEN_ANGLE, SamplePoints, edge_clustered_points, sample_map
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from studies.paper.regions import squared_distance
 from studies.paper.samples import Samples
-
-Floats = NDArray[np.float64]
 
 #: Of the surfaces of Table 1 every so many are studied: pokes, spheres and Zernike surfaces among them.
 STRIDE = 6

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Smallest singular value, relative to the largest, at which a least-squares problem still counts as determined.
 RANK_TOLERANCE = 1e-7

@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import ActuatorHysteresis, MirrorInfo, RecipeBook, ZernikeCoefficients
 from dm_msgs.msg import Calibration as CalibrationMsg
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.recalibration.drift import Drift
+from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.messages import doubles, recipe_book_message, time_message
-
-Floats = NDArray[np.float64]
 
 # Fields of the message that are named as those of a calibration and of its fit.
 _NAMES = (

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.map_sources import Maps, outcome_of
@@ -21,9 +21,8 @@ from dm_calibration.influence.region_weighting import weighting_of
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.store.calibration_store import new_id
+from dm_common import Floats
 from dm_common.mirror import Mirror
-
-Floats = NDArray[np.float64]
 
 #: What a calibration keeps of the setup of its run.
 _INSTRUMENT = ("reference_surface", "instrument_error", "scale_error")

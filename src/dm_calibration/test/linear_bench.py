@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.procedure.recorded_run import Move
+from dm_common import Floats
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from linear_mirror import LinearMirror
-
-Floats = NDArray[np.float64]
 
 
 class LinearBench:

@@ -10,18 +10,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import kei
 
+from dm_common import Floats
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.optics.sampling import SamplePoints, edge_clustered_points
 from dm_common.optics.zernike import basis
-
-Floats = NDArray[np.float64]
 
 PITCH = 4.3e-3
 RADIUS = 11e-3

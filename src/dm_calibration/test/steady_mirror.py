@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance, calibrate
@@ -12,12 +11,11 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.applied_history import SettledState
 from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
+from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
 from linear_bench import LinearBench
 from linear_mirror import LinearMirror, make_mirror
-
-Floats = NDArray[np.float64]
 
 RINGS = 2
 NOISE = 0.5e-9

@@ -21,6 +21,7 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common import Floats
 from dm_common.errors import MeasurementError
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.mirror import Mirror
@@ -28,8 +29,6 @@ from dm_common.optics.sampling import SamplePoints
 from hysteretic_mirror import MIRROR, lagging_bench
 from linear_mirror import RADIUS, LinearMirror, make_mirror
 from map_fixtures import NO_DATA, dat_bytes, four_d_bytes
-
-Floats = NDArray[np.float64]
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 SIZE = 61

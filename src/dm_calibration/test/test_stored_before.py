@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dm_msgs.msg import Calibration as CalibrationMsg
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
@@ -23,10 +22,9 @@ from dm_calibration.procedure.resumable_run import ResumeOptions, identity_of, o
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_calibration.store.calibration_store import CalibrationStore
+from dm_common import Floats
 from dm_common.messages import hysteresis_model_from, recipe_book_from
 from linear_mirror import make_mirror
-
-Floats = NDArray[np.float64]
 
 STORED = Path(__file__).with_name("stored")
 EXPECTED: dict[str, Floats] = dict(np.load(STORED / "expected.npz"))

@@ -8,9 +8,9 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.geometry import hexagonal_positions, ring_count
 from dm_common.limits import Limits
@@ -19,8 +19,6 @@ from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import TERMS, basis
 from studies.benchmarks.timing import Effort, medians
 from studies.solvers.plate_model import PlateProperties, plate_influence
-
-Floats = NDArray[np.float64]
 
 PITCH = 4.3e-3  # m between actuators of a PDM30-37
 STROKE = 4e-6  # m per unit signal

@@ -7,7 +7,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
@@ -19,8 +18,6 @@ from dm_controller.planning.target import FocusTarget
 from studies.benchmarks import stand_in_mirror
 from studies.benchmarks.jobs.scaling import ACTUATORS
 from studies.benchmarks.timing import Effort, medians
-
-Floats = NDArray[np.float64]
 
 #: Moves that the mirror has behind it, and s after its last at which it is asked.
 MOVES, ASKED_S = 12, 10.0

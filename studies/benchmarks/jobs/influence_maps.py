@@ -10,19 +10,17 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.maps import REFERENCE, SURFACE, MapSet
+from dm_common import Floats
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import TERMS, basis
 from studies.benchmarks.jobs.map_reading import write_sample
 from studies.benchmarks.sample_maps import CAMERA, maps
 from studies.benchmarks.timing import Effort, medians
-
-Floats = NDArray[np.float64]
 
 ACTUATORS = 37
 #: Maps of the run; on so many of them the loop of dmlib is timed, whose time is proportional to their number.

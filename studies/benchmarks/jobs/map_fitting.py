@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.optics.map_fit import MapFitter
+from dm_common import Floats
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.zernike import TERMS, basis, noll_to_born_wolf
 from studies.benchmarks.sample_maps import CAMERA, Ring, full_aperture, maps, mask_of
 from studies.benchmarks.timing import Effort, medians
 from studies.paper.regions import ConcentricRegions, squared_distance
 
-Floats = NDArray[np.float64]
 Fit = Callable[[Floats], Floats]
 
 #: Maps in turn: together larger than the last-level cache of most processors.

@@ -15,16 +15,14 @@ from typing import Any
 
 import numpy as np
 from dm_msgs.msg import ActuatorCommand, ActuatorState, Calibration, Capabilities, FocusRequest, FocusState, MirrorInfo
-from numpy.typing import NDArray
 
 from dm_bringup.nodes import MODULES
+from dm_common import Floats
 from dm_common.messages import doubles
 from dm_common.ros import qos
 from studies.benchmarks import stand_in_mirror
 from studies.benchmarks.ros_jobs.ros_processes import Laboratory, laboratory
 from studies.benchmarks.timing import Effort
-
-Floats = NDArray[np.float64]
 
 #: Class of the hysteresis model in the calibration.
 LAW = "Preisach"

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.hysteresis.excitation import CHECK_SHARE
@@ -15,11 +15,10 @@ from dm_calibration.influence.maps import CHECK, EXCITATION, POKE, REFERENCE, SU
 from dm_calibration.map_files import SurfaceMap
 from dm_calibration.procedure.map_acquisition import check_comparable
 from dm_calibration.procedure.outcome import MapTaken, Outcome, Setup
+from dm_common import Floats
 from dm_common.errors import MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
-
-Floats = NDArray[np.float64]
 
 #: What a calibration can be made from: a folder of map files, files, sag (M, height, width) in m, or measurements.
 Maps = str | Path | Sequence[str | Path] | Sequence[Measurement] | Floats

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
 from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
+from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 
 
@@ -50,9 +48,7 @@ def corrections(reference: SurfaceMap | None, retrace: Sequence[float] = (), dis
     return "; ".join(parts)
 
 
-def absolute_sag(
-    source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float
-) -> NDArray[np.float64]:
+def absolute_sag(source: SurfaceMap, reference: SurfaceMap, pitch: float, wavelength_tolerance: float) -> Floats:
     """(height, width) m, of a map as the instrument shows it, less the reference surface; NaN where either has no data.
 
     Args:
@@ -80,5 +76,5 @@ def absolute_sag(
         )
     if different:
         raise MapRejectedError(different)
-    difference: NDArray[np.float64] = source.sag - reference.sag
+    difference: Floats = source.sag - reference.sag
     return difference

@@ -17,10 +17,9 @@ from dm_calibration.hysteresis.candidate_fit import PREISACH_AND_DUHEM
 from dm_calibration.hysteresis.features import crept, fading_feature, play_features, relaxation
 from dm_calibration.hysteresis.segments import without
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_common import Floats
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.optics.zernike import PISTON_TILT
-
-Floats = NDArray[np.float64]
 
 #: The richest candidate, the slope of a typical fading operator, a typical creep rate.
 RICHEST, SLOPE, CREEP_RATE = PREISACH_AND_DUHEM, 1.5, 0.01

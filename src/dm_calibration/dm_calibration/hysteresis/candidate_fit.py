@@ -20,11 +20,11 @@ from scipy.optimize import least_squares
 from dm_calibration.hysteresis.features import CreepBlock, creep_blocks, crept, fading_feature, play_features
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, parts_of, starts_of, without
+from dm_common import Floats
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 #: Ridge on the weights, relative to their mean evidence: keeps neighbours alike where the data do not tell them apart.

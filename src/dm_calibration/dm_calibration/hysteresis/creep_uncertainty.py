@@ -12,15 +12,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import Run
 from dm_calibration.hysteresis.features import creep_states, follow, spectrum_prior
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, in_parts, without
+from dm_common import Floats
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.optics.zernike import PISTON_TILT
-
-Floats = NDArray[np.float64]
 
 #: Prior of the elements' weights that all actuators share: standard deviation relative to the mean rate, and their
 #: correlation over elements. Creep may begin or end anywhere: none at all of an element is not unlikely.

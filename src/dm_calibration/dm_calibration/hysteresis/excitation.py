@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.mirror import Mirror
-
-Floats = NDArray[np.float64]
 
 #: Share of the maps that test the law.
 CHECK_SHARE = 0.2

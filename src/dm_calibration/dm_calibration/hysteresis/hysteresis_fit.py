@@ -15,11 +15,10 @@ from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses, responses_of
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, basis_of, in_parts, parts_of, starts_of, without
 from dm_calibration.influence.maps import CHECK, MapSet
+from dm_common import Floats
 from dm_common.hysteresis.inverse import random_histories
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
-
-Floats = NDArray[np.float64]
 
 #: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
 #: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.

@@ -18,9 +18,9 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candid
 from dm_calibration.hysteresis.own_laws import OwnLaws
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.screening import MAD_TO_SIGMA
+from dm_common import Floats
 from dm_common.hysteresis import law_shape
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 #: The smallest slope of a law that an open loop can invert safely.

@@ -38,11 +38,11 @@ from dm_calibration.hysteresis.features import (
 )
 from dm_calibration.hysteresis.segments import basis_of, figure_columns, without
 from dm_calibration.influence.screening import MAD_TO_SIGMA
+from dm_common import Floats
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.law_shape import normalised
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 
-Floats = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 #: Patterns that are kept of the prior.

@@ -17,9 +17,8 @@ from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.identify import identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S
+from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
-
-Floats = NDArray[np.float64]
 
 #: Laws that are compared: those of a calibration, and squares of the signal between straight and cubic.
 LAWS = (CANDIDATES[0], Candidate("squares", 0, 2, 0), *CANDIDATES[1:])

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from dm_calibration.hysteresis.reduction import Reduction
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import usable_sag
+from dm_common import Floats
 from dm_common.optics.piston_tilt import fill_gaps
 from dm_common.optics.zernike import basis
-
-Floats = NDArray[np.float64]
 
 #: Least uncertainty of a response, m, that of data without noise.
 SCATTER_MIN = 1e-11

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.features import relaxation
-
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Time between the end of a degauss and the first map, s, where it is not known; creep of that age is gone soon.
 BEFORE_FIRST_MAP_S = 1.0

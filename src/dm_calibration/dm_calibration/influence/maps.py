@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
-
-Floats = NDArray[np.float64]
 
 REFERENCE = "reference"
 POKE = "poke"

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from dm_calibration.influence.registration import Registration, bumps, register, unit_responses
+from dm_common import Floats
 from dm_common.geometry import pitch, rings
 from dm_common.optics.sampling import SamplePoints
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 #: The mirror stands as configured within these: rad, share of the pitch, relative.

@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import EXCITATION, MapSet
 from dm_calibration.influence.regression import Design
+from dm_common import Floats
 from dm_common.limits import Limits
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
-
-Floats = NDArray[np.float64]
 
 #: Variance of a held-out prediction, in variances of one measurement, beyond which it is extrapolation.
 EXTRAPOLATION_MAX = 10.0

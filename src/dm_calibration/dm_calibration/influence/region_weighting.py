@@ -21,11 +21,10 @@ from dm_calibration.influence import quality
 from dm_calibration.influence.maps import SURFACE, MapSet
 from dm_calibration.influence.regression import Design, TooFewMapsError, make_design, regress, usable_sag
 from dm_calibration.influence.weights import coefficient_operator, region_weights, surface_control_error
+from dm_common import Floats
 from dm_common.optics.piston_tilt import remove_piston_tilt, weighted_fit
 from dm_common.optics.sample_regions import AREA_FRACTIONS, regional_rms
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
-
-Floats = NDArray[np.float64]
 
 #: Candidates of epsilon, in medians of the region variances.
 EPSILON_CANDIDATES: tuple[float, ...] = tuple(10.0 ** (k / 3.0) for k in range(-6, 7))

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
 
+from dm_common import Floats
 from dm_common.geometry import pitch
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 
-Floats = NDArray[np.float64]
 #: Places in the plane as complex numbers, x + iy.
 Places = NDArray[np.complex128]
 

@@ -21,11 +21,10 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
+from dm_common import Floats
 from dm_common.errors import ErrorCode
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
-
-Floats = NDArray[np.float64]
 
 #: Methods by the name used in messages and calibration files; AZWreg fits the Zernike coefficients anew to the sag with
 #: region weights, Eq. (8).

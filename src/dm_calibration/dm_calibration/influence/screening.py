@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
-
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Median absolute deviation to standard deviation, for normal errors.
 MAD_TO_SIGMA = 1.4826

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
@@ -21,8 +21,6 @@ from dm_common.optics.conic import conic_coefficients
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import TERMS, basis
-
-Floats = NDArray[np.float64]
 
 #: Channels 1..37 have a surface of their own in Table 1.
 TABLE_CHANNELS = 37

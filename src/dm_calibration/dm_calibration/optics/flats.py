@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.optics.aperture import find_aperture
-
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Highest radial order of the flats' errors that is found.
 ORDER = 12

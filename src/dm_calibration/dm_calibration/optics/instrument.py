@@ -14,10 +14,9 @@ from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from dm_calibration.optics.map_fit import MapFitter, in_products
+from dm_common import Floats
 from dm_common.optics.piston_tilt import fit_plane
 from dm_common.optics.zernike import MAX_ORDER, PISTON_TILT, TERMS
-
-Floats = NDArray[np.float64]
 
 #: Numbers of a retrace error: the terms beyond tilt for a tilt in x, then in y.
 RETRACE_SIZE = 2 * (len(TERMS) - PISTON_TILT)

@@ -20,9 +20,8 @@ from scipy import linalg
 
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError
 from dm_calibration.optics.map_moments import MaskedMoments, mask_moments
+from dm_common import Floats
 from dm_common.optics.zernike import MAX_ORDER, TERM_RMS, TERMS, basis
-
-Array = NDArray[np.float64]
 
 #: Exponents (a, b) of the products P_a(x) P_b(y).
 _PRODUCTS = [(a, b) for a in range(MAX_ORDER + 1) for b in range(MAX_ORDER + 1 - a)]
@@ -50,15 +49,15 @@ class MapFit:
         valid_pixels: number of pixels used.
     """
 
-    coefficients: Array
-    sigma: Array
+    coefficients: Floats
+    sigma: Floats
     residual_rms: float
     valid_fraction: float
     valid_pixels: int
 
 
 @cache
-def _linearisation() -> Array:
+def _linearisation() -> Floats:
     """(11, 6, 6): coefficients c of P_a P_b = sum over k of c[k, a, b] P_k."""
     degree = MAX_ORDER + 1
     result = np.zeros((2 * MAX_ORDER + 1, degree, degree))
@@ -71,7 +70,7 @@ def _linearisation() -> Array:
 
 
 @cache
-def _zernike_from_products() -> Array:
+def _zernike_from_products() -> Floats:
     """(21, 21) matrix T with Zernike = T times products, exact for polynomials of this degree."""
     nodes = np.cos(np.pi * (np.arange(12) + 0.5) / 12)
     x, y = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
@@ -126,7 +125,7 @@ class MapFitter:
         self._thin_y = np.ascontiguousarray(self._legendre_y[:, : MAX_ORDER + 1])
         self._moments = MaskedMoments(self._used, self._thin_y, self._thin_x)
 
-    def _gram(self) -> Array:
+    def _gram(self) -> Floats:
         """Masked Gram matrix of the Zernike terms."""
         moments = mask_moments(self._used, self._legendre_y, self._legendre_x)  # [degree of y, degree of x]
         c = _linearisation()
@@ -136,7 +135,7 @@ class MapFitter:
         transform = _zernike_from_products()
         return transform @ products @ transform.T
 
-    def _solve_with(self, gram: Array) -> None:
+    def _solve_with(self, gram: Floats) -> None:
         scale = TERM_RMS * math.sqrt(self.valid_pixels)  # a full disc gives the unit matrix
         eigenvalues = np.linalg.eigvalsh(gram / np.outer(scale, scale))
         if eigenvalues[0] < _SINGULAR * eigenvalues[-1]:
@@ -155,7 +154,7 @@ class MapFitter:
             return False
         return bool(np.array_equal(mask[self._rows, self._columns] & self._disc, self._used))
 
-    def fit(self, sag: Array) -> MapFit:
+    def fit(self, sag: Floats) -> MapFit:
         """Fit the terms to a map.
 
         Args:
@@ -187,19 +186,19 @@ class MapFitter:
             valid_pixels=self.valid_pixels,
         )
 
-    def residual(self, sag: Array, coefficients: Array) -> Array:
+    def residual(self, sag: Floats, coefficients: Floats) -> Floats:
         """(height, width): the map minus the sag of these coefficients; NaN outside mask and aperture."""
         result = np.full(self._shape, np.nan)
         inner = sag[self._rows, self._columns] - self._evaluate(coefficients)
         np.copyto(result[self._rows, self._columns], inner, where=self._used)
         return result
 
-    def _evaluate(self, coefficients: Array) -> Array:
+    def _evaluate(self, coefficients: Floats) -> Floats:
         """Sag of these coefficients on the square around the aperture."""
         return self._thin_y @ in_products(coefficients) @ self._thin_x.T
 
 
-def in_products(coefficients: Array) -> Array:
+def in_products(coefficients: Floats) -> Floats:
     """(6, 6) coefficients of P_b(y) P_a(x) of the surface with Zernike coefficients (21,)."""
     products = np.zeros((MAX_ORDER + 1, MAX_ORDER + 1))
     products[_B, _A] = coefficients @ _zernike_from_products()

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm
 from scipy.sparse import csr_array
 
-Array = NDArray[np.float64]
+from dm_common import Floats
 
 #: Bytes of a block: with what is read meanwhile it fits in a second-level cache of 0.5 to 1 MB.
 _BLOCK_BYTES = 384 * 1024
@@ -41,13 +41,13 @@ class _Block:
     first: int
     last: int
     unused: NDArray[np.intp]
-    rows_basis: Array  # (stop - start, d), column-major as BLAS takes it
+    rows_basis: Floats  # (stop - start, d), column-major as BLAS takes it
 
 
 class MaskedMoments:
     """Moments and energy of maps over the pixels of one mask."""
 
-    def __init__(self, mask: NDArray[np.bool_], rows_basis: Array, columns_basis: Array) -> None:
+    def __init__(self, mask: NDArray[np.bool_], rows_basis: Floats, columns_basis: Floats) -> None:
         """Find what to leave out, block by block.
 
         Args:
@@ -70,7 +70,7 @@ class MaskedMoments:
             basis = np.asfortranarray(rows_basis[start:stop])
             self._blocks.append(_Block(start, stop, first, last, np.flatnonzero(unused), basis))
 
-    def of(self, sag: Array) -> tuple[Array, float]:
+    def of(self, sag: Floats) -> tuple[Floats, float]:
         """Moments and sum of squares of a map.
 
         Args:
@@ -96,7 +96,7 @@ class MaskedMoments:
         return sums.T @ self._columns_basis, energy
 
 
-def mask_moments(mask: NDArray[np.bool_], rows_basis: Array, columns_basis: Array) -> Array:
+def mask_moments(mask: NDArray[np.bool_], rows_basis: Floats, columns_basis: Floats) -> Floats:
     """(d, d) sums over the pixels of a mask (h, w) of the products of polynomials (h, d) and (w, d)."""
     height, width = mask.shape
     rows = max(_MASK_BLOCK_BYTES // max(width, 1), 1)
@@ -108,7 +108,7 @@ def mask_moments(mask: NDArray[np.bool_], rows_basis: Array, columns_basis: Arra
         found.append(np.flatnonzero(part[:, 1:] != part[:, :-1]) + start * (width + 1))
     ends = np.concatenate(found)  # start, stop, start, stop, ... row by row
     if ends.size * _PIXELS_PER_RUN > 2 * mask.size:
-        result: Array = rows_basis.T @ (mask.astype(float) @ columns_basis)
+        result: Floats = rows_basis.T @ (mask.astype(float) @ columns_basis)
         return result
     row, column = np.divmod(ends, width + 1)
     sign = np.ones(ends.size)

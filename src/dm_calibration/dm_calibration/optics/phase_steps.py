@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
-
-Floats = NDArray[np.float64]
 
 #: Share of the valid pixels below which a region is a speck.
 SPECK = 1e-3

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.errors import ErrorCode
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import Applied, HysteresisObserver, Observed
-
-Floats = NDArray[np.float64]
 
 #: Signals, or effective signals, that differ less, normalised, are the same shape: below 1 nm.
 SMALL_MOVE = 2e-4

@@ -10,13 +10,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import REFERENCE
 from dm_calibration.procedure.outcome import MapTaken
+from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
-
-Floats = NDArray[np.float64]
 
 #: An aperture found on a map may wander by so many pixels.
 _WANDER_PX = 1.5

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.accuracy import TYPICAL_NOISE, expected_accuracy
@@ -16,14 +15,13 @@ from dm_calibration.influence.registration import bumps
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.procedure.plan import Plan, StepKind
+from dm_common import Floats
 from dm_common.figures import in_nanometres, rounded
 from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.piston_tilt import weighted_fit
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import PISTON_TILT, basis
-
-Floats = NDArray[np.float64]
 
 #: Fewest pairs of maps of the same command that tell the noise.
 PAIRS_MIN = 4

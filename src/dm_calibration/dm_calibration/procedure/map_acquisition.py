@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.maps import REFERENCE, same_points
@@ -14,11 +13,10 @@ from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
 from dm_calibration.procedure.bump_check import BumpCheck, BumpOptions
 from dm_calibration.procedure.outcome import NOWHERE, Doubted, Event, MapTaken, Outcome, Setup
 from dm_calibration.procedure.plan import Step, StepKind
+from dm_common import Floats
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench, Measurement
 from dm_common.mirror import APERTURE_TOLERANCE, Mirror
-
-Floats = NDArray[np.float64]
 
 #: Largest relative difference of wavelengths between maps.
 WAVELENGTH_TOLERANCE = 1e-4

@@ -10,14 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
-
-Floats = NDArray[np.float64]
 
 #: A place that is not known.
 NOWHERE = (float("nan"), float("nan"))

@@ -9,13 +9,11 @@ from enum import Enum, StrEnum
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.excitation import MAPS_MIN, REPEATS, excitation, next_part
 from dm_calibration.influence import surfaces
+from dm_common import Floats
 from dm_common.mirror import Mirror
-
-Floats = NDArray[np.float64]
 
 #: Commands between two reference frames of a hysteresis plan; creep takes up most of what drifts.
 HYSTERESIS_REFERENCE_EVERY = 100

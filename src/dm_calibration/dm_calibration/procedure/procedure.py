@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.maps import CHECK, MapSet
@@ -20,13 +19,12 @@ from dm_calibration.influence.surfaces import LinearModel
 from dm_calibration.procedure.map_acquisition import MapAcquisition, ProcedureOptions
 from dm_calibration.procedure.outcome import Dropped, Event, Outcome, Segment, Solved, Unseen
 from dm_calibration.procedure.plan import Plan, PlanKind, Step, StepKind, check_shape, solve_step
+from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench
 from dm_common.mirror import Mirror
 
 __all__ = ["Outcome", "Procedure", "ProcedureOptions", "Progress"]
-
-Floats = NDArray[np.float64]
 
 #: Maps of the mirror at rest with which a hysteresis run goes on: they show where the figure stands now.
 RESUME_MAPS = 3

@@ -11,18 +11,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN, REPEATS
 from dm_calibration.influence.surfaces import LinearModel
 from dm_calibration.procedure.plan import HYSTERESIS_REFERENCE_EVERY, Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions
+from dm_common import Floats
 from dm_common.errors import ErrorCode, MeasurementError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
 from dm_common.names import UnknownNameError
-
-Floats = NDArray[np.float64]
 
 #: Longest distance between reference frames that is tried.
 REFERENCE_EVERY_MAX = 200

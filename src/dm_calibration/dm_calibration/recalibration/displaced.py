@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT
-
-Floats = NDArray[np.float64]
 
 #: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
 #: that fits noise best explains about 0.13.

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 
 @dataclass(frozen=True)

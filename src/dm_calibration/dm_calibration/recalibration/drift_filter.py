@@ -23,7 +23,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtri
 
@@ -35,10 +34,9 @@ from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.displaced import displaced_actuators, displacement
 from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, Taken
+from dm_common import Floats
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
-
-Floats = NDArray[np.float64]
 
 DAY_S = 86400.0
 #: Least variance of a value that is laid to its map's noise, as a share of what the calibration's maps scatter.

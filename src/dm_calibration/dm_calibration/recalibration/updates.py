@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.influence.fit import InfluenceFit
@@ -29,8 +28,6 @@ from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_
 from dm_common.atomic_write import storing
 from dm_common.measurement import Measurement
 from dm_common.mirror import APERTURE_TOLERANCE
-
-Floats = NDArray[np.float64]
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
 REPEAT_S = 3600.0

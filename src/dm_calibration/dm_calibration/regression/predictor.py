@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.influence.fit import InfluenceFit
@@ -21,9 +20,8 @@ from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory, SagModel
 from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import ErrorRegression, model_candidates, regress, surface_errors
+from dm_common import Floats
 from dm_common.optics.piston_tilt import rms
-
-Floats = NDArray[np.float64]
 
 #: Number of histories, commands in each, and time between commands, s.
 HISTORIES = 200

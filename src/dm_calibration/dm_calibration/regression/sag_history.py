@@ -20,9 +20,8 @@ from dm_calibration.hysteresis.features import crept, play_features
 from dm_calibration.hysteresis.segments import BEFORE_FIRST_MAP_S, in_parts, parts_of, starts_of, without
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import complete_sag, drift_columns
+from dm_common import Floats
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-
-Floats = NDArray[np.float64]
 
 #: Half-widths of the play operators beside the signal itself, normalised.
 PLAY_RADII = (0.05, 0.15, 0.3, 0.5, 0.75)

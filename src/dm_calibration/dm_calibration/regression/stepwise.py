@@ -17,13 +17,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import linalg, special
 
 from dm_calibration.influence.regression import TooFewMapsError
+from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
-
-Floats = NDArray[np.float64]
 
 #: Share of a candidate's variation not explained by those selected, below which it brings nothing of its own.
 TOLERANCE = 1e-8

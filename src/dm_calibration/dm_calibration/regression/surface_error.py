@@ -41,10 +41,9 @@ from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
 from dm_calibration.regression.stepwise import P_ENTER, P_REMOVE, SelectionOptions, StepwiseFit, leave_one_out, stepwise
+from dm_common import Floats
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sample_regions import regional_rms
-
-Floats = NDArray[np.float64]
 
 #: p01 to p58; the Zernike surfaces are not part of the regression.
 SURFACES = tuple(name for name in TABLE_1 if not name.startswith("pz"))

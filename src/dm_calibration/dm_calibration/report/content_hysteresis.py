@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.report.content import NM, length, utc
 from dm_calibration.report.document import BLUE, GREEN, GREY, ORANGE, VERMILION, Picture, Section, Table
+from dm_common import Floats
 from dm_common.hysteresis.law_shape import branch, closed_cycle, opening, turned
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.recipes import RecipeBook, terms_text
-
-Floats = NDArray[np.float64]
 
 #: Minor loops: from the falling branch, down to each of these and back.
 MINOR_TURNS = (0.6, 0.2, -0.2, -0.6)

@@ -9,7 +9,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
 from dm_calibration.calibration import Calibration
@@ -17,11 +16,10 @@ from dm_calibration.influence.maps import KINDS
 from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
 from dm_calibration.report.document import BLUE, DIVERGING, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from dm_calibration.report.residuals import Residuals
+from dm_common import Floats
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERMS
-
-Floats = NDArray[np.float64]
 
 NM, MM = 1e9, 1e3
 #: Pixels across a small map.

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import effective_maps
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import make_design
+from dm_common import Floats
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from dm_common import Floats
 
 if TYPE_CHECKING:
     from dm_common.hysteresis.model import HysteresisModel, HysteresisState
     from dm_common.hysteresis.observer import HysteresisObserver
-
-Floats = NDArray[np.float64]
 
 #: Standard deviation of a shape that was held unseen, in shapes of the whole range.
 UNSEEN = 0.5

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from dm_common import Floats
 
 #: Largest |z| of a table.
 REACH = 2.5

@@ -18,14 +18,12 @@ from functools import lru_cache
 from math import ceil, comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
-
-Floats = NDArray[np.float64]
 
 #: Effective signals are met to this; a DAC step is three hundred times as large.
 TOLERANCE = 1e-7

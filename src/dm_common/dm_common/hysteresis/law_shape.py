@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.duhem import FULL_SWING, DuhemOperator
 from dm_common.hysteresis.inverse import certain_reach
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 from dm_common.limits import Limits
-
-Floats = NDArray[np.float64]
 
 #: Points of a branch of a loop.
 STEPS = 81

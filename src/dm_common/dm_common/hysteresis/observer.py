@@ -12,12 +12,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.hysteresis.creep_record import CreepRecord, rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-
-Floats = NDArray[np.float64]
 
 #: Reports kept for a law that is identified later: a calibration run makes some hundred.
 LOG_LENGTH = 5_000
