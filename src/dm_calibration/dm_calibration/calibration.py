@@ -1,7 +1,5 @@
 """A calibration: what was measured, the influence function fitted to it, and where it comes from."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version

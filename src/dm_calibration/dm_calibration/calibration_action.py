@@ -1,7 +1,5 @@
 """The body of the action `calibrate`: goal to plan, run, fit, store, publish."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from typing import Any

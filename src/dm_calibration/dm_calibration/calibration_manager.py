@@ -1,7 +1,5 @@
 """The mirror that is connected, the stored calibrations, and the one in use."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Node `calibration`: measures the influence function, keeps the calibrations, publishes the one in use."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """From maps, or a stored calibration, to a calibration: fit, poke check, limitations as sentences."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection
 from dataclasses import dataclass, replace

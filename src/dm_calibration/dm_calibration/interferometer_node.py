@@ -6,8 +6,6 @@ folder its modification time when that is recent; for a file named to `ingest_fi
 modification time. Where ROS time is a simulator's, or the file's time cannot be right, it is the time of reading.
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Iterator, Mapping

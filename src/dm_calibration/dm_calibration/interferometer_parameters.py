@@ -1,7 +1,5 @@
 """Parameters of the node `interferometer`, and what they mean to the library."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

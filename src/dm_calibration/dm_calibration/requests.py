@@ -1,7 +1,5 @@
 """What the fields of requests and goals to the nodes of this package may be."""
 
-from __future__ import annotations
-
 from dm_calibration.hysteresis.excitation import MAPS_MAX, MAPS_MIN
 from dm_calibration.influence.fit import METHODS
 from dm_calibration.procedure.plan import PlanKind

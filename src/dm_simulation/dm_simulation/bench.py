@@ -1,7 +1,5 @@
 """The whole virtual bench: drive unit, mirror, interferometer, camera and their ports, without ROS."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

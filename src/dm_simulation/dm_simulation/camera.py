@@ -7,8 +7,6 @@ function (Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4), with w
 Objects stand side by side; that a near one hides parts of a blurred far one is left out. Exposure is instantaneous.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

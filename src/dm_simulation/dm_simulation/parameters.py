@@ -1,7 +1,5 @@
 """Parameters of the node `virtual_bench`, and the bench configuration made of their values."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace

@@ -6,8 +6,6 @@ the images of the camera behind the mirror (`image_raw`, `camera_info`), which a
 and the temperature of a plate on piezo stacks (`temperature`), which a sensor would.
 """
 
-from __future__ import annotations
-
 import array
 import json
 import sys

@@ -1,7 +1,5 @@
 """`dm calibrate --boresight`: the picture of a camera stands still while the focus changes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The `dm` command: one module a verb, whose heavy imports wait until the verb runs."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import re

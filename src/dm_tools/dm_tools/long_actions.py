@@ -3,8 +3,6 @@
 The console shows such goals, can cancel them and does not get in their way; commands name them as what has the mirror.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Sequence

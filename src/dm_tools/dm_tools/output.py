@@ -1,7 +1,5 @@
 """What the subcommands share: the console, figures as JSON, progress bars, how they end."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

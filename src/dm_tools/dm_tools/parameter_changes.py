@@ -1,7 +1,5 @@
 """Changes to parameters that a measurement has found: of running nodes, and in their parameter file."""
 
-from __future__ import annotations
-
 from itertools import count
 from pathlib import Path
 from typing import Any

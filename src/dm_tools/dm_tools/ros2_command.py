@@ -1,7 +1,5 @@
 """`ros2 dm`: the command `dm` among those of ROS 2. Its entry point is all that ros2cli asks for."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

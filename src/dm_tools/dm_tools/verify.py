@@ -1,7 +1,5 @@
 """Compare a measured surface with the one that was asked for."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Getting new map files out of the instrument: by a trigger command, or from the watched folder. Knows no ROS."""
 
-from __future__ import annotations
-
 import math
 import queue
 import re

@@ -5,8 +5,6 @@ its writer has closed it and it is as long as it says itself. Nothing depends on
 stillness is judged by this machine's monotonic clock.
 """
 
-from __future__ import annotations
-
 import fnmatch
 import os
 import stat

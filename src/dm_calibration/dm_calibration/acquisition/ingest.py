@@ -1,7 +1,5 @@
 """From a map file to the figures the suite works with: oriented map, aperture, Zernike fit, samples. Knows no ROS."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path

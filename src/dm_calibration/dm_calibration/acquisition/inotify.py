@@ -3,8 +3,6 @@
 Linux tells of writers on this machine only (inotify(7)); what another one writes to a shared folder shows by polling.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import select

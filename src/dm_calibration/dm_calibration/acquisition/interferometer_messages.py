@@ -1,7 +1,5 @@
 """Maps and measurements as ROS messages."""
 
-from __future__ import annotations
-
 import array
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Maps that were not measured by a run of this suite: files, arrays or measurements, with the commands they show."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

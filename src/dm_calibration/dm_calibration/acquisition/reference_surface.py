@@ -1,7 +1,5 @@
 """The instrument's own error: a map of it, which is subtracted from every other. What is left is absolute."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

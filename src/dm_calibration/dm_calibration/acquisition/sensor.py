@@ -1,7 +1,5 @@
 """Measurements from a sensor that publishes Zernike coefficients, on request. Knows no ROS."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Running the command that makes the interferometer take a map. Knows no ROS."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -6,8 +6,6 @@ its commands, (X'X)^-1 sigma^2 each; what they do to the check moves of the run 
 Features are those of the richest candidate, which costs most maps. What no number of maps takes away is a floor.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

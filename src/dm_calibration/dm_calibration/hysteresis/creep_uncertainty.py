@@ -7,8 +7,6 @@ hold, such as loops that widen with speed, all actuators do together, so that er
 independent: the maps count for less, as far as what they leave goes the way of the features.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

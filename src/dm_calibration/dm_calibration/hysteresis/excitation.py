@@ -7,8 +7,6 @@ show creep of the first second. The last fifth are moves as in use, low-order sh
 test the law that the others gave.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The effective signal as a sum of features of the commands, linear in the weights that are to be identified."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

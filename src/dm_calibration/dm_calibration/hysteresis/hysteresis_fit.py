@@ -1,7 +1,5 @@
 """From the maps of a run to the law of a mirror, with what it may be trusted to predict."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ each actuator by itself (:mod:`~dm_calibration.hysteresis.own_laws`) are one mor
 are alike keeps its common law.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
 

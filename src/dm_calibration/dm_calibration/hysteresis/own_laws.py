@@ -14,8 +14,6 @@ least-squares solution given the other two, in turn. That of the patterns is one
 responses of neighbours overlap; its matrix is the elementwise product of the Gram matrices of features and gains.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

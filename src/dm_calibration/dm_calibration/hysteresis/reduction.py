@@ -1,7 +1,5 @@
 """A map in few numbers of like meaning: coefficients beyond tilt, and patterns of the sag beyond the terms."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

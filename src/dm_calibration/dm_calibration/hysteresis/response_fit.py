@@ -4,8 +4,6 @@ Records of other laboratories, of mirrors by any principle, need neither ROS nor
 and times are enough to see which law predicts best, and by how much.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

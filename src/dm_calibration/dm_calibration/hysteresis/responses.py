@@ -5,8 +5,6 @@ coarser, since a point with missing neighbours is the mean of the others. Beyond
 actuators shows at most N patterns, so the sag is projected onto those, and each kind is divided by its scatter.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

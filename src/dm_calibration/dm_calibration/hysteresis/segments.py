@@ -4,8 +4,6 @@ What the actuators did between two parts is not known. A degauss wipes their hys
 in a pattern that is unknown, as it is before the first part, and the mirror may have drifted meanwhile.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 

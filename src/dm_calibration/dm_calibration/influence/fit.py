@@ -6,8 +6,6 @@ frame to reference frame (see :mod:`~dm_calibration.influence.regression`). An i
 tilt, so they are removed, area-weighted, from every sag vector before the fit and from every residual that is reported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 

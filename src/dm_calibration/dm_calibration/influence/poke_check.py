@@ -4,8 +4,6 @@ How the mirror stands in the maps as a whole is told first (:mod:`~dm_calibratio
 then belongs to single actuators: dead, weak, inverted, exchanged with another, or two on one channel.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The parameters that put right what a poke check found to stand otherwise than configured."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

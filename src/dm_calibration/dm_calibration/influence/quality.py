@@ -1,7 +1,5 @@
 """How good an influence function is: held-out error, condition number, a grade per actuator, and its limitations."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -10,8 +10,6 @@ prediction. Weights of a fold come from the other folds alone. Where no weights 
 mildest candidate is chosen and the result says so; a prior epsilon can be given instead.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -9,8 +9,6 @@ begins elsewhere. Of the descriptions that fit alike, the one that leaves most a
 holds, and among those that do so alike the one nearest to the configuration.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

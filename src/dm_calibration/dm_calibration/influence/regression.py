@@ -12,8 +12,6 @@ intervals alike. Here all maps of an interval share in fixing its figure, and th
 map.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which maps are fit for the regression, and why the others are not."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dm_calibration.influence.maps import MapSet

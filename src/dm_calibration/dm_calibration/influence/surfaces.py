@@ -4,8 +4,6 @@ p01-p54 prescribe signals and are exact. p55-p58 (spheres) and pz01-pz11 (Zernik
 signals come from an influence function by bounded least squares, and the shape aimed at travels with the surface.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

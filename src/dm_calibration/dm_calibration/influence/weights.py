@@ -20,8 +20,6 @@ first is taken: there w_i acts on region i alone, and equal weights are no weigh
 favour the centre ten to one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """Readers of interferometer map files: `read_map(path).sag` is the surface sag in metres."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import stat

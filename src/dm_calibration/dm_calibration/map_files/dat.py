@@ -1,7 +1,5 @@
 """ZYGO binary `.dat` maps, as MetroPro and Mx write them ([29]; docs/map-files.md)."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

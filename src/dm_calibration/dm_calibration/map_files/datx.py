@@ -1,7 +1,5 @@
 """ZYGO `.datx` maps (HDF5, written by Mx; docs/map-files.md)."""
 
-from __future__ import annotations
-
 import io
 import math
 from typing import Any

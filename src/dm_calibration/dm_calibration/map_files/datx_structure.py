@@ -1,7 +1,5 @@
 """The structure of an HDF5 map, checked before memory is claimed for what it promises, and its values."""
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Maps in FITS files: the primary image, its heights in the unit that BUNIT tells (docs/map-files.md), and writing."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

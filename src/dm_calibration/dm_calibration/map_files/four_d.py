@@ -1,7 +1,5 @@
 """Maps of 4D Technology's 4Sight (HDF5, `.h5` and `.4D`; docs/map-files.md)."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

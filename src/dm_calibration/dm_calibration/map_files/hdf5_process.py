@@ -1,7 +1,5 @@
 """The helper that opens HDF5 files; see :mod:`dm_calibration.store.hdf5_sandbox`. Requests come on standard input."""
 
-from __future__ import annotations
-
 import math
 import os
 import resource

@@ -1,7 +1,5 @@
 """A measured surface map, as every reader of this package returns it, and the checks they share."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 Fields are found by line number and position: quotes around texts can be damaged in real files.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The circular aperture on a map: found from the valid pixels, or configured."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ coefficient c of the part by exp(-ima), and the mirror image is (-1)^m times its
 the maps are one small set of linear equations for the flats; what they leave open is told, and left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Both are taken off a map as the camera shows it, in coordinates of the camera: f
 units of half its longer side.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ a product of two Legendre polynomials is a short sum of others. Solving the 21 x
 answer.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache, lru_cache

@@ -12,8 +12,6 @@ running sums. One look-up per end of a run replaces a product over all pixels. S
 about one pixel in 32 on there are so many that the plain product is quicker.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ An instrument follows less than half a fringe from pixel to pixel. Where neighbo
 what it differs from the one beside it tells how many fringes were lost.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage

@@ -1,7 +1,5 @@
 """What stood at the mirror when a map was taken, from what the driver reports."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ All reference frames show the same command. Between two of them the picture may 
 and by a little drift; a tilt, a shift on the camera or another figure beyond that is somebody's elbow.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ A frame is a mark, two lengths, a head in JSON, the raw bytes of the arrays and 
 of the frame before it as well: no frame can get lost between two others, or be put in from another run.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """What a hysteresis plan will take and give, before anything moves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """One map of a commanded state: tried again when it fails, compared with the others, checked for a bump."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

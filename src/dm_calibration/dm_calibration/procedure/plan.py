@@ -1,7 +1,5 @@
 """What a calibration measures, in order: degauss, reference frames, pokes, surfaces of Table 1."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

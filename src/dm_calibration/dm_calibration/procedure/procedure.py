@@ -4,8 +4,6 @@ It knows no ROS: what moves the mirror and what measures it are callables. A run
 had measured: with a degauss, since nobody knows what the actuators went through meanwhile, and a reference frame.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ from what was commanded: a plan is a function of few options, and only the right
 last bit. Knows no ROS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Which run a `Calibrate` goal goes on with, and what makes two runs the same. Knows no ROS."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time

@@ -1,7 +1,5 @@
 """Which single actuators a map that disagrees comes from, how probable that is, and where they stand."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

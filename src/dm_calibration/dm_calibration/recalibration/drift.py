@@ -1,7 +1,5 @@
 """What maps that came later have shown of a calibrated mirror."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

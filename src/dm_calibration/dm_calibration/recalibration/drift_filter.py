@@ -17,8 +17,6 @@ A map that departs further from its prediction than chance allows is a bad map, 
 must not take it in.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Maps that arrive between calibrations: over the interferometer's topics, or measured for `update_calibration`."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """The topic `temperature`: what it said when a map was taken, and whether it still comes."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right, insort
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The file with the updates of a calibration: tied to it by id and content, written whole or not at all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

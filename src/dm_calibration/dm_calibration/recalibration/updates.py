@@ -3,8 +3,6 @@
 The calibration's own file is never touched. What later maps have shown stands beside it, in ``<id>.updates.hdf5``.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Services `fit_regression` and `predict_error` of the node `calibration`."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping
 from typing import Any

@@ -6,8 +6,6 @@ shapes (the spheres and Zernike surfaces of the calibration) of any size the ran
 mirror. The interval holds 95 % of them, widened by the uncertainty of the regression.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

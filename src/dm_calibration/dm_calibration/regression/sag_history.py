@@ -8,8 +8,6 @@ and H, then weights and creep rate are least-squares solutions in turn. The figu
 (:func:`~dm_calibration.influence.regression.drift_columns`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -10,8 +10,6 @@ known beforehand: the best of 58 candidates always looks better than chance, so 
 is the error on samples that were not used, :func:`leave_one_out`, where the selection is made anew without each sample.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -27,8 +27,6 @@ p values and R^2 are optimistic, because the variables were selected on the same
 :mod:`~dm_calibration.regression.stepwise`); held-out errors stand beside them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

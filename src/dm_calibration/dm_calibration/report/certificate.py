@@ -2,8 +2,6 @@
 picture of every actuator.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Text of the report: what checks have shown since the calibration, what drifts, how fast, when to calibrate next."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

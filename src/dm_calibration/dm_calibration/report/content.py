@@ -1,7 +1,5 @@
 """Text of the report, part one: what it comes to, what was measured with what, what to beware of, every map."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from pathlib import PurePath

@@ -1,7 +1,5 @@
 """Text of the report, part two: influence functions, actuators, residuals, regions, coefficients."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dm_calibration.calibration import Calibration

@@ -1,7 +1,5 @@
 """Text of the report, part three: hysteresis, creep and recipes, with their figures."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

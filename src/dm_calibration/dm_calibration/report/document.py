@@ -1,7 +1,5 @@
 """A document of sections with paragraphs, tables and pictures. Knows nothing of mirrors, HTML or PDF."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass

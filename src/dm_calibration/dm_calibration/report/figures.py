@@ -1,7 +1,5 @@
 """Figures of the report: influence functions, residuals, regions, coefficients. Lengths in m; drawn in mm and nm."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

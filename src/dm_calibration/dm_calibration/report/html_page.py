@@ -1,7 +1,5 @@
 """A document as HTML: a page with its pictures beside it, or one file with all in it."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """The report: all sections in order, as one HTML file and one PDF file."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """A document as PDF on A4 pages, set by ReportLab."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from functools import cache

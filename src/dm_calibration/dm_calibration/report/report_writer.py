@@ -4,8 +4,6 @@ A report takes some seconds of drawing, which must hold up neither the node nor 
 goes wrong with it, the calibration is stored already. `./dm report` writes the same files at any time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What a calibration's fit leaves unexplained in the maps it was made from, point by point and term by term."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The folder of calibration files: written whole or not at all, read with suspicion."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable

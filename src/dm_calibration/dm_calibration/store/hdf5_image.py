@@ -4,8 +4,6 @@ The file is made in memory, so that a full disk meets ordinary file writing, whi
 library in the middle of its own bookkeeping.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

@@ -6,8 +6,6 @@ the bytes, within limits of memory and computing time, and hands back plain arra
 damaged; the next file gets a new helper. The helper ends with the process that started it.
 """
 
-from __future__ import annotations
-
 import atexit
 import json
 import os

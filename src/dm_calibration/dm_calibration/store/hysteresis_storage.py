@@ -1,7 +1,5 @@
 """Hysteresis model and recipes as datasets and attributes of a calibration file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The drive electronics behind the wire: DAC registers, output stage, amplifier, cables to the actuators."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

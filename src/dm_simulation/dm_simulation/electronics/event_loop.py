@@ -1,7 +1,5 @@
 """One thread that waits on all sockets of the bench and owns everything their data changes."""
 
-from __future__ import annotations
-
 import selectors
 import socket
 import threading

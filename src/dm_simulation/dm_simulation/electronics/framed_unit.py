@@ -1,7 +1,5 @@
 """A serial drive unit of one's own: its frames as its data sheet gives them, and the decoder of what arrives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

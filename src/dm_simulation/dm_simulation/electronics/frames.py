@@ -1,7 +1,5 @@
 """Decoders of what arrives on the wire, written from the units' protocol descriptions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

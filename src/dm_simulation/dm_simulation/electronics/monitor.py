@@ -1,7 +1,5 @@
 """A watch on every frame, independent of the driver's own limiter: what really reached the actuators."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The serial unit on a pseudo-terminal: a USB DAC-40, or a unit whose frames a data sheet describes."""
 
-from __future__ import annotations
-
 import os
 import tty
 from collections.abc import Callable

@@ -4,8 +4,6 @@ One thread owns all sockets and, through `run()`, everything that frames change:
 which they arrived, and whoever asks for the state sees every frame that was sent before the question.
 """
 
-from __future__ import annotations
-
 import errno
 import socket
 import time

@@ -1,7 +1,5 @@
 """Parameters of the instrument: how maps differ from the surface."""
 
-from __future__ import annotations
-
 from dm_common.ros.parameters import Parameter, real, switch, whole
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 

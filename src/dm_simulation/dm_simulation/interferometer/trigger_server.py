@@ -3,8 +3,6 @@ r"""The bench's side of the trigger: one line of text in, one out, over a loopba
 `MEASURE <absolute path, or nothing>\\n` is answered by `OK <path>\\n` or `ERROR <words>\\n`.
 """
 
-from __future__ import annotations
-
 import socketserver
 import threading
 from collections.abc import Callable

@@ -4,8 +4,6 @@
 big-endian). `.datx`: HDF5 as Mx writes it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

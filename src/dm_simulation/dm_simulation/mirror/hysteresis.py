@@ -6,8 +6,6 @@ units of half the stroke each way) and the loop opens by `fraction` of the total
 vendors state hysteresis.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Protocol
 

@@ -10,8 +10,6 @@ edge, and the Laplacian multiplies what follows the first bracket by ``-4 (k + 1
 solution is written down: P are Jacobi polynomials, orthogonal over the disc with the weight 1 - rho^2.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 What stacks differ in, and what they do beyond a rate-independent law and creep, is off by default.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Kirchhoff plate theory ([7], sections 10 and 21), solved by the Rayleigh-Ritz me
 conditions, so Zernike polynomials are admissible as they stand.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ triangle between both ([16], section 2.4). The turning points that no later move
 remembers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

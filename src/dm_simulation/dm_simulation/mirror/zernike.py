@@ -5,8 +5,6 @@ and sqrt(2 (n + 1)) otherwise ([2], section 9.2, with another norm). Jacobi poly
 where sums of powers of r lose digits.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ROS side of the console: one node on a thread of its own, the latest messages, and calls as coroutines."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import time

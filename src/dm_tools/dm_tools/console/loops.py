@@ -1,7 +1,5 @@
 """Hysteresis loops of one actuator: what the law of the calibration says, and what maps say."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """What the buttons do: each function calls the nodes and returns its outcome in words."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The page: all cards in order, refreshed from one snapshot a few times a second."""
 
-from __future__ import annotations
-
 from nicegui import app, ui
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 

@@ -1,7 +1,5 @@
 """What all open pages of one console share: the operation under way, its progress, and everything that went wrong."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import time

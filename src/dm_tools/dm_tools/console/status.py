@@ -1,7 +1,5 @@
 """State of the bench in words: badges, what is missing, why something is not possible, diagnostics and log."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The latest map beside what the calibration predicts; worked out once for all open pages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

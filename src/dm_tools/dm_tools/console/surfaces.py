@@ -1,7 +1,5 @@
 """Surfaces on one grid over the aperture: the measured one, the predicted one and their difference."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """From messages to what is drawn: pure functions, without a browser and without ROS calls."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

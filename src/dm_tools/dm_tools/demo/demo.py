@@ -1,7 +1,5 @@
 """`dm demo`: the whole chain on the virtual bench, from the first poke to re-measured spheres."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

@@ -1,7 +1,5 @@
 """The virtual bench of a run: a configuration with ports and folders of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import socket

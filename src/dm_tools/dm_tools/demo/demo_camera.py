@@ -1,7 +1,5 @@
 """`dm demo --camera`: a virtual camera behind the mirror focuses on objects at three distances."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

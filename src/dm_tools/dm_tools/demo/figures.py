@@ -1,7 +1,5 @@
 """Pictures of commands, maps and residuals, with physical axes and a colour-blind-safe scale."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures of the camera's demonstration: a contact sheet and an animation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What the doctor checks on one bench: its file, the electronics, ports, folders, the calibration in store."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """`dm doctor`: what is wrong on this machine or bench, in words, and how to cure it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """What the doctor checks on any machine: packages, messages between nodes, memory, disk, clock."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import shutil

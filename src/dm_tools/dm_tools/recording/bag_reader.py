@@ -1,7 +1,5 @@
 """Read a recording: ours, or one of rosbag2 in MCAP or SQLite. Knows no node."""
 
-from __future__ import annotations
-
 import json
 import math
 import sqlite3

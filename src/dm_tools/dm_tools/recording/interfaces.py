@@ -3,8 +3,6 @@
 The text is rosbag2's: the definition, then each type it uses under a line of `=` and a line `MSG: package/Type`.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from functools import cache

@@ -1,7 +1,5 @@
 """Publish a recording again, in its own time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 

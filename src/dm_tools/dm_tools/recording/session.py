@@ -1,7 +1,5 @@
 """What a recording says of a calibration run, and the calibration made again from it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter

@@ -4,8 +4,6 @@
 and nothing may stand here that no node uses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from dm_bringup.nodes import NODES

@@ -1,7 +1,5 @@
 """Whether a keystore keeps to the profile: its policies, its permissions, and who may read its private keys."""
 
-from __future__ import annotations
-
 import stat
 from datetime import UTC, datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """SROS 2 policy and governance files from the table of interfaces, and the DDS topics that a policy allows."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import dataclass
 from pathlib import Path

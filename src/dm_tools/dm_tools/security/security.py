@@ -1,7 +1,5 @@
 """`dm security`: the hardened profile for installations with SROS 2, generated and checked."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

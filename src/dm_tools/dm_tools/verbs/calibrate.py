@@ -1,7 +1,5 @@
 """`dm calibrate`: measure and store a calibration on the running suite."""
 
-from __future__ import annotations
-
 import math
 import re
 from contextlib import suppress

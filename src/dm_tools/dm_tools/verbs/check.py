@@ -1,7 +1,5 @@
 """`dm check`: compare one map with the calibration in use, and let it improve it."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import typer

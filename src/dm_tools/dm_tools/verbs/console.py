@@ -1,7 +1,5 @@
 """`dm console`: the bench console, a web page on loopback."""
 
-from __future__ import annotations
-
 import socket
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`dm focus`, `dm flatten`, `dm degauss`: what moves the mirror of the running suite."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import typer

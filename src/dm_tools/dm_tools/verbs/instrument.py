@@ -1,7 +1,5 @@
 """`dm instrument`: find from files what the interferometer itself adds to every map."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`dm measure`: take one map of the mirror as it stands."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import typer

@@ -1,7 +1,5 @@
 """`dm recipes`: build recipes on the bench, and list those of the calibration in use."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 import typer

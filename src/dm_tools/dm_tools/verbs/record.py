@@ -1,7 +1,5 @@
 """`dm record`: the topics of a session in an MCAP file that `ros2 bag` and Foxglove read."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """`dm replay`: a recording published again, or the calibration in it made again."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """`dm report`: the report of a stored calibration as one HTML and one PDF file."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

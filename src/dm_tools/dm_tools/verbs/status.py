@@ -1,7 +1,5 @@
 """`dm status`: the running suite on one screen."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

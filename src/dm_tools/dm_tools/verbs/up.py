@@ -1,7 +1,5 @@
 """`dm up`: the nodes on this terminal, against hardware or the virtual bench."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import fcntl

@@ -1,7 +1,5 @@
 """The actuators as hexagons: signals in colour and figures, flags as signs, the chosen one outlined."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """A surface as a heat map with axes in mm and a colour bar."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Zernike bars, the residual of a run, and hysteresis loops."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

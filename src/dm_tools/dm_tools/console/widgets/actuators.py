@@ -1,7 +1,5 @@
 """The cards of the actuators: command map, poke, hysteresis loop."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from functools import partial

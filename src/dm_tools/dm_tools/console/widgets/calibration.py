@@ -1,7 +1,5 @@
 """The card of calibrations: run one, see how it goes, load one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from functools import partial
 from html import escape

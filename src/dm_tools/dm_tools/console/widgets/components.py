@@ -1,7 +1,5 @@
 """Small parts that the cards share."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """The card that asks for a curvature."""
 
-from __future__ import annotations
-
 import math
 import time
 from functools import partial

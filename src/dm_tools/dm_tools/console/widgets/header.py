@@ -1,7 +1,5 @@
 """The header of the page, always in sight: state of the bench, what is missing, and everything that was refused."""
 
-from __future__ import annotations
-
 from html import escape
 
 from nicegui import ui

@@ -1,7 +1,5 @@
 """The card of log and diagnostics."""
 
-from __future__ import annotations
-
 from html import escape
 
 from nicegui import ui

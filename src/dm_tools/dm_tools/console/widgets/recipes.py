@@ -1,7 +1,5 @@
 """The card of recipes: those of the calibration in use, and how to build more."""
 
-from __future__ import annotations
-
 from functools import partial
 from html import escape
 

@@ -1,7 +1,5 @@
 """The cards of the surface: measured, predicted, difference, and Zernike coefficients."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
