@@ -8,10 +8,10 @@ import numpy as np
 from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
-    check_pitch,
     check_size,
     sag_from_counts,
     sag_per_count,
+    zygo_map,
 )
 
 #: magic: (format, header size in bytes)
@@ -125,24 +125,7 @@ def parse_dat(content: bytes) -> SurfaceMap:
     offset = check_length(header, len(content))
     width, height = header["width"], header["height"]
     counts = np.frombuffer(content, ">i4", width * height, offset).reshape(height, width)
-    metres_per_count = sag_per_count(
-        header["scale_factor"],
-        header["wavelength"],
-        header["obliquity"],
-        header["phase_resolution"],
-        header["data_sign"],
-    )
-    pitch = check_pitch(header["lateral_resolution"])
+    sag = sag_from_counts(counts, sag_per_count(header))
+    header["part_name"] = header["part_name"].split(b"\0")[0].decode("latin-1").strip(' "')
     software = _SOFTWARE.get(header["software"], f"software {header['software']}")
-    return SurfaceMap(
-        sag=sag_from_counts(counts, metres_per_count),
-        wavelength=header["wavelength"],
-        pitch=pitch,
-        format="dat",
-        origin=(header["origin_x"], header["origin_y"]),
-        instrument=f"{software}, system type {header['system_type']}",
-        serial=str(header["system_serial"]) if header["system_serial"] else "",
-        part_name=header["part_name"].split(b"\0")[0].decode("latin-1").strip(' "'),
-        time_stamp=float(header["time_stamp"]) if header["time_stamp"] else None,
-        system_error_subtracted={0: False, 1: True}.get(header["system_error_subtracted"]),
-    )
+    return zygo_map(sag, header, "dat", f"{software}, system type {header['system_type']}")

@@ -2,12 +2,15 @@
 
 import hashlib
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 
 #: Counts from here up mean "no data" (MetroPro reference, phase data matrix).
@@ -64,11 +67,10 @@ class SurfaceMap:
         system_error_subtracted: None when not known. Maps that differ in it must not be mixed.
         piston_tilt_removed: whether the plane of the map was subtracted.
         phase_steps: number of regions that stood whole fringes off and were brought back.
-        file: where the map was read from.
         content: the file's bytes, for :attr:`sha256`.
     """
 
-    sag: NDArray[np.float64]
+    sag: Floats
     wavelength: float
     pitch: float | None
     format: str
@@ -153,35 +155,49 @@ def check_size(width: int, height: int) -> int:
     return width * height
 
 
-def check_heights(sag: NDArray[np.float64]) -> None:
+def check_heights(sag: Floats) -> None:
     """Raise MapFileError for heights that no surface in front of an interferometer has; `sag` may hold NaN."""
     lowest, highest = float(np.fmin.reduce(sag, axis=None)), float(np.fmax.reduce(sag, axis=None))
     if max(-lowest, highest) > HEIGHT_MAX:
         raise _outside("height", f"{lowest:g} to {highest:g} m", f"-{HEIGHT_MAX:g} to {HEIGHT_MAX:g} m")
 
 
-def sag_per_count(
-    scale_factor: float, wavelength: float, obliquity: float, resolution_code: int, data_sign: int
-) -> float:
-    """Return m of surface sag per count: S O W / R, negative when the data are inverted.
+def sag_per_count(header: Mapping[str, Any]) -> float:
+    """Return m of surface sag per count, by the header of a ZYGO file: S O W / R, negative when the data are inverted.
 
     The interferometric scale factor S already turns double-pass fringes into surface height.
 
     Raises:
         MapFileError: a factor that makes heights meaningless (0, NaN, absurd) or a code of unknown meaning.
     """
-    check_factor("interferometric scale factor", scale_factor)
-    check_factor("obliquity factor", obliquity)
-    check_wavelength(wavelength)
-    if resolution_code not in COUNTS_PER_FRINGE:
-        raise _outside("phase resolution code", resolution_code, "0, 1 or 2")
-    if data_sign not in (0, 1):
-        raise _outside("data sign", data_sign, "0 (normal) or 1 (inverted)")
-    sign = -1.0 if data_sign == 1 else 1.0
-    return sign * scale_factor * obliquity * wavelength / COUNTS_PER_FRINGE[resolution_code]
+    scale_factor = check_factor("interferometric scale factor", header["scale_factor"])
+    obliquity = check_factor("obliquity factor", header["obliquity"])
+    wavelength = check_wavelength(header["wavelength"])
+    if header["phase_resolution"] not in COUNTS_PER_FRINGE:
+        raise _outside("phase resolution code", header["phase_resolution"], "0, 1 or 2")
+    if header["data_sign"] not in (0, 1):
+        raise _outside("data sign", header["data_sign"], "0 (normal) or 1 (inverted)")
+    sign = -1.0 if header["data_sign"] == 1 else 1.0
+    return sign * scale_factor * obliquity * wavelength / COUNTS_PER_FRINGE[header["phase_resolution"]]
 
 
-def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> NDArray[np.float64]:
+def zygo_map(sag: Floats, header: Mapping[str, Any], form: str, instrument: str) -> SurfaceMap:
+    """`sag`, m, as a map with what the header of a ZYGO file of the format `form` tells. Raises MapFileError."""
+    return SurfaceMap(
+        sag=sag,
+        wavelength=header["wavelength"],
+        pitch=check_pitch(header["lateral_resolution"]),
+        format=form,
+        origin=(header["origin_x"], header["origin_y"]),
+        instrument=instrument,
+        serial=str(header["system_serial"]) if header["system_serial"] else "",
+        part_name=header["part_name"],
+        time_stamp=float(header["time_stamp"]) if header["time_stamp"] > 0 else None,
+        system_error_subtracted={0: False, 1: True}.get(header["system_error_subtracted"]),
+    )
+
+
+def sag_from_counts(counts: NDArray[np.integer], metres_per_count: float) -> Floats:
     """Return sag [m] of the same shape, NaN where the counts say "no data".
 
     Raises:

@@ -3,7 +3,6 @@
 Fields are found by line number and position: quotes around texts can be damaged in real files.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,12 +13,12 @@ from dm_calibration.map_files.surface_map import (
     MapFileError,
     SurfaceMap,
     check_heights,
-    check_pitch,
     check_size,
     check_wavelength,
     no_valid_pixels,
     sag_from_counts,
     sag_per_count,
+    zygo_map,
 )
 
 ASC_TITLE = b"Zygo ASCII Data File"
@@ -27,41 +26,26 @@ XYZ_TITLE = b"Zygo XYZ Data File"
 LINES = 14
 _LONGEST_NUMBER = 40  # characters; bounds the memory that one absurd token can claim
 
-
-@dataclass(frozen=True)
-class TextHeader:
-    """What the header says; lengths in m, sizes in pixels."""
-
-    intensities: int
-    origin: tuple[int, int]
-    width: int
-    height: int
-    part_name: str
-    scale_factor: float
-    wavelength: float
-    obliquity: float
-    lateral_resolution: float
-    time_stamp: float | None
-    system_type: int
-    system_serial: int
-    phase_resolution: int
-    data_sign: int
-    system_error_subtracted: bool | None
-
-    def surface_map(self, sag: NDArray[np.float64], wavelength: float, name: str) -> SurfaceMap:
-        """The map with this header, of the format `name`, with `sag` in m."""
-        return SurfaceMap(
-            sag=sag,
-            wavelength=wavelength,
-            pitch=check_pitch(self.lateral_resolution),
-            format=name,
-            origin=self.origin,
-            instrument=f"system type {self.system_type}",
-            serial=str(self.system_serial) if self.system_serial else "",
-            part_name=self.part_name,
-            time_stamp=self.time_stamp,
-            system_error_subtracted=self.system_error_subtracted,
-        )
+#: Header line and position in it, both from 1, type, and what messages call the field.
+_FIELDS: dict[str, tuple[int, int, type, str]] = {
+    "time_stamp": (8, 8, int, "time stamp"),
+    "intensity_width": (3, 3, int, "intensity width"),
+    "intensity_height": (3, 4, int, "intensity height"),
+    "intensity_buckets": (3, 5, int, "intensity buckets"),
+    "origin_x": (4, 1, int, "phase origin x"),
+    "origin_y": (4, 2, int, "phase origin y"),
+    "width": (4, 3, int, "phase width"),
+    "height": (4, 4, int, "phase height"),
+    "scale_factor": (8, 2, float, "interferometric scale factor"),
+    "wavelength": (8, 3, float, "wavelength"),
+    "obliquity": (8, 5, float, "obliquity factor"),
+    "lateral_resolution": (8, 7, float, "lateral resolution"),
+    "system_type": (9, 3, int, "system type"),
+    "system_serial": (9, 5, int, "system serial number"),
+    "phase_resolution": (11, 1, int, "phase resolution code"),
+    "data_sign": (11, 8, int, "data sign"),
+    "system_error_subtracted": (12, 1, int, "system error subtracted"),
+}
 
 
 def is_text(start: bytes) -> bool:
@@ -69,8 +53,8 @@ def is_text(start: bytes) -> bool:
     return start.lstrip().startswith((ASC_TITLE, XYZ_TITLE))
 
 
-def split_header(content: bytes) -> tuple[TextHeader, bytes]:
-    """Return the header and the body, which begins with the `#` after the header.
+def read_header(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the header fields by name, and the body, which begins with the `#` after the header.
 
     Raises:
         MapFileError: too few lines, a number missing or unreadable, or no `#` after the header.
@@ -81,40 +65,15 @@ def split_header(content: bytes) -> tuple[TextHeader, bytes]:
     body = lines.pop().lstrip()
     if not body.startswith(b"#"):
         raise MapFileError(f"line {LINES + 1}: must be '#', the end of the header")
-    tokens = [line.decode("latin-1").split() for line in lines]
-
-    def number(line: int, position: int, name: str) -> float:
+    header: dict[str, Any] = {"part_name": lines[6].decode("latin-1").replace('"', "").strip()}
+    for field, (line, position, kind, name) in _FIELDS.items():
         try:
-            return float(tokens[line - 1][position - 1])
+            value = float(lines[line - 1].decode("latin-1").split()[position - 1])
         except (IndexError, ValueError):
             raise MapFileError(f"{name}: no number at position {position} of header line {line}") from None
-
-    def integer(line: int, position: int, name: str) -> int:
-        value = number(line, position, name)
-        if not (abs(value) < 2**53 and value == int(value)):
+        if kind is int and not (abs(value) < 2**53 and value == int(value)):
             raise MapFileError(f"{name} = {value:g} in header line {line}: must be an integer")
-        return int(value)
-
-    time_stamp = integer(8, 8, "time stamp")
-    header = TextHeader(
-        intensities=integer(3, 3, "intensity width")
-        * integer(3, 4, "intensity height")
-        * integer(3, 5, "intensity buckets"),
-        origin=(integer(4, 1, "phase origin x"), integer(4, 2, "phase origin y")),
-        width=integer(4, 3, "phase width"),
-        height=integer(4, 4, "phase height"),
-        part_name=lines[6].decode("latin-1").replace('"', "").strip(),
-        scale_factor=number(8, 2, "interferometric scale factor"),
-        wavelength=number(8, 3, "wavelength"),
-        obliquity=number(8, 5, "obliquity factor"),
-        lateral_resolution=number(8, 7, "lateral resolution"),
-        time_stamp=float(time_stamp) if time_stamp > 0 else None,
-        system_type=integer(9, 3, "system type"),
-        system_serial=integer(9, 5, "system serial number"),
-        phase_resolution=integer(11, 1, "phase resolution code"),
-        data_sign=integer(11, 8, "data sign"),
-        system_error_subtracted={0: False, 1: True}.get(integer(12, 1, "system error subtracted")),
-    )
+        header[field] = kind(value)
     return header, body
 
 
@@ -137,15 +96,15 @@ def numbers(text: bytes, name: str, expected: int, dtype: type) -> NDArray[Any]:
         raise MapFileError(f"{name}: {error}") from None
 
 
-def _phase_section(header: TextHeader, body: bytes) -> bytes:
+def _phase_section(intensities: int, body: bytes) -> bytes:
     """The text between the `#` before the phase data and the `#` after them."""
     before, *sections, after = body.split(b"#")
     if before.strip() or after.strip():
         raise MapFileError("the phase data do not end with '#'; the file is truncated")
     if len(sections) == 2:
-        numbers(sections[0], "intensity data", header.intensities, np.int64)
+        numbers(sections[0], "intensity data", intensities, np.int64)
         return sections[1]
-    if len(sections) == 1 and header.intensities == 0:  # the intensity section may be left out when it is empty
+    if len(sections) == 1 and intensities == 0:  # the intensity section may be left out when it is empty
         return sections[0]
     raise MapFileError(
         f"{len(sections)} data sections between '#' marks: must be intensity and phase; the file is truncated"
@@ -158,14 +117,13 @@ def parse_asc(content: bytes) -> SurfaceMap:
     Raises:
         MapFileError: not a whole, meaningful map; the message names the field.
     """
-    header, body = split_header(content)
-    pixels = check_size(header.width, header.height)
-    metres_per_count = sag_per_count(
-        header.scale_factor, header.wavelength, header.obliquity, header.phase_resolution, header.data_sign
-    )
-    counts = numbers(_phase_section(header, body), "phase data", pixels, np.int64)
-    sag = sag_from_counts(counts.reshape(header.height, header.width), metres_per_count)
-    return header.surface_map(sag, header.wavelength, "asc")
+    header, body = read_header(content)
+    pixels = check_size(header["width"], header["height"])
+    metres_per_count = sag_per_count(header)
+    intensities = header["intensity_width"] * header["intensity_height"] * header["intensity_buckets"]
+    counts = numbers(_phase_section(intensities, body), "phase data", pixels, np.int64)
+    sag = sag_from_counts(counts.reshape(header["height"], header["width"]), metres_per_count)
+    return zygo_map(sag, header, "asc", f"system type {header['system_type']}")
 
 
 #: Units the value column may be in, as m; None = waves of the file's wavelength.
@@ -187,9 +145,10 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
             f"xyz_unit = {what}: an .xyz file does not tell the unit of its values; must be one of "
             f"{', '.join(XYZ_UNITS)}"
         )
-    header, body = split_header(content)
-    pixels = check_size(header.width, header.height)
-    wavelength = check_wavelength(header.wavelength)
+    header, body = read_header(content)
+    width, height = header["width"], header["height"]
+    pixels = check_size(width, height)
+    wavelength = check_wavelength(header["wavelength"])
     rows, mark, rest = body[1:].partition(b"#")
     if rest.strip():
         raise MapFileError("text after the '#' that ends the data")
@@ -197,18 +156,18 @@ def parse_xyz(content: bytes, unit: str | None) -> SurfaceMap:
         raise MapFileError("the last line is not ended; the file is truncated")
     table = numbers(rows.replace(b"No Data", b"nan"), "data lines (column, row, value)", 3 * pixels, np.float64)
     column, row, value = table.reshape(pixels, 3).T
-    pixel = _grid_indices(row, header.origin[1], header.height, "row") * header.width
-    pixel += _grid_indices(column, header.origin[0], header.width, "column")
+    pixel = _grid_indices(row, header["origin_y"], height, "row") * width
+    pixel += _grid_indices(column, header["origin_x"], width, "column")
     if (np.bincount(pixel, minlength=pixels) != 1).any():
         raise MapFileError("data lines: some pixel is missing and another appears twice")
-    sag = np.empty((header.height, header.width))
+    sag = np.empty((height, width))
     sag.ravel()[pixel] = value
     if not np.isfinite(sag).any():
         raise no_valid_pixels(sag.shape)
     metres = XYZ_UNITS[unit]
     sag *= wavelength if metres is None else metres
     check_heights(sag)
-    return header.surface_map(sag, wavelength, "xyz")
+    return zygo_map(sag, header, "xyz", f"system type {header['system_type']}")
 
 
 def _grid_indices(position: NDArray[np.float64], origin: int, size: int, name: str) -> NDArray[np.intp]:
