@@ -171,36 +171,33 @@ PARAMETERS = (
 )
 
 
+def _named(kind: Any, values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The parameters called as fields of the dataclass `kind`, behind `prefix`."""
+    return {field.name: values[prefix + field.name] for field in fields(kind) if prefix + field.name in values}
+
+
 def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
     """Options of a fit from the node's parameters; `method` empty = the default."""
-    same = {field.name: values[field.name] for field in fields(FitOptions) if field.name in values}
-    return FitOptions(**same | {"method": method or FitOptions().method, "epsilon": values["epsilon"] or None})
+    return FitOptions(
+        **_named(FitOptions, values) | {"method": method or FitOptions().method, "epsilon": values["epsilon"] or None}
+    )
 
 
 def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> ProcedureOptions:
     """Options of a run from the node's parameters; `maps_per_state` 0 = 1."""
     return ProcedureOptions(
-        measure_retries=values["measure_retries"],
-        failures_max=values["failures_max"],
+        **_named(ProcedureOptions, values),
         maps_per_state=maps_per_state or 1,
-        aperture_tolerance=values["aperture_tolerance"],
         fit=fit_options(values),
-        bump=BumpOptions(
-            values["bump.tilt_max"],
-            values["bump.shift_max"],
-            values["bump.figure_max"],
-            values["hysteresis_allowance"],
-        ),
+        bump=BumpOptions(**_named(BumpOptions, values), **_named(BumpOptions, values, "bump.")),
     )
 
 
 def update_options(values: Mapping[str, Any]) -> UpdateOptions:
     """Options of updates from the node's parameters."""
     return UpdateOptions(
-        surprise_max=values["updates.surprise_max"],
-        surprises_max=values["updates.surprises_max"],
-        valid_fraction_min=values["valid_fraction_min"],
-        aperture_tolerance=values["aperture_tolerance"],
+        **_named(UpdateOptions, values),
+        **_named(UpdateOptions, values, "updates."),
         # Without a hysteresis model, an actuator may stand on any branch of its loop.
         signal_sigma=0.5 * values["hysteresis_allowance"],
         rates=DriftRates(values["updates.gain_rate"], values["updates.figure_rate"]),

@@ -56,23 +56,16 @@ class MapSet:
         if not (points.x.shape == points.y.shape == points.weight.shape and points.x.ndim == 1 and points.x.size):
             raise ValueError(f"sampling points: x {points.x.shape}, y {points.y.shape}, weight {points.weight.shape}")
         count, terms = self.coefficients.shape
-        expected = {
-            "step": (count,),
-            "signals": (count, self.signals.shape[-1]),
-            "applied": self.signals.shape,
-            "stamp_ns": (count,),
-            "sigma": (count, terms),
-            "sag": (count, self.points.x.size),
-            "residual_rms": (count,),
-            "valid_fraction": (count,),
-            "nominal": (count, terms),
-            "moved_ns": (count,),
-            "segment": (count,),
-            "temperature": (count,),
-        }
-        for name, shape in expected.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has the shape {getattr(self, name).shape}: must be {shape}")
+        expected = (
+            ((count,), ("step", "stamp_ns", "residual_rms", "valid_fraction", "moved_ns", "segment", "temperature")),
+            ((count, terms), ("sigma", "nominal")),
+            ((count, self.actuators), ("signals", "applied")),
+            ((count, points.x.size), ("sag",)),
+        )
+        for shape, names in expected:
+            for name in names:
+                if getattr(self, name).shape != shape:
+                    raise ValueError(f"{name} has the shape {getattr(self, name).shape}: must be {shape}")
         for name in ("label", "kind", "file", "sha256"):
             if len(getattr(self, name)) != count:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries: must be {count}")

@@ -227,16 +227,13 @@ def _weak(size: Floats, height: Floats, ring: Indices, counted: NDArray[np.bool_
 
 def cycles(place: Indices) -> list[tuple[int, ...]]:
     """The cycles of a permutation that are longer than 1, each from its smallest member on."""
-    found = []
-    seen: set[int] = set()
+    found: list[tuple[int, ...]] = []
     for start in range(place.size):
-        cycle = []
-        at = start
-        while at not in seen:
-            seen.add(at)
+        cycle, at = [start], int(place[start])
+        while at > start:
             cycle.append(at)
             at = int(place[at])
-        if len(cycle) > 1:
+        if at == start and len(cycle) > 1:
             found.append(tuple(cycle))
     return found
 

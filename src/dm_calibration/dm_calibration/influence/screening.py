@@ -19,26 +19,21 @@ DROPPED_MAX = 0.25
 
 def unusable(maps: MapSet, valid_fraction_min: float) -> list[str]:
     """Reason for which each map cannot enter a fit; "" = it can."""
-    terms_finite = np.asarray(np.isfinite(maps.coefficients).all(axis=1))
-    applied_finite = np.asarray(np.isfinite(maps.applied).all(axis=1))
-    infinite = np.asarray(np.isinf(maps.sag).any(axis=1))
-    missing = np.isnan(maps.sag).mean(axis=1)
     reasons = []
-    for i in range(len(maps)):
-        reason = ""
-        if not terms_finite[i]:
+    for coefficients, applied, sag, valid in zip(
+        maps.coefficients, maps.applied, maps.sag, maps.valid_fraction, strict=True
+    ):
+        reason, missing = "", np.isnan(sag).mean()
+        if not np.isfinite(coefficients).all():
             reason = "a Zernike coefficient is not finite"
-        elif not applied_finite[i]:
+        elif not np.isfinite(applied).all():
             reason = "an applied signal is not finite"
-        elif infinite[i]:
+        elif np.isinf(sag).any():
             reason = "a sag sample is infinite"
-        elif not maps.valid_fraction[i] >= valid_fraction_min:
-            reason = (
-                f"too few valid pixels: {maps.valid_fraction[i]:.1%} of the aperture, "
-                f"at least {valid_fraction_min:.0%} are needed"
-            )
-        elif missing[i] > MISSING_POINTS_MAX:
-            reason = f"{missing[i]:.1%} of the sampling points have no data, at most {MISSING_POINTS_MAX:.0%} may"
+        elif not valid >= valid_fraction_min:
+            reason = f"too few valid pixels: {valid:.1%} of the aperture, at least {valid_fraction_min:.0%} are needed"
+        elif missing > MISSING_POINTS_MAX:
+            reason = f"{missing:.1%} of the sampling points have no data, at most {MISSING_POINTS_MAX:.0%} may"
         reasons.append(reason)
     return reasons
 

@@ -145,15 +145,11 @@ def solve_shape(
 
 def largest_step(start: Floats, direction: Floats, mirror: Mirror) -> float:
     """Largest t >= 0 for which start + t direction keeps the range and the neighbour limit; 0 when start breaks one."""
-    value, slope = start, direction
-    limits = mirror.limits
-    limit_high, limit_low = np.full(start.size, limits.high), np.full(start.size, limits.low)
-    if limits.pairs.size:
-        a, b = limits.pairs.T
-        most = np.full(a.size, limits.neighbour_difference)
-        value, slope = np.append(value, start[a] - start[b]), np.append(slope, direction[a] - direction[b])
-        limit_high, limit_low = np.append(limit_high, most), np.append(limit_low, -most)
-    room = np.where(slope > 0, limit_high - value, value - limit_low)
+    limits, (a, b) = mirror.limits, mirror.limits.pairs.T
+    value, slope = np.append(start, start[a] - start[b]), np.append(direction, direction[a] - direction[b])
+    high = np.append(np.full(start.size, limits.high), np.full(a.size, limits.neighbour_difference))
+    low = np.append(np.full(start.size, limits.low), np.full(a.size, -limits.neighbour_difference))
+    room = np.where(slope > 0, high - value, value - low)
     moving = np.abs(slope) > 1e-12
     if not moving.any():
         return 0.0

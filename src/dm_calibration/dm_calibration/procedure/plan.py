@@ -54,12 +54,10 @@ class Step:
 
     Attributes:
         label: unique in the plan.
-        kind: see StepKind.
         signals: (N,) to command; None for a degauss, and for a surface that is solved when its turn comes. Of a check,
             what it bends the mirror by when the figure is flat: see :func:`check_shape`.
         nominal: (21,) coefficients aimed at, m; None when signals are prescribed.
         dwell: to hold the shape beyond the settle time, s.
-        settle_share: of the settle time to wait.
     """
 
     label: str
@@ -83,7 +81,6 @@ class PlanOptions:
         poke_amplitude: half-swing of a push-pull poke, normalised.
         reference_every: steps between two reference frames.
         surfaces: names of Table 1; empty = all.
-        degauss: whether to start with a degauss.
         hysteresis_maps: commands of a hysteresis plan, at most.
         until: accuracy at which a hysteresis plan may end, m; 0 = never before its end.
     """
@@ -248,15 +245,8 @@ def _surfaces(names: Sequence[str], mirror: Mirror, asked: bool, remarks: list[s
 def _with_references(states: Sequence[Step], mirror: Mirror, every: int) -> list[Step]:
     """`states` with a reference frame before, after each `every` steps, and after the last."""
     steps: list[Step] = []
-    frames = 0
-
-    def reference() -> Step:
-        nonlocal frames
-        frames += 1
-        return Step(f"reference {frames}", StepKind.REFERENCE, mirror.rest)
-
-    for i, state in enumerate(states):
-        if i % every == 0:
-            steps.append(reference())
-        steps.append(state)
-    return [*steps, reference()]
+    begins = [*range(0, len(states), every), len(states)]
+    for number, begin in enumerate(begins, start=1):
+        steps.append(Step(f"reference {number}", StepKind.REFERENCE, mirror.rest))
+        steps += states[begin : begin + every]
+    return steps
