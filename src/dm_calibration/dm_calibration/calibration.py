@@ -55,20 +55,14 @@ class Calibration:
 
     Attributes:
         id: unique name, also the file's stem.
-        mirror_name, mirror_serial: the mirror measured.
         wavelength: m; 0 = the maps did not tell.
         aperture_radius: m.
         created_ns: time of writing, ns since the epoch of the node's clock.
-        software_version: of dm_calibration.
         actuator_x, actuator_y: (N,) m, positions in the configuration at the time of measuring.
-        maps: the raw data.
-        fit: the result.
         dropped: "label: reason" of the states that gave no map at all.
         targets: the shapes that were solved from an influence function; their coefficients are maps.nominal.
         limitations: sentences; those of the fit, of the run, and of the poke check.
-        note: the user's.
         hysteresis: hysteresis and creep; with it, `fit` acts on effective signals. None = not identified.
-        recipes: built on this calibration.
         reference_surface: the map that was subtracted from all others as the instrument's error, and its SHA-256; "" =
             none.
         instrument_error: 95 % bound on what is left of the instrument's error in a coefficient, m; 0 = not known.

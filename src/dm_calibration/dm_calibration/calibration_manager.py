@@ -20,7 +20,6 @@ class CalibrationManager:
     """Shared by the topics, services and the action of the node; every method may be called from any thread.
 
     Attributes:
-        store: the folder of calibration files.
         mirror: that the driver describes; None before it did.
         in_use: the calibration in use; None = there is none.
     """

@@ -92,7 +92,6 @@ def put_updates(
     """What later maps have shown, into the `message` of the calibration that they update.
 
     Args:
-        fit: the influence function as it is now.
         doubts: sentences, added to the known limitations.
         mirror_changed: the calibration no longer counts as CALIBRATED.
         disagreement: largest coefficient error that maps have shown since one last agreed, m: no bound is below it.

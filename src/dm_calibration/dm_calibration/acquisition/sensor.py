@@ -56,9 +56,7 @@ class SensorAcquisition:
     """Takes the first measurement that was begun after a request; those between requests are let go.
 
     Args:
-        source: what the sensor is called.
         read: makes a map of its aperture, and what was found in it, of what the sensor has seen.
-        now_ns: the clock of its stamps.
     """
 
     #: The sensor leaves no files.

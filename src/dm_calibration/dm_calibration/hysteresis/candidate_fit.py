@@ -98,7 +98,6 @@ class Run:
     Attributes:
         signals: (M, N) as applied.
         time: (M,) s, of the maps, rising.
-        responses: what was measured.
         start: s, when the degauss had ended; None = just before the first map.
         moved: (M,) s, when the mirror took each shape; None = right after the map before.
         segment: (M,) changes where the run was resumed with a degauss; None = it was not interrupted.
@@ -156,7 +155,6 @@ class LawFit:
     """A candidate fitted to some rows of a run.
 
     Attributes:
-        candidate: which.
         law: with effective signals that span 2 in a full cycle.
         residual: (M, D) of all rows, those left out included; units of `Responses.values`.
     """

@@ -30,8 +30,6 @@ class HysteresisFit:
     """Hysteresis and creep of one mirror.
 
     Attributes:
-        name: class of the law.
-        law: see :class:`~dm_common.hysteresis.model.HysteresisModel`.
         zernike_sigma: (K,) m, standard deviation of the coefficients of a predicted move, on maps that had no part in
             the fit, the maps' own noise taken off; 0 for piston and tilt.
         held_out_max_zernike: m, 95th percentile of the largest of them.
@@ -55,9 +53,6 @@ def fit_hysteresis(
     """Identify the law from the maps of one run, in the order measured, which begins with a degauss.
 
     Maps of kind CHECK test the law before they join the final fit.
-
-    Args:
-        candidates: classes of laws to choose from.
 
     Raises:
         ExcitationError: the maps do not show hysteresis.

@@ -90,7 +90,6 @@ class OwnLaws:
     """Laws of each actuator on one run: features once, then fits to any of its rows.
 
     Args:
-        run: what was commanded and measured.
         candidate: play operators and orders of the Legendre series.
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.

@@ -40,7 +40,6 @@ class FitOptions:
 
     Attributes:
         method: a name of METHODS.
-        folds: of the cross-validation.
         epsilon: m^2, above 0, the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
         valid_fraction_min: least share of valid pixels in the aperture of a map.
         outlier_sigmas: residual, in robust sigmas above the median, beyond which a map is an outlier.
@@ -76,12 +75,10 @@ class InfluenceFit:
     """An influence function with its quality. N actuators, K Zernike terms, P sampling points, M maps.
 
     Attributes:
-        method: name of the method.
         influence_zernike: (K, N) m per unit signal; columns of actuators that never moved are 0.
         zernike_offset: (K,) m, figure at zero signals, averaged over the run.
         influence_sag: (P, N) m per unit signal, piston and tilt removed.
         sag_offset: (P,) m, piston and tilt removed.
-        points: the sampling points.
         signal_min, signal_max: range of applied signals in the maps used.
         used: (M,) which maps entered the fit.
         reasons: (M,) why not; "" for those used.
@@ -139,7 +136,6 @@ def fit_influence(
     Args:
         rings: (N,) ring of each actuator, for the grades; None = all are compared with each other.
         limits: of the signals, where hysteresis is not followed: the error allows for it; None = it does not.
-        exclude: labels of maps to leave out.
 
     Raises:
         UnknownNameError: an unknown method or label, listing the near ones.

@@ -129,7 +129,6 @@ def loop_share(left: Floats, moved: Floats, weight: Floats, tested: NDArray[np.b
 
     Args:
         left, moved: (M, P) m, sag of the held-out residuals, and that the signals make from mid range on.
-        weight: (P,) of the points.
         tested: (M,) which maps count.
         allowance: share of an actuator's move by which it may miss.
     """
@@ -174,9 +173,7 @@ def limitations(good: MapSet, design: Design, grades: NDArray[np.uint8], tilt_kn
     """What a user of an influence function fitted to the maps `good` must know, in sentences.
 
     Args:
-        design: of these maps.
         grades: (N,) GRADE_*.
-        tilt_known: whether the maps show the mirror's tilt.
         untested: number of maps that the cross-validation could not judge.
     """
     if EXCITATION in good.kind:

@@ -45,7 +45,6 @@ class RegionWeighting:
         score: (E,) m, held-out rms surface error of each, mean square over maps and regions.
         score_unweighted: m, the same with all weights 1.
         surfaces: number of surfaces that the variances are taken over.
-        folds: of the cross-validation.
     """
 
     variance: Floats

@@ -44,7 +44,6 @@ class MapFit:
             pixel. Print-through and air turbulence are correlated, so the true uncertainty is larger.
         residual_rms: what the terms leave unexplained over the valid pixels.
         valid_fraction: valid pixels / pixels inside the aperture.
-        valid_pixels: number of pixels used.
     """
 
     coefficients: Floats

@@ -27,7 +27,6 @@ class ProcedureOptions:
     Attributes:
         measure_retries: further tries after a measurement that failed.
         failures_max: states in a row without a map after which the run is given up.
-        maps_per_state: maps taken in each commanded state.
         aperture_tolerance: largest relative deviation of a map's aperture radius from the mirror's.
         fit: options of the fit that the surfaces with a prescribed shape are solved from.
         bump: what reference frames may differ by.

@@ -59,7 +59,6 @@ class MapTaken:
     """A map was measured.
 
     Attributes:
-        record: of it.
         radius_known: whether it tells its aperture radius.
         centre: of the aperture on the map, m; NaN = not known.
     """
@@ -109,13 +108,9 @@ class Outcome:
     """What a run has measured so far.
 
     Attributes:
-        records: the maps, in order.
         setup: what all of them share; None before the first.
-        radius_known: whether the maps tell their aperture radius.
         dropped: "label: reason" of each map or state that gave none.
         remarks: what was measured differently than asked.
-        targets: the shapes that were solved.
-        segment: number of the present segment: see :class:`Segment`.
         centres: of the aperture on each map of `records`, m; NaN = not known.
     """
 

@@ -35,7 +35,6 @@ class Move:
     Attributes:
         stamp_ns: when its end was written to the electronics.
         requested, applied: (N,) as the driver reported.
-        degauss: whether it was a degauss.
     """
 
     stamp_ns: int
@@ -49,11 +48,8 @@ class RecordedRun:
     """One run of the action `calibrate`.
 
     Attributes:
-        mirror: as the driver described it.
-        moves: in order.
         maps: in the order of their stamps.
         labels: of the steps that feedback told of, by step.
-        steps: of the plan.
         model: of the calibration in use when it began; None = none.
     """
 

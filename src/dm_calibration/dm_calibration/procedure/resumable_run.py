@@ -28,7 +28,6 @@ class OpenRun:
     """A run with its journal.
 
     Attributes:
-        outcome: so far.
         storing: the calibration it may have been stored as already; None = it had not come so far.
         resumed: what it goes on from; "" = it begins.
         notes: what became of other unfinished runs.

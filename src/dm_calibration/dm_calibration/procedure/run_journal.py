@@ -36,7 +36,6 @@ class Kept:
 
     Attributes:
         folder: of the journal; its name is the run's.
-        outcome: the run so far.
         maps: measured, those in doubt included.
         last_ns: wall time of the last write, ns since the epoch.
         storing: the calibration that was about to be stored; None = the run had not come so far.

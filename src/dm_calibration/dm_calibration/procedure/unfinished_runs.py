@@ -64,7 +64,6 @@ class UnfinishedRuns:
         """The journal of a new run.
 
         Args:
-            identity: what a goal must share to go on with this run.
             about: what is kept for people.
 
         Raises:

@@ -156,7 +156,6 @@ class Comparison:
         rms: m rms of the difference in sag, piston and tilt removed.
         surprise: difference over its expected size: about 1 when all is well. The larger of two: root mean square over
             all values, and the largest single one over the largest to be expected of so many.
-        updated: the drift with this map taken in.
         displaced: {index: effective signal more than there should be} of the actuators that the difference comes from,
             the worst first, where a few of them explain it: one that sticks, say.
         probability: {index: of each of them, against any other actuator and against a map that is bad all over}.

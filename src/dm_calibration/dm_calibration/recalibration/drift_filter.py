@@ -81,7 +81,6 @@ class DriftFilter:
         maps: what it was fitted to: shows how far a map scatters about its prediction.
         hysteresis: None = not identified.
         signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
-        rates: see there.
 
     Raises:
         ValueError: the maps of a hysteresis model have time stamps that run backwards.

@@ -51,7 +51,6 @@ class MapListener:
     """Gives maps that arrive to :class:`RecalibrationManager` and publishes what they change.
 
     Args:
-        services: measure for the service.
         busy: whether a calibration is running; its maps are not taken.
     """
 

@@ -44,7 +44,6 @@ class UpdateOptions:
         valid_fraction_min: least share of valid pixels.
         aperture_tolerance: largest relative deviation of a map's aperture radius from the calibration's.
         signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
-        rates: how fast the mirror is expected to change.
     """
 
     surprise_max: float = 3.0
@@ -73,7 +72,6 @@ class RecalibrationManager:
     """Updates of the calibration in use; every method may be called from any thread.
 
     Args:
-        folder: of the calibration files.
         options: asked for at every map; its rates and signal_sigma at every new calibration.
     """
 
@@ -172,7 +170,6 @@ class RecalibrationManager:
         """Compare a map of the mirror at `settled` with the calibration, and take it in when it agrees.
 
         Args:
-            dry_run: compare only.
             without: indices of actuators that do not move any more: from now on without effect, standing where the
                 map shows them.
 

@@ -186,7 +186,6 @@ def files(calibration: Calibration, file: str, sha256: str) -> Section:
 
     Args:
         file: name of the calibration's; "" = not stored.
-        sha256: of it.
     """
     maps = calibration.maps
     rows = [

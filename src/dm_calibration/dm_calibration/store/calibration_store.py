@@ -44,7 +44,6 @@ class CalibrationStore:
     """Calibrations of one folder, one file ``<id>.h5`` each.
 
     Args:
-        folder: of the files.
         written: called with each file that was stored or replaced.
     """
 
