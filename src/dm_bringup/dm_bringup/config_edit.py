@@ -1,7 +1,5 @@
 """Change values in a parameter file and leave all else as it is: comments, order, spelling."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

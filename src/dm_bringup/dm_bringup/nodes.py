@@ -3,8 +3,6 @@
 Standard library only, for `./dm` takes the environment of the nodes from here before it has one.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass

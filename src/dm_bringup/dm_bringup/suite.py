@@ -1,7 +1,5 @@
 """Start and stop the nodes of the suite as processes, where `ros2 launch` is not at hand."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

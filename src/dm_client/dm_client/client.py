@@ -8,8 +8,6 @@ with DeformableMirrorClient() as mirror:
     print(f"{state.predicted_rms * 1e9:.1f} nm rms expected")
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType

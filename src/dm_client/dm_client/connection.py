@@ -1,7 +1,5 @@
 """One node in a thread of its own, for code that calls and waits: the latest messages, services, actions."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import time

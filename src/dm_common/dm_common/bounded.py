@@ -16,8 +16,6 @@ rms instead of 6).
 Clipping the unconstrained solution instead can double the residual of a saturated sphere.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular

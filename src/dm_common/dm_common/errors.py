@@ -1,7 +1,5 @@
 """What can go wrong with a request, and the code that answers it. Knows no ROS."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figures in sentences."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

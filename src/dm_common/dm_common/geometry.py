@@ -1,7 +1,5 @@
 """Where the actuators are, in the mirror surface frame (x right, y up, metres), and which are neighbours."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

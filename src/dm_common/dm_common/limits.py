@@ -1,7 +1,5 @@
 """What the signals of a mirror must keep to: a range for each, and how far neighbours may differ."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 

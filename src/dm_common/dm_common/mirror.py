@@ -1,7 +1,5 @@
 """Geometry and limits of a mirror, and whether a calibration belongs to it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names that nobody knows, answered with those that come near."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable
 

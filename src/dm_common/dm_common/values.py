@@ -1,7 +1,5 @@
 """What a parameter, or a field of a request, may be: declared in tables, checked in one place. Knows no ROS."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ A degauss that was begun goes on: a newer order takes the place of the one that 
 at mid range with its history known. Steady times, s, are given with each call.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ a small part of a small correction. When the history gets lost during a hold, th
 state says nothing of where the shape stands.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any

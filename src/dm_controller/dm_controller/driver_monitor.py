@@ -4,8 +4,6 @@ A driver that is stopped or was killed tells nobody: its last report says for ev
 old here, by the steady clock, and a command that no report confirms is reported.
 """
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections import deque

@@ -5,8 +5,6 @@ creep, a degauss on the way and the order that waits for it. Whoever drives it c
 out the effects in the order given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

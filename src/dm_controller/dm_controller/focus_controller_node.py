@@ -3,8 +3,6 @@
 Translates messages, parameters and time; what happens is decided in `dm_controller.focus_controller`.
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """Between the messages of the focus controller's node and the types it works with."""
 
-from __future__ import annotations
-
 import array
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Parameters of the node `focus_controller`, and what the fields of its goals may be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

@@ -1,7 +1,5 @@
 """What goes into the focus controller and what comes out of it, without ROS."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ fetched once per calibration, in the background; what they hold beyond the influ
 of hysteresis, which then only has to be looked up.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any

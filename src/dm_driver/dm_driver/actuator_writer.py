@@ -3,8 +3,6 @@
 The latest command wins. A move is cut into steps by the safety limiter and written by `dm_driver.writer_thread`.
 """
 
-from __future__ import annotations
-
 import math
 import time
 

@@ -1,7 +1,5 @@
 """The decaying cycle that wipes a piezo's hysteresis (docs/protocols.md, degauss)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

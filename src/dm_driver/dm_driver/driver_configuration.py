@@ -1,7 +1,5 @@
 """From parameter values to the parts of the driver; everything that can contradict itself is found here."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The driver's health on /diagnostics, and what it logs of the link."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

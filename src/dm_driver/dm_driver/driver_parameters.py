@@ -1,7 +1,5 @@
 """Parameters of the node `pdm_driver`."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -8,8 +8,6 @@ Two slots are written in turn, each with a check sum, so that one is whole at an
 what a killed process wrote; only a crash of the whole computer may lose the last seconds.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import struct

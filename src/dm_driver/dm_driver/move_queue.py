@@ -1,7 +1,5 @@
 """The move under way, the newest one behind it, and what the mirror's hysteresis remembers of their ends."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from dm_driver.moves import Kind, Move, Outcome

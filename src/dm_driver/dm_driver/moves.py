@@ -1,7 +1,5 @@
 """What the actuator writer is asked to do, and what it reports about itself."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ commands, `deactivate` ramps to the safe shape. A unit that cannot be reached do
 reports the lost link and keeps trying, so that the order in which things are switched on does not matter.
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -5,8 +5,6 @@ are convex: a straight line between two legal shapes stays legal. A move is ther
 steps, may be left for a new target at any of them, and every shape on the way is as safe as its ends.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

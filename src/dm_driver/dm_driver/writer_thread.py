@@ -4,8 +4,6 @@ It writes one step of the current move after the other, paced so that the slew r
 a newer one. After a lost link it tries to reconnect once a second and then writes the last shape again.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -8,8 +8,6 @@ Actuators may have polynomials of their own, and others on falling than on risin
 The equation has no u in it, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -10,8 +10,6 @@ where that led further away, on the way to it, until a round gains nothing. Chan
 they end: else signals go far for what the surface hardly shows, such as piston. Each round ends inside the limits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache

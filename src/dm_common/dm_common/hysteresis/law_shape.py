@@ -1,7 +1,5 @@
 """What a law is over the whole range of the signals: how steep at least, how far it reaches, and its loops."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

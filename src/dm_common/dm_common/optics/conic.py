@@ -1,7 +1,5 @@
 """Conic surfaces about the axis, Eq. (2) in [1], and their Zernike coefficients."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Piston and tilt, which the interferometer's alignment adds: of maps, and of sag vectors at the sampling points."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dm_common import Floats

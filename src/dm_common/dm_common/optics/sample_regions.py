@@ -8,8 +8,6 @@ disc of a given area holds of each point the part of that annulus that lies insi
 this is exact, as it is for uniform points, whose weights are equal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sampling points on the unit disc and the rule of [1], section 2.2, for reading a map at them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

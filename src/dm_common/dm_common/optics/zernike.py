@@ -5,8 +5,6 @@ is that of [1]: n rising, m rising, cosine before sine. x points right, y up, th
 have the unit of the sag they describe (m).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Clients for threads that may wait: of services, of actions, and one that holds the mirror against others."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

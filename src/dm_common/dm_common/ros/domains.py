@@ -1,7 +1,5 @@
 """ROS domains for runs that must not meet others on the same machine, and who holds what one wants for oneself."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

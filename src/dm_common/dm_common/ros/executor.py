@@ -15,8 +15,6 @@ with care (measured with rclpy 7.1.6):
   turns SIGINT and SIGTERM into an orderly end instead.
 """
 
-from __future__ import annotations
-
 import fcntl
 import gc
 import os

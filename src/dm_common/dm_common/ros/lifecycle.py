@@ -1,7 +1,5 @@
 """Lifecycle nodes, and the health of a node on `/diagnostics` (the Python diagnostic_updater is not on PyPI)."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

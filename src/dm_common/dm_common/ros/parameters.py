@@ -4,8 +4,6 @@ The table declares the parameters, checks every value (at start and on `ros2 par
 parameter pages of the documentation.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from array import array

@@ -5,8 +5,6 @@ for every publisher with a lease, whatever is published; so the nodes that other
 who wait watch it here: they know within a second, also after kill -9.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

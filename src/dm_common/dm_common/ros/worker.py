@@ -5,8 +5,6 @@ thread; its outcome is handed back to the executor, which sends the response. Wh
 undisturbed and nothing polls.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 import traceback

@@ -4,8 +4,6 @@ The host judges the request as for an open-loop move and knows calibration and m
 `dm_controller.converge.closed_loop`; driver and interferometer are reached through services.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -4,8 +4,6 @@ Neighbouring shapes have about the same defect, so that of a shape is estimated 
 (`planning.recipes.Kriging`), each as sure as the noise of its maps permits.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

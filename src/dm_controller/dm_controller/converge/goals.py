@@ -1,7 +1,5 @@
 """Goals of `converge` and `build_recipes`: what is checked before anything moves, and how they end."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

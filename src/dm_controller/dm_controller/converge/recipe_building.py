@@ -8,8 +8,6 @@ from all rounds so far (`converge.defects`): most shapes are right at once, and 
 re-measures them. In the end each recipe rests on its neighbours' maps too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol

@@ -4,8 +4,6 @@ Recipes that are whole are stored however the goal ends: on a failure of the ben
 The mirror goes back to mid range.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

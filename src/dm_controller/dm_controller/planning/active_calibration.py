@@ -1,7 +1,5 @@
 """The calibration in use: whether it belongs to the mirror at hand, and what moves are planned with."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which way to a shape, where there is a choice: at once from where the mirror stands, or after a degauss."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """How far off a shape may be by creep that is not known: of the first second, of hours, and of what was held unseen."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -13,8 +13,6 @@ As a short power series in the radius, all that is linear in the sag of a conic 
 terms are exact to rounding.
 """
 
-from __future__ import annotations
-
 from functools import cache, partial
 
 import numpy as np

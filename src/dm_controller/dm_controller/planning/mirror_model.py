@@ -1,7 +1,5 @@
 """A calibrated mirror: predicts the surface of a command and finds the command of a surface, before anything moves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ exponential covariance) serves every shape near recipes, of whatever kind. How l
 model promises and from what the recipes show: their corrections, and what is missed of each when it is left out.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The methods that closed loops offer: least squares, with and without the limits of the actuators."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

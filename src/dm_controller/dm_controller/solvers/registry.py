@@ -1,7 +1,5 @@
 """The solvers that closed loops offer, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 from numpy.typing import ArrayLike

@@ -1,7 +1,5 @@
 """What every command passes on its way to the writer: is the driver configured, who holds the mirror. Knows no ROS."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar

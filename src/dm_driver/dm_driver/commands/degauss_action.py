@@ -1,7 +1,5 @@
 """The body of the action `degauss`."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Any

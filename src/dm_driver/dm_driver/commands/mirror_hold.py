@@ -5,8 +5,6 @@ it: commands of others are refused, with a sentence that says who holds it, for 
 renewed all the time and ends soon after its holder has died. Taking it over is explicit.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

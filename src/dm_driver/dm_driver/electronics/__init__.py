@@ -4,8 +4,6 @@ A further drive unit is one subclass of :class:`~dm_driver.electronics.base.Driv
 `BACK_ENDS`; a serial one that takes whole frames needs neither, see :mod:`dm_driver.electronics.frame_format`.
 """
 
-from __future__ import annotations
-
 from dm_driver.electronics.base import DriveElectronics, ElectronicsSettings
 from dm_driver.electronics.edac40 import Edac40Tcp, Edac40Udp
 from dm_driver.electronics.framed_serial import FramedSerial

@@ -1,7 +1,5 @@
 """What every drive unit offers: a number of output channels that take integer codes, and a link that can break."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable

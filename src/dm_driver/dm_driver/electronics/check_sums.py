@@ -4,8 +4,6 @@ CRC parameters: Williams, "A Painless Guide to CRC Error Detection Algorithms"; 
 catalogue of parametrised CRC algorithms (Cook).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce

@@ -1,7 +1,5 @@
 """List the EDAC40 units on the network: `python -m dm_driver.electronics.discover [--address A] [--port P]`."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Discovery of EDAC40 units: one UDP question, one answer per unit (docs/protocols.md, discovery)."""
 
-from __future__ import annotations
-
 import re
 import select
 import socket

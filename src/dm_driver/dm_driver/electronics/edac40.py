@@ -4,8 +4,6 @@ The unit acknowledges nothing and cannot be read back. Only command 0 (value) is
 offset live in its non-volatile memory and shift every voltage.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import socket

@@ -6,8 +6,6 @@ A word is `offset + scale * code`, in two's complement when negative. Words foll
 `word_bits` 16 each has two bytes, with 12 two words share three.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

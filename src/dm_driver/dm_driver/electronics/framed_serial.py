@@ -1,7 +1,5 @@
 """Any drive unit that takes whole frames over a serial line, described by parameters alone."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -4,8 +4,6 @@ That program takes a pattern of numbers from 0 to 1, one for each actuator, and 
 are these numbers (0 and 1 at the ends, `amplifier_gain` 1), since the volts behind them cannot be known here.
 """
 
-from __future__ import annotations
-
 import select
 from collections.abc import Callable
 from typing import Any

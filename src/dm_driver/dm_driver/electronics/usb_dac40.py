@@ -1,7 +1,5 @@
 """USB DAC-40: 40 channels, 12 bit, behind an FTDI virtual serial port (docs/protocols.md, USB DAC-40)."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

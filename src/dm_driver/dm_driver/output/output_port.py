@@ -1,7 +1,5 @@
 """One drive unit as the writer sees it: shapes go in, what then stands at the actuators comes back."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

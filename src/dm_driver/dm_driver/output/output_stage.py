@@ -1,7 +1,5 @@
 """From a shape in actuator order to the codes of all connector channels, and back to what stands at the actuators."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ attract a membrane with the square of the voltage. The amplifier divides by its 
 between its voltages at code 0 and at full scale.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

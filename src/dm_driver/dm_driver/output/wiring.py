@@ -1,7 +1,5 @@
 """Which connector channel drives which actuator (docs/protocols.md, wiring)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from typing import Final
