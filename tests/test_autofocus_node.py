@@ -6,6 +6,7 @@ import array
 import io
 import math
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -202,6 +203,16 @@ def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer:
     assert found.curvature == pytest.approx(0.0173, abs=depth_of_focus(lens.aperture_radius) / 2)
     assert found.images <= 10 and len(scene.requests) <= found.images + 1, "nothing is passed without an image"
 
+    scene.info.publish(CameraInfo(k=[lens.focal_length_px / 2, *8 * [0.0]]))
+    time.sleep(0.3)
+    contradicted = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert contradicted.error_code == ErrorCode.OK, contradicted.message
+    fits, given = lens.focal_length_px, lens.focal_length_px / 2
+    assert f"would fit a focal length of {fits:.0f} px, {given:.0f} px is given (optics.focal_length_px, or fx" in (
+        contradicted.message
+    )
+    known()
+    time.sleep(0.3)
     handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
     wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
     tracked = len(scene.states)
@@ -269,8 +280,40 @@ def test_compressed_images_are_taken_as_they_come(start: Start, observer: Observ
 def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer) -> None:
     scene.stamped = False
     wait_until(lambda: scene.states[-1].header.stamp.sec == 0, what="an image without a stamp")
-    found = observer.run_goal(FocusStack, "focus_stack", FocusStack.Goal()).result
-    assert found.error_code == ErrorCode.TIMEOUT and "no stamp" in found.message
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == ErrorCode.TIMEOUT and "no header.stamp" in found.message
+
+
+@pytest.mark.parametrize(
+    ("rate", "code", "text"),
+    [(4.0, ErrorCode.TIMEOUT, r"image_timeout = 0.1 s: .* one in 0.2\d* s; image_timeout must be above 0.5"),
+     (1000.0, ErrorCode.OK, "sharpest at")],
+)  # fmt: skip
+def test_a_slow_camera_is_named_and_a_fast_one_is_no_harm(
+    start: Start, observer: Observer, rate: float, code: int, text: str
+) -> None:
+    with FilmedScene(observer, object_curvature=0.0173, rate=rate) as played:
+        start("dm_autofocus", "autofocus", {**PARAMETERS, "image_timeout": 0.1})
+        wait_until(lambda: played.states, 60, "the first figure of an image")
+        found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert found.error_code == code and re.search(text, found.message), found.message
+
+
+def test_what_is_wrong_with_a_goal_or_the_images_is_named(scene: FilmedScene, observer: Observer) -> None:
+    """Field, value and allowed range; and the node goes on with the next goal."""
+    top, nothing = np.full((48, 64), 255, np.uint8), np.zeros((48, 64), np.uint8)
+    for goal, image, code, text in (
+        ({"region": [0.5, 0.0, 0.9, 1.0]}, None, ErrorCode.OUT_OF_RANGE, r"region = \[0.5, 0.0, 0.9, 1.0\].* 0 to 1"),
+        ({"region": [0.5, 0.5, 1.5, 0.1]}, None, ErrorCode.OUT_OF_RANGE, r"region\[2\] = 1.5.* 0 to 1"),
+        ({"region": [0.0, 1.0, 0.5]}, None, ErrorCode.INVALID_LENGTH, "region has 3 values: must have 0 or 4"),
+        ({"region": [0.5, 0.5, 0.01, 0.01]}, None, ErrorCode.INVALID_ARGUMENT, r"region = .* 1 x 1 px .* 3 x 3"),
+        ({"curvature_max": 0.2}, None, ErrorCode.OUT_OF_RANGE, r"curvature_max = .*\+0.2000 1/m: .* \+0.0498 1/m"),
+        ({}, top, ErrorCode.NOT_CONVERGED, "100 % of its pixels have the largest value, 255"),
+        ({}, nothing, ErrorCode.NOT_CONVERGED, "the image is black"),
+    ):
+        scene.render = None if image is None else lambda _curvature, image=image: image
+        found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal(**goal)).result
+        assert found.error_code == code and re.search(text, found.message), (goal, found.error_code, found.message)
 
 
 def test_what_the_controller_refuses_is_left_out(scene: FilmedScene, observer: Observer) -> None:

@@ -101,8 +101,8 @@ def find_boresight(see: Callable[[float, Floats], NDArray], focus: float, step: 
         raise BoresightError(
             f"the picture does not follow the mirror's tilt: two equal tilts move it by {np.hypot(*by_x):.2f} and "
             f"{np.hypot(*by_y):.2f} px, with an uncertainty of {max(sigma_x.max(), sigma_y.max()):.2f} px; is "
-            "hold_tilt of the focus controller off, does the calibration not know where the actuators are, or is there "
-            "nothing to see in the region?"
+            "hold_tilt of the focus controller off, does the calibration not know where the actuators are or come from "
+            "maps whose tilt was removed, or is there nothing to see in the region?"
         )
     drift, sigma = moved(step, np.zeros(2))
     return Boresight(scale / (2 * TILT), drift / (2 * step), sigma / (2 * step))

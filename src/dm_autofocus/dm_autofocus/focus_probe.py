@@ -88,6 +88,7 @@ class FocusProbe:
         self._asked: deque[float] = deque(maxlen=8)  # answers to these are our own, however late
         self._other_request: float | None = None  # of another node, while held [1/m]
         self._measuring = False
+        self._apart = 0.0  # the stamps of the latest two images [s]
         self._fresh: Image | CompressedImage | None = None
         self._request = node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self._hold = MirrorHolder(node, node.get_name())
@@ -122,7 +123,8 @@ class FocusProbe:
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         with self._changed:
-            self.newest = message
+            before, self.newest = self.newest, message
+            self._apart = seconds(message.header.stamp) - seconds(before.header.stamp) if before is not None else 0.0
             if not (self._measuring and self._gate.open_for(seconds(message.header.stamp))):
                 self.dropped += 1
                 return
@@ -246,7 +248,11 @@ class FocusProbe:
         try:
             while len(samples) < self._values["images_per_step"]:
                 if not self._wait(lambda: self._fresh is not None, self._values["image_timeout"], stop):
-                    raise Refusal(ErrorCode.TIMEOUT, self._no_image_reason())
+                    limit = self._values["image_timeout"]
+                    newest = None if self.newest is None else seconds(self.newest.header.stamp)
+                    reason = self._gate.reason(newest, self._apart, limit)
+                    text = f"no image of the settled focus on {self.topic} within image_timeout = {limit:g} s: {reason}"
+                    raise Refusal(ErrorCode.TIMEOUT, text)
                 with self._changed:
                     message, self._fresh = self._fresh, None
                 if message is None:
@@ -286,14 +292,3 @@ class FocusProbe:
                     return False
                 self._changed.wait(0.05)  # `stop` gives no notice
         return True
-
-    def _no_image_reason(self) -> str:
-        text = f"no image of the settled focus on {self.topic} within {self._values['image_timeout']:g} s: "
-        if self.newest is None:
-            return text + "none came at all; is the camera running?"
-        if seconds(self.newest.header.stamp) == 0:
-            return text + "they carry no stamp, so nobody knows which focus they show"
-        early = self._gate.settled_at - seconds(self.newest.header.stamp)
-        if early > 0:
-            return text + f"the newest is stamped {early:.3f} s before the shape stood; do the clocks agree?"
-        return text + "they stopped coming"

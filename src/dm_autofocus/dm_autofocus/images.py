@@ -183,3 +183,22 @@ class SettledGate:
     def open_for(self, stamp: float) -> bool:
         """Whether an image with this stamp was exposed after the shape stood."""
         return stamp - self._stamp_lead >= self.settled_at
+
+    def reason(self, newest: float | None, apart: float, timeout_s: float) -> str:
+        """Why no image has counted for a time.
+
+        Args:
+            newest: stamp of the latest image; None = none came.
+            apart: from the one before it [s]; 0 = not known.
+            timeout_s: how long one was waited for.
+        """
+        if newest is None:
+            return "none came at all; is the camera running?"
+        if newest == 0:
+            return "they carry no header.stamp, so nobody knows which focus they show; it must be above 0"
+        if 2 * apart > timeout_s:  # a period may pass until an exposure begins, and another until it has arrived
+            return f"the camera takes one in {apart:.3g} s; image_timeout must be above {2 * apart:.3g} s"
+        if newest < self.settled_at:
+            early = self.settled_at - newest
+            return f"the newest is stamped {early:.3f} s before the shape stood; do the clocks agree?"
+        return "they stopped coming"

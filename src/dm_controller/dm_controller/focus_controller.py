@@ -29,7 +29,7 @@ from dm_controller.focus_types import (
     Sent,
     StartDegauss,
 )
-from dm_controller.planning.active_calibration import NO_CALIBRATION, ActiveCalibration, active_calibration
+from dm_controller.planning.active_calibration import NO_CALIBRATION, NO_TILT, ActiveCalibration, active_calibration
 from dm_controller.planning.choice import Degauss, PlanningContext, choose_move, unreachable
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import Request
@@ -85,6 +85,8 @@ class FocusController:
             self.observer.use(active.planner.law, active.middle, active.planner.hysteresis is not None)
             self.active, self._at_rest = active, None
             effects.append(Log("info", f"using calibration {active.calibration.id} of {mirror.serial}"))
+            if self._values["hold_tilt"] and active.mirror.tilt is None:
+                effects.append(Log("warning", f"calibration {active.calibration.id}: {NO_TILT}"))
         except Refusal as refusal:
             self.active, self.not_calibrated = None, refusal
             self.hold.end("there is no calibration to hold it with")

@@ -46,6 +46,12 @@ from dm_controller.loop_actions import LoopHost
 from dm_controller.planning.target import Request
 
 ACTUATORS, POINTS, RADIUS = 37, 300, 11e-3
+#: Of the actuators, in aperture radii.
+PLACES = [(0.0, 0.0)] + [
+    (0.4 * r * np.cos(k * np.pi / (3 * r)), 0.4 * r * np.sin(k * np.pi / (3 * r)))
+    for r in (1, 2, 3)
+    for k in range(6 * r)
+]
 CONDITIONED = FocusRequest.MODE_CONDITIONED
 #: Creep is quick, so that a shape needs corrections soon.
 LAW = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.85], [0.15]]), np.zeros(0), 0.0, 0.05, CREEP_TIMES)
@@ -74,12 +80,7 @@ def calibration(name: str = "known", law: HysteresisModel = LAW, **fields: Any) 
     random = np.random.default_rng(1)
     angle, distance = random.uniform(0.0, 2.0 * np.pi, POINTS), np.sqrt(random.uniform(0.0, 1.0, POINTS))
     x, y = distance * np.cos(angle), distance * np.sin(angle)
-    ring = [(0.0, 0.0)] + [
-        (0.4 * r * np.cos(k * np.pi / (3 * r)), 0.4 * r * np.sin(k * np.pi / (3 * r)))
-        for r in (1, 2, 3)
-        for k in range(6 * r)
-    ]
-    influence = np.array([2e-6 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.3) for a, b in ring]).T
+    influence = np.array([2e-6 * np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.3) for a, b in PLACES]).T
     terms = basis(x, y)
     return Calibration(
         id=name,
@@ -115,8 +116,8 @@ def calibration(name: str = "known", law: HysteresisModel = LAW, **fields: Any) 
 MIRROR = MirrorInfo(
     serial="M1",
     actuators=ACTUATORS,
-    actuator_x=doubles(np.arange(37.0)),
-    actuator_y=doubles(np.zeros(37)),
+    actuator_x=doubles(RADIUS * np.array(PLACES)[:, 0]),
+    actuator_y=doubles(RADIUS * np.array(PLACES)[:, 1]),
     working_aperture_diameter=2.0 * RADIUS,
     signal_min=-1.0,
     signal_max=1.0,
@@ -269,6 +270,20 @@ def test_a_dry_run_changes_nothing(bench: Bench) -> None:
     assert order.outcome is not None and order.outcome.move is not None
     assert not (bench.commands or bench.outcomes)
     assert not bench.controller.hold.active
+
+
+@pytest.mark.parametrize(("removed", "hold_tilt"), [(True, True), (True, False), (False, True)])
+def test_a_calibration_without_tilt_is_named_where_tilt_is_to_be_held(removed: bool, hold_tilt: bool) -> None:
+    bench, message = Bench(hold_tilt=hold_tilt), calibration("other")
+    if removed:
+        zernike = np.reshape(message.influence_zernike, (21, ACTUATORS))
+        zernike[1:3] *= 1e-3
+        message.influence_zernike = doubles(zernike)
+    bench.log.clear()
+    bench.do(bench.controller.use(message, MIRROR))
+    assert any("other: its maps do not show" in text for text in bench.log) == (removed and hold_tilt)
+    assert bench.controller.active is not None
+    assert (bench.controller.active.mirror.tilt is None) == (removed or not hold_tilt)
 
 
 def test_it_goes_on_without_an_actuator_that_does_not_move_and_says_so(bench: Bench) -> None:

@@ -21,6 +21,11 @@ from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
 
 NO_CALIBRATION = "no calibration: run `./dm calibrate` or load_calibration"
+#: What to do where `hold_tilt` is true and cannot be.
+NO_TILT = (
+    "its maps do not show the actuators' tilt (was it removed from them?): hold_tilt = true cannot hold it, and a "
+    "camera's picture moves with the focus; calibrate from maps that keep their tilt, or set hold_tilt = false"
+)
 #: A law is scaled so that effective signals span this over a full cycle; gains are in the influence function.
 SPAN = 2.0
 SPAN_TOLERANCE = 0.2

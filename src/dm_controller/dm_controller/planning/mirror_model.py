@@ -26,6 +26,8 @@ RIDGE_SHARE = 0.01
 #: How much more tilt counts than the sag beyond the terms, where it is held: less than the coefficients, so that where
 #: a limit binds the shape has precedence.
 TILT_WEIGHT = 10.0
+#: Tilt at the edge, as a share of the largest response, below which maps do not show it; an actuator makes 1.5.
+LEAST_TILT = 0.05
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class CalibratedMirror:
     Args:
         model: of the mirror.
         limits: of its signals.
-        hold_tilt: hold it where the model says where the actuators are.
+        hold_tilt: hold it where the model says where the actuators are, and its maps show their tilt.
         axis: (2,) m, x and y of where the camera's axis meets the mirror.
 
     Attributes:
@@ -152,7 +154,8 @@ class CalibratedMirror:
         self.tilt = None
         if hold_tilt and model.actuator_x is not None and model.actuator_y is not None:
             places = np.array([model.actuator_x, model.actuator_y]) / model.aperture_radius
-            self.tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
+            tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
+            self.tilt = tilt if np.abs(tilt).max() > LEAST_TILT * response.max() else None
         self.matrix = self.rows(model.influence_zernike, model.influence_sag, self.tilt)
         self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
