@@ -48,7 +48,7 @@ class AgeingSimulation:
         self.bench.apply(np.clip(rng.uniform(-0.6, 0.6) + 0.25 * rng.standard_normal(37), -1.0, 1.0))
         self.bench.settle()
         for applied in self.bench.reports[self._heard :]:
-            self.history.observe(replace(applied, moving=False), applied.time)
+            self.history.observe(replace(applied, moving=False, heard=applied.time))
         self._heard = len(self.bench.reports)
 
     def measurement(self, sag: np.ndarray) -> Measurement:

@@ -30,7 +30,7 @@ class Driver:
     def report(self, time: float, moving: bool = False, active: bool = True) -> None:
         known = self.degausses > 0
         report = Applied(time, self.signals, self.turns, self.turned_at, self.degausses, known, moving, active=active)
-        self.history.observe(report, time)
+        self.history.observe(replace(report, heard=time))
 
     def go(self, time: float, value: float) -> None:
         self.turns, self.turned_at = self.turns + 1, self.signals
@@ -127,7 +127,7 @@ def test_a_command_amid_corrections_is_a_move(history: AppliedHistory, driver: D
 def test_a_correction_under_way_is_no_move(history: AppliedHistory, driver: Driver) -> None:
     driver.go(10.0, 0.2)
     for time, requested, still in ((20.0, 0.2001, True), (21.0, 0.6, False)):
-        history.observe(Applied(time, driver.signals, 2, None, 0, True, True, np.full(2, requested)), time)
+        history.observe(Applied(time, driver.signals, 2, None, 0, True, True, np.full(2, requested)))
         assert (history.still_for(21.0) > 0.0) == still
 
 

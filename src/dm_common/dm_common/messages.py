@@ -119,8 +119,8 @@ def measurement_from(response: Any) -> Measurement:
     )
 
 
-def applied_from(message: ActuatorState) -> Applied:
-    """What the driver reports as applied."""
+def applied_from(message: ActuatorState, heard: float = -math.inf) -> Applied:
+    """What the driver reports as applied, `heard` now (s)."""
     signals = np.array(message.applied, dtype=np.float64)
     turned_at = np.array(message.turned_at, dtype=np.float64)
     return Applied(
@@ -133,6 +133,8 @@ def applied_from(message: ActuatorState) -> Applied:
         moving=message.moving,
         requested=np.array(message.requested, dtype=np.float64),
         active=message.driver_state == ActuatorState.STATE_ACTIVE,
+        linked=message.driver_state != ActuatorState.STATE_LINK_LOST,
+        heard=heard,
     )
 
 

@@ -29,8 +29,18 @@ DAY = 86_400.0
 AT_REST = CreepRecord(10.0, CREEP_TIMES, np.zeros((3, len(CREEP_TIMES))), np.zeros(len(CREEP_TIMES)), np.zeros((3, 0)))
 
 
-def report(time: float, signal: float) -> Applied:
-    return Applied(time, np.full(3, signal), 0, None, 1, True)
+def report(time: float, signal: float, **changes: object) -> Applied:
+    return replace(Applied(time, np.full(3, signal), 0, None, 1, True), **changes)  # type: ignore[arg-type]
+
+
+def held_for_a_day() -> HysteresisObserver:
+    """Of a mirror that went to 0.5 at 0 s, of which nothing else was reported for a day."""
+    observer = HysteresisObserver()
+    observer.use(LAW, 0.0)
+    observer.observe(report(-1.0, 0.0))
+    observer.observe(report(0.0, 0.5, turns=1))
+    observer.observe(report(0.0, 0.5, turns=1, heard=DAY))
+    return observer
 
 
 def test_the_next_start_knows_what_was_held_for_a_day(tmp_path: Path) -> None:
@@ -92,6 +102,34 @@ def test_a_record_that_makes_no_sense_is_named(tmp_path: Path, change: dict[str,
     write_record(file, AT_REST._replace(**change))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=text):
         read_record(file, 100.0)
+
+
+def test_a_day_at_a_shape_counts_until_the_driver_that_held_it_was_heard_last() -> None:
+    """Another driver, which knows nothing of that shape, comes ten minutes later: what stood meanwhile is in doubt."""
+    observer = held_for_a_day()
+    observer.observe(report(DAY + 600.0, 0.0, degausses=0, history_known=False))
+    state = observer.state
+    assert state is not None and "started" in observer.unknown
+    minute, hours = np.searchsorted(CREEP_TIMES, (60.0, 3600.0))
+    assert (state.crept[:, hours:-1] > 0.2).all()
+    assert (np.abs(state.crept[:, :minute]) < 1e-3).all()
+    assert state.crept_sigma[:minute] == pytest.approx(UNSEEN, rel=1e-3)
+    assert state.crept_sigma[hours + 1] < 0.3 * UNSEEN
+
+
+@pytest.mark.parametrize("away", [0.0, 600.0])
+def test_while_the_link_is_lost_nobody_knows_whether_the_outputs_hold(away: float) -> None:
+    observer = held_for_a_day()
+    for heard in (DAY, DAY + away):
+        lost = report(0.0, 0.5, turns=1, history_known=False, active=False, linked=False, heard=heard)
+        observer.observe(lost)
+    observer.observe(report(DAY + away, 0.5, turns=1, history_known=False, heard=DAY + away))
+    state = observer.state
+    assert state is not None and (state.crept[:, :-2] > 0.2).all()
+    minute = np.searchsorted(CREEP_TIMES, 60.0)
+    assert state.crept_sigma[:minute] == pytest.approx(UNSEEN if away else 0.0, abs=1e-3)
+    observer.observe(report(DAY + away + 5.0, 0.0, turns=2, degausses=2))
+    assert observer.state is not None and (observer.state.crept_sigma[minute:] > 0.0).all() == bool(away)
 
 
 def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:

@@ -160,9 +160,8 @@ class FocusControllerNode(ManagedNode):
             self._forecast.use(controller.active, self._values["reachable_tolerance"])
 
     def _on_actuator_state(self, message: ActuatorState) -> None:
-        report = driver_report_from(message)
         with self.controller() as (controller, now):
-            self._do(controller.driver_report(report, now), now)
+            self._do(controller.driver_report(driver_report_from(message, now.time), now), now)
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):

@@ -21,9 +21,9 @@ from dm_controller.planning.target import FocusTarget
 CURE = "a degauss over the full range (action degauss, `./dm degauss`) makes it known"
 
 
-def driver_report_from(message: ActuatorState) -> DriverReport:
-    """What a dm_msgs/ActuatorState reports."""
-    applied = applied_from(message)
+def driver_report_from(message: ActuatorState, heard: float) -> DriverReport:
+    """What a dm_msgs/ActuatorState reports, `heard` now (s)."""
+    applied = applied_from(message, heard)
     assert applied.requested is not None
     return DriverReport(
         applied,

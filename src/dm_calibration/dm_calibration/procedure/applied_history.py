@@ -44,13 +44,13 @@ class AppliedHistory:
         """Follow `law` from now on, and through what was heard before; None = no hysteresis."""
         self._observer.use(law or HysteresisModel.linear(), middle)
 
-    def observe(self, report: Applied, heard: float) -> None:
-        """Take the driver's next report, heard at `heard` (s).
+    def observe(self, report: Applied) -> None:
+        """Take the driver's next report.
 
         Raises:
             ValueError: as :meth:`HysteresisObserver.observe`; what was heard before is forgotten.
         """
-        self._heard = heard
+        self._heard = report.heard
         self._observer.observe(report)
 
     def heard_since(self, time: float) -> bool:

@@ -159,7 +159,7 @@ class MapListener:
         if not len(message.applied):
             return
         try:
-            self._history.observe(applied_from(message), 1e-9 * self._node.get_clock().now().nanoseconds)
+            self._history.observe(applied_from(message, 1e-9 * self._node.get_clock().now().nanoseconds))
         except ValueError as error:
             self._node.get_logger().error(f"actuator_state refused: {error}", throttle_duration_sec=10.0)
 

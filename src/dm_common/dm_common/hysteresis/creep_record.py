@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from dm_common.hysteresis.model import HysteresisModel, HysteresisState
     from dm_common.hysteresis.observer import HysteresisObserver
 
-#: Standard deviation of a shape that was held unseen, in shapes of the whole range.
+#: Standard deviation of a shape that was held unseen, in shapes of the whole range: nearly all of them are within one.
 UNSEEN = 0.5
 
 
@@ -111,11 +111,16 @@ def rested(
     if record.crept.shape == settled.shape and time >= record.time:
         left = np.exp(-(time - record.time) / law.creep_time)
         settled += (record.crept - settled) * left
-        sigma = np.hypot(sigma * (1.0 - left), record.crept_sigma * left)
+        sigma = held_unseen(law, record.crept_sigma * left, time - record.time)
         lags = lagged.shape[1]
         followed = record.lagged if record.lagged.shape[1] >= lags else record.crept
         lagged += (followed[:, :lags] - lagged) * left[:lags]
     return replace(moved, crept=settled, crept_sigma=sigma, lagged=lagged)
+
+
+def held_unseen(law: HysteresisModel, sigma: Floats, elapsed: float) -> Floats:
+    """(J,) `crept_sigma` after `elapsed` s at a shape that nobody saw, of which `sigma` is what that left of it."""
+    return np.hypot(sigma, UNSEEN * -np.expm1(-max(elapsed, 0.0) / law.creep_time))
 
 
 def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -> CreepRecord | None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dm_common import Floats
-from dm_common.hysteresis.creep_record import CreepRecord, rested
+from dm_common.hysteresis.creep_record import CreepRecord, held_unseen, rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
 #: Reports kept for a law that is identified later: a calibration run makes some hundred.
@@ -36,6 +36,8 @@ class Applied:
         moving: on the way to another shape.
         requested: (N,) what it moves to; None = not known.
         active: the electronics follow.
+        linked: the electronics are in reach.
+        heard: s, when the driver said so last; what repeats a report tells that the shape still stands.
     """
 
     time: float
@@ -47,6 +49,8 @@ class Applied:
     moving: bool = False
     requested: Floats | None = None
     active: bool = True
+    linked: bool = True
+    heard: float = -np.inf
 
 
 class HysteresisTracker:
@@ -59,15 +63,16 @@ class HysteresisTracker:
         law: the law that is followed.
         state: the best guess; None before the first report.
         unknown: the reason why the state is a guess only; "" = it is known.
+        last: report; one that only repeats it may take its place.
     """
 
     def __init__(self, law: HysteresisModel, middle: float = 0.0, record: CreepRecord | None = None) -> None:
-        self.law, self._record = law, record
+        self.law, self._middle, self._record = law, middle, record
         self.state: HysteresisState | None = None
         self.unknown = "the driver has not reported yet"
-        self._middle = middle
-        self._last: Applied | None = None
+        self.last: Applied | None = None
         self._set_off: HysteresisState | None = None  # the state when the move under way began
+        self._seen = -np.inf  # s, until when it is known what stood
 
     def observe(self, report: Applied) -> None:
         """Take the next report.
@@ -77,25 +82,27 @@ class HysteresisTracker:
         """
         if not np.isfinite(report.signals).all():
             raise ValueError("applied: holds values that are not finite")
-        last, self._last = self._last, report
+        last, self.last = self.last, report
         if self.state is not None and len(report.signals) != len(self.state.signals):
             raise ValueError(f"applied: {len(report.signals)} signals, before there were {len(self.state.signals)}")
         if last is None or self.state is None:
-            self._guess(report, "it moved before this node followed it")
+            self.state = rested(self.law, report.signals, report.time, self._middle, self._record)
+            self.unknown = "it moved before this node followed it"
             return
-        law = self.law
-        if last.time < law.crept_at <= report.time and law.crept.shape == report.signals.shape:
+        if last.linked:
+            self._seen = max(last.heard, self.state.time)
+        if last.time < self.law.crept_at <= report.time and self.law.crept.shape == report.signals.shape:
             # The figure of a calibration is relative to what the actuators had crept to, as it found.
-            state = law.advance(self.state, law.crept_at)
-            crept = np.repeat(law.crept[:, None], len(law.creep_time), axis=1)
-            self.state, self._set_off = replace(state, crept=crept, crept_sigma=np.zeros(len(law.creep_time))), None
+            state = self.law.advance(self.state, self.law.crept_at)
+            crept = np.repeat(self.law.crept[:, None], len(self.law.creep_time), axis=1)
+            self.state, self._set_off = replace(state, crept=crept, crept_sigma=0.0 * state.crept_sigma), None
         if report.time < self.state.time:
             # Hysteresis knows no time; creep stands still until the clock has caught up.
             self.state = replace(self.state, time=report.time)
         if report.turns < last.turns or report.degausses < last.degausses:
-            # It stood where the driver left it or came up, which this report tells, from about then on.
-            self.state = self.law.move(self.state, report.signals, self.state.time)
-            self._guess_keeping_creep(report, "the driver was started or activated again")
+            # As far as anybody knows it stood where the driver left it or came up, from when it was heard last.
+            self.state = self.law.move(self.state, report.signals, min(self._seen, report.time))
+            self._guess_keeping_creep(report, "the driver was started or activated again", self._seen)
             return
         if report.degausses > last.degausses:
             self._degaussed(report, last)
@@ -103,13 +110,15 @@ class HysteresisTracker:
         if report.moving and (not last.moving or report.turns > last.turns):
             self._set_off = self.law.advance(self.state, report.time)
         if not report.history_known:
-            self._guess_keeping_creep(report, "writes were lost, or a degauss was left")
+            # Without a link, nobody knows whether the outputs held: the unit may have had no power.
+            since = self._seen if report.linked and not last.linked else report.time
+            self._guess_keeping_creep(report, "writes were lost, or a degauss was left", since)
             return
-        if report.turns > last.turns + 1:
-            missed = report.turns - last.turns - 1
-            self._guess_keeping_creep(report, f"{missed} turns were not seen" if missed > 1 else "a turn was not seen")
-            return
-        self._follow(report, last)
+        if (missed := report.turns - last.turns - 1) > 0:
+            reason = f"{missed} turns were not seen" if missed > 1 else "a turn was not seen"
+            self._guess_keeping_creep(report, reason, report.time)
+        else:
+            self._follow(report, last)
 
     def _follow(self, report: Applied, last: Applied) -> None:
         assert self.state is not None
@@ -121,24 +130,19 @@ class HysteresisTracker:
         """Begin a new history; moves since the degauss are known if there was at most one turn."""
         assert self.state is not None
         # While it swings about the middle, creep follows the middle.
-        began = self._set_off or self.state
+        began, self._set_off = self._set_off or self.state, None
         self.state = self.law.advance(self.law.degaussed(began, began.time, self._middle), report.time)
-        self._set_off = None
         # The end of the degauss is a turn itself, and one left for it may precede.
         seen = report.turns - last.turns <= 2 and report.degausses == last.degausses + 1
         self.unknown = "" if seen and report.history_known else "moves after the degauss were not seen"
-        if report.turned_at is not None:
-            self.state = self.law.move(self.state, report.turned_at, report.time)
-        self.state = self.law.move(self.state, report.signals, report.time)
+        self._follow(report, last)
 
-    def _guess(self, report: Applied, reason: str) -> None:
-        self.state, self.unknown = rested(self.law, report.signals, report.time, self._middle, self._record), reason
-
-    def _guess_keeping_creep(self, report: Applied, reason: str) -> None:
-        """Where the mirror stands is known, on which branch is not."""
+    def _guess_keeping_creep(self, report: Applied, reason: str, since: float) -> None:
+        """Where the mirror stands is known, on which branch is not; what it stood at `since` then (s) is in doubt."""
         assert self.state is not None
-        self.state = self.law.move(self.state, report.signals, report.time)
-        self.unknown = reason
+        state = self.law.move(self.state, report.signals, report.time)
+        sigma = held_unseen(self.law, state.crept_sigma, report.time - since)
+        self.state, self.unknown = replace(state, crept_sigma=sigma), reason
 
 
 class ActuatorEstimate(NamedTuple):
@@ -159,9 +163,8 @@ class ActuatorEstimate(NamedTuple):
 
     def after_degauss(self, law: HysteresisModel, actuators: int, time: float, middle: float) -> ActuatorEstimate:
         """The actuators after a degauss that ends at `time` (s)."""
-        if self.state is None:
-            return ActuatorEstimate(law.demagnetised(actuators, time, middle), "")
-        return ActuatorEstimate(law.degaussed(self.state, time, middle), "")
+        state, fresh = self.state, law.demagnetised(actuators, time, middle)
+        return ActuatorEstimate(fresh if state is None else law.degaussed(state, time, middle), "")
 
 
 class Observed(NamedTuple):
@@ -220,6 +223,7 @@ class HysteresisObserver:
             if not report.signals.size:
                 return
             if self._log and _same(self._log[-1], report):
+                self._log[-1] = self._tracker.last = report
                 return
             # What a later law must know: where the way bent, and how a move under way began.
             if len(self._log) >= 2 and _between(self._log[-2], self._log[-1], report):
@@ -290,5 +294,5 @@ def _same(last: Applied, report: Applied) -> bool:
     return _phase(last) == _phase(report) and last.time == report.time and np.array_equal(last.signals, report.signals)
 
 
-def _phase(report: Applied) -> tuple[int, int, bool, bool, bool]:
-    return report.turns, report.degausses, report.history_known, report.moving, report.active
+def _phase(report: Applied) -> tuple[int, int, bool, bool, bool, bool]:
+    return report.turns, report.degausses, report.history_known, report.moving, report.active, report.linked
