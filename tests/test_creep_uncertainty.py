@@ -13,7 +13,7 @@ from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.responses import Responses
 from dm_common import Floats
-from dm_common.hysteresis.creep_record import UNSEEN, rested
+from dm_common.hysteresis.creep_record import UNSEEN, record_of, rested
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_controller.planning.creep_error import IN_FIGURE_S, CreepError
 from linear_mirror import make_mirror
@@ -105,6 +105,31 @@ def test_what_was_held_unseen_widens_the_bound_until_it_has_faded() -> None:
     assert (np.diff(bounds) < 0.0).all()
     assert bounds[0] > 1.5 * error.bound(known, position, 0.05).max_zernike
     assert bounds[-1] == pytest.approx(error.bound(known, position, 0.05).max_zernike, rel=0.2)
+
+
+@pytest.mark.parametrize("lag", [0.0, -0.5, 2.0])
+def test_the_bound_holds_where_power_was_off_unseen(lag: float) -> None:
+    """A shape of the whole range was believed to stand for ten minutes, and its creep had faded to that of no shape.
+
+    What loops follow otherwise than the straight part (`lag`) makes no difference: a shape is both.
+    """
+    law = CREEPS
+    if lag:
+        spectrum = np.ones(len(CREEP_TIMES))
+        spectrum[:7] -= lag
+        law = replace(CREEPS, creep_spectrum=spectrum, lag_spectrum=np.full(7, lag))
+    law = replace(law, creep_covariance=np.zeros((2, 1 + len(CREEP_TIMES), 1 + len(CREEP_TIMES))))
+    whole = np.linspace(-0.5, 0.5, COUNT)
+    error = CreepError(law, RESPONSE, np.zeros((COUNT, COUNT)), whole)
+    held = law.advance(law.move(law.demagnetised(COUNT, 0.0), whole, 0.0), 86_400.0)
+    record = record_of(law, held, 86_400.0)
+    believed = law.degaussed(rested(law, whole, 87_000.0, 0.0, record), 87_000.0)
+    off = law.advance(law.move(held, np.zeros(COUNT), 86_400.0), 87_000.0)
+    for later in (1.0, 60.0, 3600.0):
+        gap = law.effective(law.advance(off, 87_000.0 + later)) - law.effective(law.advance(believed, 87_000.0 + later))
+        wrong = np.abs(RESPONSE @ gap).max()
+        bound = error.bound(believed, np.zeros(COUNT), later).max_zernike
+        assert 0.9 * wrong < bound < 3.0 * wrong
 
 
 def test_a_degauss_does_not_make_old_creep_known() -> None:

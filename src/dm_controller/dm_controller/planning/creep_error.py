@@ -55,6 +55,7 @@ class CreepError:
             self._in_figure = law.crept[:, None] * np.exp(-IN_FIGURE_S / law.creep_time)
         # What a shape of the whole range held unseen would leave, by element.
         share = np.atleast_2d(law.creep_share).mean(axis=0)
+        share[: len(law.lag_time)] += np.atleast_2d(law.lag_share).mean(axis=0)  # what they follow of the signals
         self._unseen = (rows @ whole)[:, None] * share
         # What was held before the calibration fades for hours. A run of minutes shows of it how large it is, but hardly
         # of which actuators: any may differ from what was found by a share of what they have in the mean.
@@ -81,7 +82,7 @@ class CreepError:
             features[:, :, 0] = 0.0
             features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
         shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
-        shared += np.square(self._unseen * (state.crept_sigma * faded)[:, None]).sum(axis=2)
+        shared += np.square((state.crept_sigma * faded) @ self._unseen.T)  # one shape that all elements have followed
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
         if not measured:
             since = np.maximum(state.time + ages - self._law.crept_at, 0.0)
