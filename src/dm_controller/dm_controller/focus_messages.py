@@ -115,7 +115,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment) 
         figures |= {
             "curvature": shape.move.target.curvature,
             "stands for": f"{now.time - shape.began:.1f}",
-            "bound": shape.move.plan.max_zernike_upper,
+            "bound": shape.bound(not controller.observer.unknown),
         }
     text = trouble(controller, values, now)
     return Health(WARN if text else OK, text or "ready", figures)

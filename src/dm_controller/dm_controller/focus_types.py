@@ -1,5 +1,6 @@
 """What goes into the focus controller and what comes out of it, without ROS."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -212,6 +213,15 @@ class CommandedShape:
     checked: float
     kept: bool = True
     began: float = 0.0
+
+    def bound(self, known: bool) -> float:
+        """m, 95 % bound on its largest coefficient error, with the history of the actuators `known` to this day or not.
+
+        What was written again after a lost link is on another branch of the hysteresis than it was found for.
+        """
+        plan, lost = self.move.plan, self.move.known and not known
+        spread = plan.max_zernike_upper - plan.max_zernike
+        return plan.max_zernike + math.hypot(spread, self.planner.unknown_max_zernike if lost else 0.0)
 
     def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
         """Another command for the shape that was commanded last, on behalf of the same holder."""
