@@ -82,17 +82,12 @@ def summary(calibration: Calibration) -> Section:
         f"{_counted(dropped, 'map was', 'maps were')} dropped; "
         f"{_counted(warnings, 'warning or limitation', 'warnings and limitations')} below."
     )
-    return Section(
-        "Summary",
-        [
-            kind,
-            "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that "
-            "had no part in it: the honest one. Re-measured is what a map showed after a command of this calibration "
-            "was applied. All lengths are surface sag, piston and tilt removed.",
-            counted,
-        ],
-        [Table("Key figures", ("figure", "value"), rows)],
+    meaning = (
+        "In-sample is what the fit leaves in the maps it was fitted to. Held-out is what it leaves in maps that had no "
+        "part in it: the honest one. Re-measured is what a map showed after a command of this calibration was applied. "
+        "All lengths are surface sag, piston and tilt removed."
     )
+    return Section("Summary", [kind, meaning, counted], [Table("Key figures", ("figure", "value"), rows)])
 
 
 def provenance(calibration: Calibration) -> Section:
@@ -118,36 +113,29 @@ def provenance(calibration: Calibration) -> Section:
         ("note", calibration.note or "none"),
     ]
     shapes = [(name, target.strip()) for name, _, target in (text.partition(":") for text in calibration.targets)]
-    solved = (
-        [Table("Shapes that were solved on an influence function", ("surface", "aim"), shapes, textual=True)]
-        if shapes
-        else []
+    tables = [Table("Provenance", ("item", "value"), rows, textual=True)]
+    if shapes:
+        title = "Shapes that were solved on an influence function"
+        tables.append(Table(title, ("surface", "aim"), shapes, textual=True))
+    text = (
+        "The calibration file holds everything this page is made of: signals, coefficients and sag of every map, names "
+        "and full SHA-256 of the map files, and the result."
     )
-    return Section(
-        "What was measured, when and with what",
-        [
-            "The calibration file holds everything this page is made of: signals, coefficients and sag of every map, "
-            "names and full SHA-256 of the map files, and the result."
-        ],
-        [Table("Provenance", ("item", "value"), rows, textual=True), *solved],
-    )
+    return Section("What was measured, when and with what", [text], tables)
 
 
 def cautions(calibration: Calibration) -> Section:
     """Poke check, limitations, dropped maps."""
     findings = [text.removeprefix(POKE_CHECK) for text in calibration.limitations if text.startswith(POKE_CHECK)]
     others = [text for text in calibration.limitations if not text.startswith(POKE_CHECK)]
-    checked = (
-        [f"Poke check. {finding}" for finding in findings]
-        if findings
-        else ["Poke check: the responses lie where the configured layout puts the actuators."]
-    )
+    checked = [f"Poke check. {finding}" for finding in findings]
+    if not findings:
+        checked = ["Poke check: the responses lie where the configured layout puts the actuators."]
     fit, maps = calibration.fit, calibration.maps
     rejected = [(maps.label[i], fit.reasons[i]) for i in np.flatnonzero(~fit.used)]
     never = [(label, reason.strip()) for label, _, reason in (entry.partition(":") for entry in calibration.dropped)]
-    rows = [*rejected, *never]
-    table = [Table("Maps that are not in the fit", ("map", "reason"), rows, textual=True)] if rows else []
-    return Section("Warnings and known limitations", [*checked, *others], table)
+    table = Table("Maps that are not in the fit", ("map", "reason"), [*rejected, *never], textual=True)
+    return Section("Warnings and known limitations", [*checked, *others], [table] if table.rows else [])
 
 
 def every_map(calibration: Calibration) -> Section:
@@ -165,20 +153,12 @@ def every_map(calibration: Calibration) -> Section:
         )
         for i, label in enumerate(maps.label)
     ]
-    return Section(
-        "Every map",
-        [
-            "Residual: rms sag that the fit leaves. Beyond 21 terms: what the Zernike terms leave of the map itself, "
-            "print-through and noise."
-        ],
-        [
-            Table(
-                "Maps in the order measured",
-                ("map", "kind", "time, s", "residual, nm", "beyond 21 terms, nm", "valid, %"),
-                rows,
-            )
-        ],
+    text = (
+        "Residual: rms sag that the fit leaves. Beyond 21 terms: what the Zernike terms leave of the map itself, "
+        "print-through and noise."
     )
+    header = ("map", "kind", "time, s", "residual, nm", "beyond 21 terms, nm", "valid, %")
+    return Section("Every map", [text], [Table("Maps in the order measured", header, rows)])
 
 
 def files(calibration: Calibration, file: str, sha256: str) -> Section:
@@ -194,11 +174,7 @@ def files(calibration: Calibration, file: str, sha256: str) -> Section:
         if name
     ]
     folders = sorted({str(PurePath(name).parent) for name in maps.file if name})
-    return Section(
-        "Files",
-        [
-            *([f"This report was made of {file}, SHA-256 {sha256}."] if file else []),
-            *([f"Map files lay in {', '.join(folders)}."] if folders else ["The maps came without files."]),
-        ],
-        [Table("Map files", ("map", "file", "SHA-256"), rows, textual=True)] if rows else [],
-    )
+    text = [f"This report was made of {file}, SHA-256 {sha256}."] if file else []
+    text.append(f"Map files lay in {', '.join(folders)}." if folders else "The maps came without files.")
+    table = Table("Map files", ("map", "file", "SHA-256"), rows, textual=True)
+    return Section("Files", text, [table] if rows else [])

@@ -30,31 +30,26 @@ def influence(calibration: Calibration) -> Section:
         )
         for k in range(fit.actuators)
     ]
-    return Section(
-        "Influence functions",
-        [
-            f"The maps of the second page are interpolated between the {fit.points.x.size} sampling points. The "
-            "response is the rms of such a map. An actuator is weak or dead when its response is small beside its "
-            "ring's median or not well above its standard error.",
-        ],
-        [Table("Actuators", ("actuator", "x, mm", "y, mm", "ring", "response, nm", "± nm", "grade"), rows)],
+    text = (
+        f"The maps of the second page are interpolated between the {fit.points.x.size} sampling points. The response "
+        "is the rms of such a map. An actuator is weak or dead when its response is small beside its ring's median or "
+        "not well above its standard error."
     )
+    header = ("actuator", "x, mm", "y, mm", "ring", "response, nm", "± nm", "grade")
+    return Section("Influence functions", [text], [Table("Actuators", header, rows)])
 
 
 def residual(calibration: Calibration) -> Section:
     """Residual of each map."""
     fit = calibration.fit
-    return Section(
-        "Residuals of the maps",
-        [
-            f"In-sample {fit.in_sample_rms * NM:.2f} nm, held out {fit.held_out_rms * NM:.2f} nm rms sag. Reference "
-            "frames are maps at mid range; the figure of the mirror is followed from one to the next "
-            f"({fit.drift_rms * NM:.2f} nm rms over the run)."
-        ],
-        pictures=[
-            Picture("residuals", "What the fit leaves of each map, over the run.", figures.residual_figure(calibration))
-        ],
+    text = (
+        f"In-sample {fit.in_sample_rms * NM:.2f} nm, held out {fit.held_out_rms * NM:.2f} nm rms sag. Reference frames "
+        "are maps at mid range; the figure of the mirror is followed from one to the next "
+        f"({fit.drift_rms * NM:.2f} nm rms over the run)."
     )
+    drawn = figures.residual_figure(calibration)
+    picture = Picture("residuals", "What the fit leaves of each map, over the run.", drawn)
+    return Section("Residuals of the maps", [text], pictures=[picture])
 
 
 def regions(calibration: Calibration, left: Residuals) -> Section:
@@ -73,44 +68,37 @@ def regions(calibration: Calibration, left: Residuals) -> Section:
         column = shown[:, k] * NM
         row = [f"{share:.0%}", *(f"{value:.2f}" for value in (*np.quantile(column, (0.5, 0.9)), column.max()))]
         rows.append(row + ([f"{weights[k]:.3f}"] if weights.size else []))
-    weighted = (
-        " The weights are those of Eq. (8), from the variance of the surface control error over the sample surfaces; "
-        "a controller may weight its command by them."
-        if weights.size
-        else ""
+    text = (
+        "rms of the residual inside concentric discs of 10 … 100 % of the aperture's area, over all maps but the "
+        "reference frames, in-sample."
     )
-    return Section(
-        title,
-        [
-            "rms of the residual inside concentric discs of 10 … 100 % of the aperture's area, over all maps but the "
-            f"reference frames, in-sample.{weighted}"
-        ],
-        [Table("Residual by region", header, rows)],
-        [Picture("regions", "Residual inside each disc: one dot per map.", figures.regions_figure(shown, kinds))],
-    )
+    if weights.size:
+        text += (
+            " The weights are those of Eq. (8), from the variance of the surface control error over the sample "
+            "surfaces; a controller may weight its command by them."
+        )
+    picture = Picture("regions", "Residual inside each disc: one dot per map.", figures.regions_figure(shown, kinds))
+    return Section(title, [text], [Table("Residual by region", header, rows)], [picture])
 
 
 def coefficients(calibration: Calibration, left: Residuals) -> Section:
     """Residual by Zernike term."""
     hysteresis = calibration.hysteresis
     sigma = hysteresis.zernike_sigma if hysteresis is not None else None
-    first = PISTON_TILT
     rms = np.sqrt(np.mean(np.square(left.coefficients), axis=0)) * NM
     header = ["term", "in-sample rms, nm"] + (["held-out moves, nm"] if sigma is not None else [])
     rows = [
         [NAMES[k], f"{rms[k]:.3f}"] + ([f"{sigma[k] * NM:.3f}"] if sigma is not None else [])
-        for k in range(first, left.maps.terms)
+        for k in range(PISTON_TILT, left.maps.terms)
     ]
-    held = (
-        " Held-out moves are those of the check, predicted by a law that had not seen them; the noise of their maps is "
-        "taken off, so they can lie below the in-sample figure."
-        if sigma is not None
-        else f" Held out, the largest of a map stays below {calibration.fit.held_out_max_zernike * NM:.2f} nm in 95 % "
-        "of the maps."
-    )
-    return Section(
-        "Zernike coefficients",
-        [f"What the fit leaves of each coefficient beyond tilt, rms over the maps.{held}"],
-        [Table("Residual by coefficient", header, rows)],
-        [Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(left, sigma))],
-    )
+    text = "What the fit leaves of each coefficient beyond tilt, rms over the maps. "
+    if sigma is not None:
+        text += (
+            "Held-out moves are those of the check, predicted by a law that had not seen them; the noise of their maps "
+            "is taken off, so they can lie below the in-sample figure."
+        )
+    else:
+        bound = calibration.fit.held_out_max_zernike * NM
+        text += f"Held out, the largest of a map stays below {bound:.2f} nm in 95 % of the maps."
+    picture = Picture("coefficients", "Error of each coefficient.", figures.coefficients_figure(left, sigma))
+    return Section("Zernike coefficients", [text], [Table("Residual by coefficient", header, rows)], [picture])

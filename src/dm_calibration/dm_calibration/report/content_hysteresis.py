@@ -102,14 +102,12 @@ def hysteresis(calibration: Calibration) -> Section:
     title = "Hysteresis and creep"
     hysteresis = calibration.hysteresis
     if hysteresis is None:
-        return Section(
-            title,
-            [
-                "Not identified: the maps of this plan do not show hysteresis apart from the influence function. "
-                "A calibration with the plan “hysteresis” does (./dm calibrate --plan hysteresis)."
-            ],
+        text = (
+            "Not identified: the maps of this plan do not show hysteresis apart from the influence function. A "
+            "calibration with the plan “hysteresis” does (./dm calibrate --plan hysteresis)."
         )
-    law, wavelength = hysteresis.law, calibration.wavelength
+        return Section(title, [text])
+    law, bound = hysteresis.law, length(hysteresis.held_out_max_zernike, calibration.wavelength)
     openings = loop_opening(law)
     spread = f", {openings.min():.1%} to {openings.max():.1%} over the actuators" if law.actuators else ""
     shared = "the mean over actuators, whose laws are their own" if law.actuators else "all actuators share it"
@@ -121,37 +119,20 @@ def hysteresis(calibration: Calibration) -> Section:
         ("creep", f"{law.creep_rate:.2%} of a step per decade of time"),
         ("growth of a step from 1 s to 1 h", f"{hour:.2f} %"),
         ("growth of a step from 1 s to 1 day", f"{day:.2f} %"),
-        (
-            "largest coefficient error of a predicted move, held out, 95 %",
-            length(hysteresis.held_out_max_zernike, wavelength),
-        ),
+        ("largest coefficient error of a predicted move, held out, 95 %", bound),
         ("standard deviation of an effective signal when the history is unknown", f"{hysteresis.unknown_sigma:.3f}"),
     ]
-    pictures = [
-        Picture(
-            "loops",
-            f"Loops of the identified law: {shared}; gains are in the influence function.",
-            loops_figure(law),
-        )
-    ]
+    caption = f"Loops of the identified law: {shared}; gains are in the influence function."
+    pictures = [Picture("loops", caption, loops_figure(law))]
     if law.creep_rate > 0.0:
-        pictures.append(
-            Picture(
-                "creep",
-                "Creep of the identified law after a step on a rested mirror.",
-                creep_figure(law),
-            )
-        )
-    return Section(
-        title,
-        [
-            "The effective signal is what sag and coefficients are linear in; it depends on the applied signal and on "
-            "the turning points before it. A degauss wipes the loops, not the creep.",
-            *hysteresis.remarks,
-        ],
-        [Table("The law", ("item", "value"), rows, textual=True)],
-        pictures,
+        caption = "Creep of the identified law after a step on a rested mirror."
+        pictures.append(Picture("creep", caption, creep_figure(law)))
+    text = (
+        "The effective signal is what sag and coefficients are linear in; it depends on the applied signal and on the "
+        "turning points before it. A degauss wipes the loops, not the creep."
     )
+    table = Table("The law", ("item", "value"), rows, textual=True)
+    return Section(title, [text, *hysteresis.remarks], [table], pictures)
 
 
 def recipes(calibration: Calibration) -> Section:
@@ -159,10 +140,8 @@ def recipes(calibration: Calibration) -> Section:
     book = calibration.recipes
     title = "Recipes: errors re-measured after the command"
     if not book.recipes:
-        return Section(
-            title,
-            ["None are stored with this calibration, so none was re-measured. The action “build_recipes” builds them."],
-        )
+        text = "None are stored with this calibration, so none was re-measured. The action “build_recipes” builds them."
+        return Section(title, [text])
     rows = [
         (
             f"{recipe.curvature:+.4f}",
@@ -176,13 +155,10 @@ def recipes(calibration: Calibration) -> Section:
         for recipe in book.recipes
     ]
     header = ("curvature, 1/m", "conic", "added terms", "largest coefficient, nm", "rms sag, nm", "maps", "signals")
-    return Section(
-        title,
-        [
-            f"Each begins with a degauss of {book.degauss_steps} half-swings. The last was built {utc(book.stamp_ns)}. "
-            "Halfway between neighbours the bound is larger than what was re-measured by "
-            f"{length(book.interpolation_error, calibration.wavelength)} at most."
-        ],
-        [Table("Recipes", header, rows)],
-        [Picture("recipes", "Re-measured errors of the recipes.", recipes_figure(book))],
+    text = (
+        f"Each begins with a degauss of {book.degauss_steps} half-swings. The last was built {utc(book.stamp_ns)}. "
+        "Halfway between neighbours the bound is larger than what was re-measured by "
+        f"{length(book.interpolation_error, calibration.wavelength)} at most."
     )
+    picture = Picture("recipes", "Re-measured errors of the recipes.", recipes_figure(book))
+    return Section(title, [text], [Table("Recipes", header, rows)], [picture])

@@ -168,13 +168,8 @@ def coefficients_figure(left: Residuals, hysteresis_sigma: Floats | None) -> Fig
     share = 0.8 if hysteresis_sigma is None else 0.4
     axes.bar(place - (0.8 - share) / 2, rms * NM, share, color=BLUE, label="maps of the fit (in-sample)")
     if hysteresis_sigma is not None:
-        axes.bar(
-            place + 0.2,
-            hysteresis_sigma[first:] * NM,
-            share,
-            color=ORANGE,
-            label="held-out moves, noise of maps removed",
-        )
+        held_out = hysteresis_sigma[first:] * NM
+        axes.bar(place + 0.2, held_out, share, color=ORANGE, label="held-out moves, noise of maps removed")
     names = [f"$Z_{{{term.n}}}^{{{term.m}}}$" + f"\n{term.kind}" * bool(term.kind) for term in TERMS[first:]]
     axes.set_xticks(place, names[: len(place)], fontsize=8)
     axes.set(xlabel="Zernike term (Born & Wolf, peak-normalised)", ylabel="rms error of the coefficient, nm")
