@@ -1,6 +1,6 @@
 """From the maps of a run to the law of a mirror, with what it may be trusted to predict."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,9 +47,7 @@ class HysteresisFit:
     remarks: tuple[str, ...]
 
 
-def fit_hysteresis(
-    maps: MapSet, progress: Callable[[str], None] = lambda step: None, candidates: Sequence[Candidate] = CANDIDATES
-) -> HysteresisFit:
+def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -> HysteresisFit:
     """Identify the law from the maps of one run, in the order measured, which begins with a degauss.
 
     Maps of kind CHECK test the law before they join the final fit.
@@ -62,7 +60,7 @@ def fit_hysteresis(
     time = 1e-9 * (maps.stamp_ns - maps.stamp_ns[0])
     run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment)
     test = np.array([kind == CHECK for kind in maps.kind])
-    found, run = _without_outliers(run, test, candidates, progress)
+    found, run = _without_outliers(run, test, candidates)
     covariance = _error_covariance(found, run, maps.terms)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
@@ -80,19 +78,17 @@ def fit_hysteresis(
     )
 
 
-def _without_outliers(
-    run: Run, test: NDArray[np.bool_], candidates: Sequence[Candidate], progress: Callable[[str], None]
-) -> tuple[Identification, Run]:
+def _without_outliers(run: Run, test: NDArray[np.bool_], candidates: Sequence[Candidate]) -> tuple[Identification, Run]:
     """The law of the maps that one law explains, and the run with those alone counting; the commands all stay."""
     for _ in range(OUTLIER_ROUNDS - 1):
-        found = identify(run, test, candidates, progress=progress)
+        found = identify(run, test, candidates)
         size = np.linalg.norm(found.fit.residual, axis=1)
         usable = run.responses.usable
         outlier = usable & (size > OUTLIER * np.median(size[usable]))
         if not outlier.any() or outlier.sum() > OUTLIERS_MAX * usable.sum():
             return found, run
         run = replace(run, responses=replace(run.responses, usable=usable & ~outlier))
-    return identify(run, test, candidates, progress=progress), run
+    return identify(run, test, candidates), run
 
 
 def _left_out(maps: MapSet, run: Run) -> tuple[str, ...]:
@@ -180,12 +176,12 @@ def _crept_before(responses: Responses, effective: Floats, fading: Floats) -> Fl
     return weights_of(unknown, left, gains, np.eye(fading.shape[1]), (1.0, 0.0))
 
 
-def unknown_history_sigma(law: HysteresisModel, seed: int = 0, actuators: int = 500) -> float:
+def unknown_history_sigma(law: HysteresisModel) -> float:
     """Standard deviation of the static effective signal at one signal over random histories."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     still = replace(law, creep_rate=0.0)
     differences = []
-    for one, other in zip(*(random_histories(still, -1.0, 1.0, rng, actuators) for _ in range(2)), strict=True):
+    for one, other in zip(*(random_histories(still, -1.0, 1.0, rng, 500) for _ in range(2)), strict=True):
         signals = rng.uniform(-1.0, 1.0, len(one.signals))
         differences.append(still.position_at(one, signals) - still.position_at(other, signals))
     return float(np.std(differences) / np.sqrt(2.0))

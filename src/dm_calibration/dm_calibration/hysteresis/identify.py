@@ -6,7 +6,7 @@ each actuator by itself (:mod:`~dm_calibration.hysteresis.own_laws`) are one mor
 are alike keeps its common law.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 
 import numpy as np
@@ -63,7 +63,6 @@ def identify(
     folds: int = 4,
     blocks: int = 1,
     slope_min: float = SLOPE_MIN,
-    progress: Callable[[str], None] = lambda step: None,
 ) -> Identification:
     """Find the law that predicts best.
 
@@ -103,7 +102,6 @@ def identify(
     def consider(problem: CandidateProblem | OwnLaws, whole: LawFit | None = None) -> None:
         nonlocal best
         name = problem.candidate.name
-        progress(name)
         whole = whole or problem.fit(train)
         if not whole.candidate.own and whole.candidate.slopes:
             fading.append(whole)
