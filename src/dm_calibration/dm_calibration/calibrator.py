@@ -112,12 +112,10 @@ def calibrate(
         if commands is None:
             raise ValueError("commands: must be given, (M, N) signals, one row for each map")
         maps = outcome_of(maps, commands, times, mirror, settings, hysteresis)
-    return _evaluated(maps, mirror, options or FitOptions(), provenance or _provenance(mirror), run_limitations)
-
-
-def _provenance(mirror: Mirror) -> Provenance:
-    now = time.time_ns()
-    return Provenance(new_id(mirror.name, mirror.serial, now), now)
+    if provenance is None:
+        now = time.time_ns()
+        provenance = Provenance(new_id(mirror.name, mirror.serial, now), now)
+    return _evaluated(maps, mirror, options or FitOptions(), provenance, run_limitations)
 
 
 def _evaluated(

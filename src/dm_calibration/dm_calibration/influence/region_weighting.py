@@ -103,8 +103,7 @@ def choose_weighting(
         raise ValueError(f"the maps carry {maps.terms} terms: AZWreg fits {len(TERMS)}; use AZreg")
     chosen = sample_surfaces(maps)
     # `sag` has its gaps filled from a fit: a region that nobody saw would get its weight from what was made up.
-    labels = [label for label, used in zip(maps.label, chosen, strict=True) if used]
-    regional_rms(maps.sag[chosen], maps.points, labels=labels)
+    regional_rms(maps.sag[chosen], maps.points, labels=maps.select(chosen).label)
     fold = _folds(maps, chosen, folds)
     fractions = np.array((0.0, *EPSILON_CANDIDATES))  # 0 stands for no weights at all
     variance = _variance(design, maps, sag, chosen)
@@ -118,7 +117,7 @@ def choose_weighting(
         judged = left_out & tested
         if not judged.any():
             continue
-        train = _without(design, ~left_out)
+        train = Design(design.matrix[~left_out], design.drift, design.excited)
         predicted = design.matrix[judged] @ (np.linalg.pinv(train.matrix, rcond=1e-9) @ sag[~left_out])
         r = _variance(train, maps.select(~left_out), sag[~left_out], chosen[~left_out])
         for e, share in enumerate(fractions):
@@ -189,18 +188,13 @@ def _folds(maps: MapSet, chosen: NDArray[np.bool_], folds: int) -> NDArray[np.in
     return fold
 
 
-def _without(design: Design, keep: NDArray[np.bool_]) -> Design:
-    return Design(design.matrix[keep], design.drift, design.excited)
-
-
 def _variance(design: Design, maps: MapSet, sag: Floats, chosen: NDArray[np.bool_]) -> Floats:
     """(R,) variance over the chosen maps of the regional rms surface control error, G being that of AZreg."""
     coefficients = np.linalg.pinv(design.matrix, rcond=1e-9) @ maps.coefficients
     influence = np.zeros((maps.terms, maps.actuators))
     influence[:, design.excited] = coefficients[design.drift :].T
     error = surface_control_error(sag[chosen], maps.applied[chosen], influence, maps.points)
-    labels = [label for label, used in zip(maps.label, chosen, strict=True) if used]
-    regional = regional_rms(error, maps.points, labels=labels)
+    regional = regional_rms(error, maps.points, labels=maps.select(chosen).label)
     variance = regional.var(axis=0, ddof=1)
     if (np.sqrt(variance) <= CONSTANT * regional.mean(axis=0)).all():
         raise ValueError(

@@ -99,9 +99,11 @@ def show_result(result: Any, calibration: Any = None) -> None:
         )
     if result.hysteresis_model:
         promised = promise(promise_of(calibration)) if calibration is not None else "none while it is not in use"
+        expected = result.expected_max_zernike
+        foretold = f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
         console.print(
             f"promise: {promised} for the largest coefficient, from "
-            f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{_foretold(result)}; hysteresis "
+            f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{foretold}; hysteresis "
             f"{result.hysteresis_model}"
         )
     for entry in result.dropped:
@@ -120,11 +122,6 @@ def after_run(result: Any, written: Path | None) -> str:
     if result.parameters:  # with them limits count for the true neighbours, and the aperture is where the mirror is
         return f"start the nodes with {written or 'these parameters'}, and calibrate again"
     return "./dm focus 0.02" if result.id else "./dm calibrate" if result.poke_check_passed else ""
-
-
-def _foretold(result: Any) -> str:
-    expected = result.expected_max_zernike
-    return f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
 
 
 def figures_of(result: Any) -> dict[str, Any]:
