@@ -10,7 +10,7 @@ from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift_filter import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
 from dm_common.mirror import APERTURE_TOLERANCE
-from dm_common.ros.parameters import AUTOSTART, Parameter, real, switch, text, whole
+from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, switch, text, whole
 
 PARAMETERS = (
     AUTOSTART,
@@ -20,127 +20,106 @@ PARAMETERS = (
         text(""),
         "Calibration to use as soon as the mirror is known: empty = none, newest = the newest that fits, or an id.",
     ),
-    Parameter(
+    live(
         "write_report",
         switch(True),
         "Write the report of every calibration that is stored, <id>.html and <id>.pdf, beside its file.",
-        live=True,
     ),
-    Parameter("poke_amplitude", real(0.5, 0.01, 1.0), "Half-swing of a push-pull poke, normalised.", live=True),
-    Parameter("reference_every", whole(10, 1, 1000), "Steps between two reference frames.", live=True),
-    Parameter("hysteresis_maps", whole(200, 60, 2000), "Commands of a hysteresis plan; more, less noise.", live=True),
-    Parameter("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time.", live=True),
-    Parameter(
+    live("poke_amplitude", real(0.5, 0.01, 1.0), "Half-swing of a push-pull poke, normalised."),
+    live("reference_every", whole(10, 1, 1000), "Steps between two reference frames."),
+    live("hysteresis_maps", whole(200, 60, 2000), "Commands of a hysteresis plan; more, less noise."),
+    live("settle_time", real(0.5, 0.0, 600.0, "s"), "Wait between command and map, in ROS time."),
+    live(
         "map_time",
         real(1.0, 0.001, 600.0, "s"),
         "What a map is said to take until one was taken, in ROS time.",
-        live=True,
     ),
-    Parameter("measure_retries", whole(1, 0, 20), "Further tries after a map that failed.", live=True),
-    Parameter(
-        "failures_max", whole(3, 1, 1000), "Shapes in a row without a map after which a run is given up.", live=True
-    ),
-    Parameter("driver_timeout", real(30.0, 0.1, 600.0, "s"), "Longest wait for the driver to set a shape.", live=True),
-    Parameter("degauss_timeout", real(180.0, 0.1, 3600.0, "s"), "Longest wait for a degauss.", live=True),
-    Parameter("measure_timeout", real(60.0, 0.1, 3600.0, "s"), "Longest wait for one map.", live=True),
-    Parameter(
+    live("measure_retries", whole(1, 0, 20), "Further tries after a map that failed."),
+    live("failures_max", whole(3, 1, 1000), "Shapes in a row without a map after which a run is given up."),
+    live("driver_timeout", real(30.0, 0.1, 600.0, "s"), "Longest wait for the driver to set a shape."),
+    live("degauss_timeout", real(180.0, 0.1, 3600.0, "s"), "Longest wait for a degauss."),
+    live("measure_timeout", real(60.0, 0.1, 3600.0, "s"), "Longest wait for one map."),
+    live(
         "resume_max_age",
         real(43200.0, 0.0, 1e8, "s"),
         "An interrupted run goes on with the next goal of the same plan, settings and mirror when it is not older; "
         "0 = never.",
-        live=True,
     ),
-    Parameter(
+    live(
         "start_fresh",
         switch(False),
         "The next goal sets interrupted runs aside and begins anew; false again as soon as it has begun.",
-        live=True,
     ),
-    Parameter(
+    live(
         "bump.tilt_max",
         real(3e-6, 0.0, 1e-3, "m"),
         "Largest change of tilt between two reference frames, as sag at the edge; 0 = not checked.",
-        live=True,
     ),
-    Parameter(
+    live(
         "bump.shift_max",
         real(1e-4, 0.0, 1e-2, "m"),
         "Largest shift of the aperture on the map between two reference frames, at the mirror; 0 = not checked.",
-        live=True,
     ),
-    Parameter(
+    live(
         "bump.figure_max",
         real(50e-9, 0.0, 1e-3, "m"),
         "Largest change of the rms figure between two reference frames, beyond what twice `hysteresis_allowance` "
         "explains; 0 = not checked.",
-        live=True,
     ),
-    Parameter(
+    live(
         "aperture_tolerance",
         real(APERTURE_TOLERANCE, 1e-6, 0.5),
         "Largest relative difference between the aperture radius of maps or calibrations and the mirror's.",
-        live=True,
     ),
-    Parameter("folds", whole(10, 2, 1000), "Folds of the cross-validation.", live=True),
-    Parameter(
+    live("folds", whole(10, 2, 1000), "Folds of the cross-validation."),
+    live(
         "epsilon",
         real(0.0, 0.0, 1e-6, "m^2"),
         "Prior parameter of the region weights of AZWreg, Eq. (8); 0 = by cross-validation.",
-        live=True,
     ),
-    Parameter("valid_fraction_min", real(0.5, 0.0, 1.0), "Least share of valid pixels of a map.", live=True),
-    Parameter(
+    live("valid_fraction_min", real(0.5, 0.0, 1.0), "Least share of valid pixels of a map."),
+    live(
         "outlier_sigmas",
         real(6.0, 3.0, 1e3),
         "Residual of a map, in robust sigmas, beyond which it is dropped.",
-        live=True,
     ),
-    Parameter(
+    live(
         "hysteresis_allowance",
         real(0.10, 0.0, 1.0),
         "Share of their moves by which actuators may miss their mark (hysteresis) without the map being an outlier; "
         "0 = they have none, and moves without a law of it are promised what held-out maps show.",
-        live=True,
     ),
-    Parameter("dead_sigmas", real(3.0, 0.0, 1e3), "Dead below this many standard errors.", live=True),
-    Parameter(
+    live("dead_sigmas", real(3.0, 0.0, 1e3), "Dead below this many standard errors."),
+    live(
         "weak_sigmas",
         real(10.0, 0.0, 1e3),
         "Weak below this many standard errors, where they are twice those of the other actuators.",
-        live=True,
     ),
-    Parameter(
-        "weak_share", real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring.", live=True
-    ),
-    Parameter(
+    live("weak_share", real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring."),
+    live(
         "calibrated_error_max",
         real(32e-9, 0.0, 1e-3, "m"),
         "A calibration whose held-out coefficient error is larger counts as APPROXIMATE (default: wavelength / 20).",
-        live=True,
     ),
-    Parameter(
+    live(
         "updates.enable",
         switch(True),
         "Take maps that arrive between calibrations to follow the drift of gains and figure.",
-        live=True,
     ),
-    Parameter(
+    live(
         "updates.still_time",
         real(0.5, 0.0, 600.0, "s"),
         "Before and after the stamp of a map the mirror must keep its shape for so long; creep corrections keep it.",
-        live=True,
     ),
-    Parameter(
+    live(
         "updates.surprise_max",
         real(3.0, 1.0, 100.0),
         "A map that differs from its prediction by more than this times the expected difference is not taken.",
-        live=True,
     ),
-    Parameter(
+    live(
         "updates.surprises_max",
         whole(3, 1, 1000),
         "Maps in a row that differ so much after which the mirror counts as changed.",
-        live=True,
     ),
     Parameter(
         "updates.gain_rate",
@@ -152,21 +131,17 @@ PARAMETERS = (
         real(1e-9, 0.0, 1e-6, "m"),
         "Expected rms drift of the figure in one day; it grows with the root of time. 0 = the figure stays.",
     ),
-    Parameter("updates.gain_drift_max", real(0.02, 0.0, 1.0), "Drift of a gain from which to warn.", live=True),
-    Parameter(
-        "updates.offset_drift_max", real(50e-9, 0.0, 1e-3, "m"), "Drift of the figure from which to warn.", live=True
-    ),
-    Parameter(
+    live("updates.gain_drift_max", real(0.02, 0.0, 1.0), "Drift of a gain from which to warn."),
+    live("updates.offset_drift_max", real(50e-9, 0.0, 1e-3, "m"), "Drift of the figure from which to warn."),
+    live(
         "updates.stale_after",
         real(2592000.0, 1.0, 1e10, "s"),
         "A calibration that no map has agreed with for so long is stale (default: 30 days).",
-        live=True,
     ),
-    Parameter(
+    live(
         "temperature.silent_after",
         real(60.0, 0.1, 86400.0, "s"),
         "After so long without a message on `temperature` that of the mirror is not known.",
-        live=True,
     ),
 )
 

@@ -13,7 +13,7 @@ from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap
 from dm_calibration.optics.instrument import RETRACE_SIZE
 from dm_calibration.optics.orientation import Orientation
-from dm_common.ros.parameters import AUTOSTART, Parameter, real, reals, switch, text, texts
+from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, reals, switch, text, texts
 
 PARAMETERS = (
     AUTOSTART,
@@ -43,56 +43,47 @@ PARAMETERS = (
     ),
     Parameter("trigger_output_suffix", text(".datx"), "Ending of the file name that replaces {path}."),
     Parameter("trigger_timeout", real(30.0, 0.1, 3600.0, "s"), "Time limit of trigger_command."),
-    Parameter(
-        "measure_timeout", real(60.0, 0.1, 86400.0, "s"), "Time limit of a measurement that asks for none.", live=True
-    ),
-    Parameter(
+    live("measure_timeout", real(60.0, 0.1, 86400.0, "s"), "Time limit of a measurement that asks for none."),
+    live(
         "aperture.radius",
         real(0.0, 0.0, 1.0, "m"),
         "Radius of the aperture; 0 = find the valid region of each map.",
-        live=True,
     ),
-    Parameter(
+    live(
         "aperture.centre_x",
         real(0.0, -1.0, 1.0, "m"),
         "Centre of the aperture from the oriented map's centre, x right; used with aperture.radius.",
-        live=True,
     ),
-    Parameter("aperture.centre_y", real(0.0, -1.0, 1.0, "m"), "The same, y up.", live=True),
-    Parameter(
+    live("aperture.centre_y", real(0.0, -1.0, 1.0, "m"), "The same, y up."),
+    live(
         "aperture.follow",
         switch(False),
         "Count that from the centre of the valid region, found anew in each map, where that ends at the rim of the "
         "mirror or of a mask on it.",
-        live=True,
     ),
-    Parameter(
+    live(
         "aperture.minimum_valid_fraction",
         real(0.7, 0.0, 1.0),
         "Smallest share of valid pixels inside the aperture; maps with fewer are refused.",
-        live=True,
     ),
-    Parameter("orientation.flip_x", switch(False), "Exchange left and right of the instrument's picture.", live=True),
-    Parameter("orientation.flip_y", switch(False), "Exchange top and bottom of the instrument's picture.", live=True),
-    Parameter(
+    live("orientation.flip_x", switch(False), "Exchange left and right of the instrument's picture."),
+    live("orientation.flip_y", switch(False), "Exchange top and bottom of the instrument's picture."),
+    live(
         "orientation.rotate_deg",
         real(0.0, -360.0, 360.0, "deg"),
         "Then rotate it counter-clockwise. `./dm calibrate --plan poke-check` finds flips and angle.",
-        live=True,
     ),
-    Parameter(
+    live(
         "wavelength.expected",
         real(0.0, 0.0, 2e-5, "m"),
         "Wavelength of the instrument; maps of another are refused. 0 = any.",
-        live=True,
     ),
-    Parameter("wavelength.tolerance", real(1e-9, 0.0, 1e-6, "m"), "Allowed difference from it.", live=True),
-    Parameter(
+    live("wavelength.tolerance", real(1e-9, 0.0, 1e-6, "m"), "Allowed difference from it."),
+    live(
         "pitch",
         real(0.0, 0.0, 0.1, "m"),
         "Lateral resolution per pixel, as `./dm measure --reference-sphere METRES` finds it; files that tell one "
         "that differs by more than 5 % are refused. 0 = as the files tell.",
-        live=True,
     ),
     Parameter(
         "reference_surface",
@@ -110,33 +101,29 @@ PARAMETERS = (
         real(0.0, -0.1, 0.1),
         "Radial distortion at the edge of the map, as a share, as `./dm instrument grid MARKS.csv MAP` finds it.",
     ),
-    Parameter(
+    live(
         "instrument_error",
         real(0.0, 0.0, 1e-6, "m"),
         "95 % bound on what is left of the instrument's error in any coefficient; results say what they are absolute "
         "to by it. 0 = not known.",
-        live=True,
     ),
-    Parameter(
+    live(
         "scale_error",
         real(0.0, 0.0, 0.1),
         "95 % bound on the relative error of the lateral scale, for the same; 0 = not known.",
-        live=True,
     ),
-    Parameter(
+    live(
         "xyz_unit",
         text("", choices=("", *XYZ_UNITS)),
         "Unit of the values in .xyz files, which do not tell it, and in .fits files without BUNIT; empty = refuse "
         "them.",
-        live=True,
     ),
-    Parameter(
+    live(
         "remove_piston_tilt",
         switch(False),
         "Subtract piston and tilt from the published map; coefficients and samples keep them.",
-        live=True,
     ),
-    Parameter("publish_map", switch(True), "Publish the map itself, several megabytes.", live=True),
+    live("publish_map", switch(True), "Publish the map itself, several megabytes."),
 )
 
 

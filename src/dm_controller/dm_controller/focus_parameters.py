@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Final
 
-from dm_common.ros.parameters import AUTOSTART, Parameter, real, switch, text, whole
+from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, switch, text, whole
 from dm_common.values import Fields, reals
 from dm_controller.creep_hold import PERIOD_S
 from dm_controller.planning.planner import SETTLE_S
@@ -12,31 +12,28 @@ from dm_controller.planning.planner import SETTLE_S
 AXIS_MAX = 0.1
 #: Of the closed loops, for whatever node hosts them.
 LOOP_PARAMETERS = (
-    Parameter(
+    live(
         "converge.tolerance",
         real(2e-9, 1e-11, 1e-5, "m"),
         "largest coefficient error at which a closed loop ends",
-        live=True,
     ),
-    Parameter("converge.max_maps", whole(5, 1, 100), "maps that a closed loop may take", live=True),
-    Parameter(
+    live("converge.max_maps", whole(5, 1, 100), "maps that a closed loop may take"),
+    live(
         "converge.creep",
         real(0.01, 0.0, 0.2),
         "growth of a move per decade of time that a loop foresees where no creep was identified; 0 = none",
-        live=True,
     ),
-    Parameter(
+    live(
         "recipes.tolerance",
         real(6.3e-10, 1e-11, 1e-5, "m"),
         "largest re-measured coefficient error of a recipe",
-        live=True,
     ),
-    Parameter("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take", live=True),
-    Parameter("recipes.average", whole(8, 2, 50), "most maps averaged after each degauss of a recipe", live=True),
+    live("recipes.max_maps", whole(32, 4, 100), "maps that one recipe may take"),
+    live("recipes.average", whole(8, 2, 50), "most maps averaged after each degauss of a recipe"),
     Parameter("converge.settle_time", real(0.5, 0.0, 600.0, "s"), "wait between command and map, in ROS time"),
     Parameter("converge.driver_timeout", real(30.0, 0.1, 600.0, "s"), "longest wait for the driver to set a shape"),
     Parameter("converge.measure_timeout", real(60.0, 0.1, 3600.0, "s"), "longest wait for one map"),
-    Parameter("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed", live=True),
+    live("converge.measure_retries", whole(1, 0, 20), "further tries after a map that failed"),
     Parameter("recipes.degauss_steps", whole(100, 1, 10000), "half-swings of the degauss that recipes begin with"),
     Parameter("recipes.degauss_timeout", real(120.0, 1.0, 3600.0, "s"), "longest wait for a degauss"),
 )
@@ -59,67 +56,57 @@ PARAMETERS: Final = (
         "wait after the last write before a MoveFocus goal succeeds, and when a shape is to be right",
     ),
     Parameter("move_timeout", real(10.0, 0.1, 600.0, "s"), "longest time a move may take"),
-    Parameter(
+    live(
         "driver_timeout",
         real(3.0, 0.0, 600.0, "s"),
         "silence of pdm_driver after which requests are refused, and longest wait until it confirms a command; longer "
         "than its state_period; 0 = never, and 3 s for a command",
-        live=True,
     ),
-    Parameter(
+    live(
         "time_budget",
         real(0.0, 0.0, 3600.0, "s"),
         "time in which AUTO may condition the mirror, for requests that name none; 0 = never by itself",
-        live=True,
     ),
-    Parameter(
+    live(
         "condition.degauss_steps",
         whole(0, 0, 10000),
         "half-swings of the degauss that conditions; 0 = as the recipes were built, without recipes as the driver does",
-        live=True,
     ),
-    Parameter("condition.timeout", real(180.0, 0.1, 3600.0, "s"), "longest wait for that degauss", live=True),
-    Parameter("hold.enable", switch(True), "correct a shape for creep while it is held", live=True),
+    live("condition.timeout", real(180.0, 0.1, 3600.0, "s"), "longest wait for that degauss"),
+    live("hold.enable", switch(True), "correct a shape for creep while it is held"),
     Parameter("hold.period", real(PERIOD_S, 0.01, 3600.0, "s"), "shortest time between two corrections"),
-    Parameter(
+    live(
         "hold.tolerance",
         real(2e-10, 1e-12, 1e-6, "m"),
         "predicted Zernike coefficient error from which a held shape is corrected",
-        live=True,
     ),
-    Parameter(
-        "hold.slew", real(0.02, 1e-5, 2.0), "largest change of a signal in one correction, normalised", live=True
-    ),
-    Parameter(
+    live("hold.slew", real(0.02, 1e-5, 2.0), "largest change of a signal in one correction, normalised"),
+    live(
         "hold.resolution",
         real(3.0518e-5, 0.0, 0.1),
         "step of the electronics, normalised (16 bit over the range: 2/65535); less than half of it is not corrected",
-        live=True,
     ),
-    Parameter(
+    live(
         "calibration_age_max",
         real(2_592_000.0, 0.0, 1e9, "s"),
         "age from which a calibration that no map has confirmed is called stale; it is still used; 0 = never",
-        live=True,
     ),
     Parameter(
         "state_folder",
         text("~/.ros/focus_controller"),
         "folder that keeps what the actuators of each mirror have crept to, for the next start; empty = keep nothing",
     ),
-    Parameter(
+    live(
         "hold_tilt",
         switch(True),
         "keep the mirror's tilt while its curvature changes, so that the picture of a camera stands still; "
         "false = tilt is free",
-        live=True,
     ),
-    Parameter(
+    live(
         "optical_axis",
         reals([0.0, 0.0], -AXIS_MAX, AXIS_MAX, "m", sizes=(2,)),
         "x and y of where the camera's axis meets the mirror, from the middle of the calibrated aperture: the picture "
         "stands still where the vertex of the sphere stays on it; `./dm calibrate --boresight` finds it",
-        live=True,
     ),
     *LOOP_PARAMETERS,
 )

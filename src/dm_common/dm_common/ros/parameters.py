@@ -135,6 +135,11 @@ class Parameter:
         return descriptor
 
 
+def live(name: str, value: Value, description: str) -> Parameter:
+    """A parameter that may change while the node runs."""
+    return Parameter(name, value, description, live=True)
+
+
 #: Of every lifecycle node.
 AUTOSTART = Parameter("autostart", switch(True), "Configure and activate by itself after the start.")
 
