@@ -83,7 +83,7 @@ def test_the_law_is_fitted_to_the_very_maps_that_count(monkeypatch: pytest.Monke
     monkeypatch.setattr(hysteresis_fit, "identify", one_more)
     every = Responses(np.zeros((60, 1)), 1, np.ones(60, dtype=bool))
     run = Run(np.zeros((60, 1)), np.arange(60.0), every)
-    _, kept = hysteresis_fit._without_outliers(run, np.zeros(60, dtype=bool), (), print)
+    _, kept = hysteresis_fit._without_outliers(run, np.zeros(60, dtype=bool), ())
     assert kept is fitted_to[-1]
     assert kept.responses.usable.sum() == 60 - hysteresis_fit.OUTLIER_ROUNDS + 1
 

@@ -3,14 +3,26 @@
 import math
 from typing import Final
 
-from dm_common.ros.parameters import AUTOSTART, REQUIRED, Parameter, real, reals, switch, text, whole, wholes
+from dm_common.ros.parameters import (
+    AUTOSTART,
+    REQUIRED,
+    Parameter,
+    fields_of,
+    live,
+    real,
+    reals,
+    switch,
+    text,
+    whole,
+    wholes,
+)
 from dm_driver.degauss import STEPS_MAX
 from dm_driver.electronics import BACK_ENDS
 from dm_driver.electronics.check_sums import CHECK_SUMS
 from dm_driver.electronics.frame_format import BYTE_ORDERS, MOST_BITS, MOST_WORD_BITS, PARITIES, FrameFormat
 from dm_driver.output.volts import LAWS, LINEAR
 
-_FRAME: Final = FrameFormat()
+_frame = fields_of("framed_serial", FrameFormat())
 
 PARAMETERS: Final = (
     AUTOSTART,
@@ -66,56 +78,40 @@ PARAMETERS: Final = (
         "leaves at most one step. False = never wait: for a unit that acknowledges late, where speed counts more.",
     ),
     Parameter("electronics.timeout", real(1.0, 0.01, 60.0, "s"), "Longest wait for the electronics."),
-    Parameter("framed_serial.channels", whole(_FRAME.channels, 1, 4096), "Output channels of the unit."),
-    Parameter("framed_serial.bits", whole(_FRAME.bits, 1, MOST_BITS), "Bits of a code."),
-    Parameter("framed_serial.header", text(_FRAME.header), "Bytes before the words, hexadecimal, for example 'A5 5A'."),
-    Parameter("framed_serial.terminator", text(_FRAME.terminator), "Bytes after the check sum, hexadecimal."),
+    _frame("channels", whole(..., 1, 4096), "Output channels of the unit."),
+    _frame("bits", whole(..., 1, MOST_BITS), "Bits of a code."),
+    _frame("header", text(...), "Bytes before the words, hexadecimal, for example 'A5 5A'."),
+    _frame("terminator", text(...), "Bytes after the check sum, hexadecimal."),
     Parameter(
         "framed_serial.channel_order",
         wholes([], 0, 4095),
         "Connector channels, from 0, in the order of their words; empty = 0, 1, 2, ...",
     ),
-    Parameter(
-        "framed_serial.word_bits",
-        whole(_FRAME.word_bits, 0, MOST_WORD_BITS),
+    _frame(
+        "word_bits",
+        whole(..., 0, MOST_WORD_BITS),
         "Bits of a word on the wire, no gaps between words; 0 = framed_serial.bits rounded up to whole bytes.",
     ),
-    Parameter(
-        "framed_serial.byte_order",
-        text(_FRAME.byte_order, choices=BYTE_ORDERS),
+    _frame(
+        "byte_order",
+        text(..., choices=BYTE_ORDERS),
         "big: words begin with their most significant bit; little: with their least significant byte and bit.",
     ),
-    Parameter("framed_serial.scale", whole(_FRAME.scale, -(2**31), 2**31), "word = offset + scale * code."),
-    Parameter(
-        "framed_serial.offset",
-        whole(_FRAME.offset, -(2**31), 2**32),
-        "word = offset + scale * code; negative words in two's complement.",
-    ),
-    Parameter("framed_serial.checksum", text(_FRAME.checksum, choices=tuple(CHECK_SUMS)), "Check sum."),
-    Parameter(
-        "framed_serial.checksum_covers_header",
-        switch(_FRAME.checksum_covers_header),
-        "The check sum counts the header.",
-    ),
-    Parameter(
-        "framed_serial.checksum_byte_order",
-        text(_FRAME.checksum_byte_order, choices=BYTE_ORDERS),
-        "Of check sums of two bytes.",
-    ),
-    Parameter("framed_serial.opening", text(_FRAME.opening), "Bytes sent once after opening, hexadecimal."),
-    Parameter(
-        "framed_serial.reply",
-        text(_FRAME.reply),
+    _frame("scale", whole(..., -(2**31), 2**31), "word = offset + scale * code."),
+    _frame("offset", whole(..., -(2**31), 2**32), "word = offset + scale * code; negative words in two's complement."),
+    _frame("checksum", text(..., choices=tuple(CHECK_SUMS)), "Check sum."),
+    _frame("checksum_covers_header", switch(...), "The check sum counts the header."),
+    _frame("checksum_byte_order", text(..., choices=BYTE_ORDERS), "Of check sums of two bytes."),
+    _frame("opening", text(...), "Bytes sent once after opening, hexadecimal."),
+    _frame(
+        "reply",
+        text(...),
         "What the unit answers to every frame within electronics.timeout, hexadecimal; empty = it does not answer.",
     ),
-    Parameter("framed_serial.baud_rate", whole(_FRAME.baud_rate, 50, 10_000_000, "bit/s"), "Of the line."),
-    Parameter("framed_serial.parity", text(_FRAME.parity, choices=PARITIES), "Parity bit."),
-    Parameter("framed_serial.stop_bits", whole(_FRAME.stop_bits, 1, 2), "Stop bits."),
-    Parameter(
-        "framed_serial.frame_rate",
-        real(_FRAME.frame_rate, 0.0, 1e6, "Hz"),
-        "Most frames per second; 0 = as many as the line carries.",
-    ),
+    _frame("baud_rate", whole(..., 50, 10_000_000, "bit/s"), "Of the line."),
+    _frame("parity", text(..., choices=PARITIES), "Parity bit."),
+    _frame("stop_bits", whole(..., 1, 2), "Stop bits."),
+    _frame("frame_rate", real(..., 0.0, 1e6, "Hz"), "Most frames per second; 0 = as many as the line carries."),
     Parameter("volts.dac_at_zero", real(REQUIRED, unit="V"), "DAC output for code 0 (EDAC40 as delivered: -6)."),
     Parameter("volts.dac_at_full", real(REQUIRED, unit="V"), "DAC output for the full-scale code (EDAC40: +6)."),
     Parameter("volts.amplifier_gain", real(REQUIRED), "Actuator volts per DAC volt (about 80)."),
@@ -143,10 +139,9 @@ PARAMETERS: Final = (
     ),
     Parameter("safe_signals", reals([], -1.0, 1.0), "The safe shape; empty = all -1 (volts.min)."),
     Parameter("degauss.steps", whole(100, 1, STEPS_MAX), "Half-swings of a degauss."),
-    Parameter(
+    live(
         "degauss.duration_max",
         real(180.0, 1.0, 3600.0, "s"),
         "Longest degauss: goals that would take longer are refused.",
-        live=True,
     ),
 )

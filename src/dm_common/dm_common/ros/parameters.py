@@ -8,7 +8,7 @@ import difflib
 import math
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -25,6 +25,8 @@ __all__ = [
     "ParameterError",
     "Values",
     "declare",
+    "fields_of",
+    "live",
     "real",
     "reals",
     "switch",
@@ -133,6 +135,18 @@ class Parameter:
         if value.kind is int and bounded:
             descriptor.integer_range = [IntegerRange(from_value=int(value.low), to_value=int(value.high))]
         return descriptor
+
+
+def fields_of(group: str, config: Any) -> Callable[[str, Value, str], Parameter]:
+    """A function that makes the parameters of `group` after fields of `config`; it takes what `Parameter` does.
+
+    The name is that of the field, as is the default, for which `...` stands.
+    """
+
+    def parameter(name: str, value: Value, description: str) -> Parameter:
+        return Parameter(f"{group}.{name}", replace(value, default=getattr(config, name)), description)
+
+    return parameter
 
 
 def live(name: str, value: Value, description: str) -> Parameter:
