@@ -112,6 +112,18 @@ def terms_text(zernike: Sequence[float]) -> str:
     return ", ".join(f"{name} {1e9 * value:+.4g} nm" for name, value in terms if value)
 
 
+def recipe_row(recipe: Any) -> tuple[str, ...]:
+    """Curvature, conic constant, added terms, re-measured errors in nm and maps of a recipe or its message, as text."""
+    return (
+        f"{recipe.curvature:+.4f}",
+        f"{recipe.conic_constant:g}",
+        terms_text(recipe.zernike) or "-",
+        f"{1e9 * recipe.max_zernike:.2f}",
+        f"{1e9 * recipe.rms:.2f}",
+        str(recipe.maps),
+    )
+
+
 def terms_of(text: str) -> list[float]:
     """Added terms, m, from a text such as "astigmatism cos=200, coma sin=-50", in nm; names of SPOKEN.
 

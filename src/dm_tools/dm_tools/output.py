@@ -106,6 +106,12 @@ def nanometres(length: float) -> float:
     return length * 1e9
 
 
+def figures(message: Any, *names: str) -> dict[str, Any]:
+    """Fields of `message` for JSON; of a name that ends in `_nm` the field without that, in nanometres."""
+    fields = {name: getattr(message, name.removesuffix("_nm")) for name in names}
+    return {name: nanometres(value) if name.endswith("_nm") else value for name, value in fields.items()}
+
+
 def as_wavelengths(length: float) -> str:
     """A length (m) by the wavelength of the interferometer, such as λ/50; "" above λ/5."""
     return in_wavelengths(length, WAVELENGTH)

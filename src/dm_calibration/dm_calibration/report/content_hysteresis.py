@@ -9,7 +9,7 @@ from dm_calibration.report.document import BLUE, GREEN, GREY, ORANGE, VERMILION,
 from dm_common import Floats
 from dm_common.hysteresis.law_shape import branch, closed_cycle, opening, turned
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.recipes import RecipeBook, terms_text
+from dm_common.recipes import RecipeBook, recipe_row
 
 #: Minor loops: from the falling branch, down to each of these and back.
 MINOR_TURNS = (0.6, 0.2, -0.2, -0.6)
@@ -142,18 +142,8 @@ def recipes(calibration: Calibration) -> Section:
     if not book.recipes:
         text = "None are stored with this calibration, so none was re-measured. The action “build_recipes” builds them."
         return Section(title, [text])
-    rows = [
-        (
-            f"{recipe.curvature:+.4f}",
-            f"{recipe.conic_constant:g}",
-            terms_text(recipe.zernike) or "-",
-            f"{recipe.max_zernike * NM:.2f}",
-            f"{recipe.rms * NM:.2f}",
-            str(recipe.maps),
-            f"{recipe.signals.min():+.3f} … {recipe.signals.max():+.3f}",
-        )
-        for recipe in book.recipes
-    ]
+    ranges = (f"{recipe.signals.min():+.3f} … {recipe.signals.max():+.3f}" for recipe in book.recipes)
+    rows = [(*recipe_row(recipe), reach) for recipe, reach in zip(book.recipes, ranges, strict=True)]
     header = ("curvature, 1/m", "conic", "added terms", "largest coefficient, nm", "rms sag, nm", "maps", "signals")
     text = (
         f"Each begins with a degauss of {book.degauss_steps} half-swings. The last was built {utc(book.stamp_ns)}. "

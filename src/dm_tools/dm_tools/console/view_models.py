@@ -12,7 +12,7 @@ from matplotlib import colormaps
 from dm_common import Floats
 from dm_common.figures import with_point
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
-from dm_common.recipes import terms_text
+from dm_common.recipes import recipe_row
 
 NM = 1e9
 #: Half-width of a 95 % interval in standard deviations.
@@ -252,20 +252,10 @@ def evenly(first: float | None, last: float | None, number: float | None) -> lis
 
 
 def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:
-    """Recipes of a dm_msgs/Calibration: curvature, conic constant, added terms, re-measured errors in nm, maps."""
+    """Recipes of a dm_msgs/Calibration; see `recipe_row`."""
     if calibration is None or not calibration.id:
         return []
-    return [
-        (
-            f"{recipe.curvature:+.4f}",
-            f"{recipe.conic_constant:g}",
-            terms_text(recipe.zernike) or "-",
-            f"{recipe.max_zernike * NM:.2f}",
-            f"{recipe.rms * NM:.2f}",
-            str(recipe.maps),
-        )
-        for recipe in calibration.recipes.recipes
-    ]
+    return [recipe_row(recipe) for recipe in calibration.recipes.recipes]
 
 
 def calibration_text(calibration: Any) -> list[str]:

@@ -1,11 +1,20 @@
 """`dm check`: compare one map with the calibration in use, and let it improve it."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from dm_common.figures import two_fold
-from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, nanometres, next_step, write_json
+from dm_tools.output import (
+    JsonOption,
+    NamespaceOption,
+    TakeOverOption,
+    console,
+    figures,
+    nanometres,
+    next_step,
+    write_json,
+)
 from dm_tools.running_suite import (
     REPORT_S,
     hear_health,
@@ -66,7 +75,8 @@ def check(
         f"since the calibration was made: {maps} taken in, gains changed by up to {response.gain_drift:.2%}, the "
         f"figure by {nanometres(response.offset_drift):.2f} nm rms"
     )
-    write_json(json, {"check": figures_of(response) | {"promised_nm": nanometres(promised)}})
+    names = ("accepted", "max_zernike_nm", "rms_nm", "surprise", "revision", "gain_drift", "offset_drift_nm")
+    write_json(json, {"check": figures(response, *names) | {"promised_nm": nanometres(promised)}})
     if not (response.accepted or forget):
         cure = "as the message says, or ./dm calibrate" if "--without" in response.message else "./dm calibrate"
         next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}")
@@ -82,16 +92,3 @@ def check(
         if calibration.hysteresis.play_radius
         else "./dm calibrate finds the hysteresis too, and promises far less than this"
     )
-
-
-def figures_of(response: Any) -> dict[str, Any]:
-    """A check's figures for JSON."""
-    return {
-        "accepted": response.accepted,
-        "max_zernike_nm": nanometres(response.max_zernike),
-        "rms_nm": nanometres(response.rms),
-        "surprise": response.surprise,
-        "revision": response.revision,
-        "gain_drift": response.gain_drift,
-        "offset_drift_nm": nanometres(response.offset_drift),
-    }

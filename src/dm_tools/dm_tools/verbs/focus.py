@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, nanometres, next_step, write_json
+from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
 from dm_tools.running_suite import naming_holder, promise, running_suite
 
 
@@ -106,13 +106,6 @@ def _show_next(state: Any) -> None:
 
 def figures_of(state: Any) -> dict[str, Any]:
     """A dm_msgs/FocusState's figures for JSON."""
-    return {
-        "curvature": state.curvature,
-        "predicted_rms_nm": nanometres(state.predicted_rms),
-        "predicted_rms_upper_nm": nanometres(state.predicted_rms_upper),
-        "predicted_max_zernike_nm": nanometres(state.predicted_max_zernike),
-        "predicted_max_zernike_upper_nm": nanometres(state.predicted_max_zernike_upper),
-        "saturated": state.saturated,
-        "applied": state.applied,
-        "calibration": state.calibration_id,
-    }
+    lengths = ("predicted_rms_nm", "predicted_rms_upper_nm", "predicted_max_zernike_nm")
+    rest = ("predicted_max_zernike_upper_nm", "saturated", "applied")
+    return figures(state, "curvature", *lengths, *rest) | {"calibration": state.calibration_id}
