@@ -26,7 +26,7 @@ def dump(node: Node) -> dict[str, Any]:
 @pytest.mark.parametrize("entry", NODES, ids=lambda entry: str(entry.name))
 def test_dump_load_dump_is_the_same(observer: Observer, entry: SuiteNode, tmp_path: Path) -> None:
     table = entry.load_parameters()
-    required = {item.name: "x" if item.kind is str else 1.0 for item in table if item.default is REQUIRED}
+    required = {item.name: "x" if item.value.kind is str else 1.0 for item in table if item.default is REQUIRED}
     if "electronics.kind" in required:
         required["electronics.kind"] = "edac40_tcp"
     first = Node(entry.name, parameter_overrides=[RosParameter(name, value=value) for name, value in required.items()])

@@ -16,7 +16,7 @@ def as_markdown(table: Sequence[Parameter]) -> str:
     lines = ["| parameter | default | allowed | what it is |", "|---|---|---|---|"]
     for parameter in table:
         default = "**required**" if parameter.default is REQUIRED else f"`{parameter.default!r}`"
-        allowed, unit = parameter.allowed(), parameter.value.unit
+        allowed, unit = parameter.value.allowed(), parameter.value.unit
         if unit and not allowed.endswith(unit):
             allowed += f" ({unit})"
         live = " *live*" if parameter.live else ""

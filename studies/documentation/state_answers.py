@@ -71,7 +71,7 @@ class Nodes:
         for node in NODES:
             for parameter in node.load_parameters():
                 name = parameter.name
-                wrong = self.put(node.name, name, 1.5 if parameter.kind is str else "nonsense")
+                wrong = self.put(node.name, name, 1.5 if parameter.value.kind is str else "nonsense")
                 assert name in wrong, f"{node.name}: {name}: {wrong!r}"
                 request = GetParameters.Request(names=[name])
                 (now,) = self.ask(GetParameters, f"{node.name}/get_parameters", request).values

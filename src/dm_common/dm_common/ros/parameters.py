@@ -9,6 +9,7 @@ import math
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -73,10 +74,6 @@ class Parameter:
     live: bool = False
 
     @property
-    def kind(self) -> type | str:
-        return self.value.kind
-
-    @property
     def default(self) -> Any:
         return self.value.default
 
@@ -86,10 +83,6 @@ class Parameter:
         if self.value.choices:
             described += f" One of: {', '.join(map(str, self.value.choices))}."
         return described
-
-    def allowed(self) -> str:
-        """The allowed values as text."""
-        return self.value.allowed()
 
     def check(self, given: Any) -> Any:
         """The value that `given` stands for: where a float is wanted, a whole number counts as one.
@@ -103,7 +96,7 @@ class Parameter:
             float(item) if value.item is float and type(item) is int else item for item in (given if many else [given])
         ]
         if many != value.many or any(type(item) is not value.item for item in items):
-            raise ParameterError(f"{self.name} = {given!r}: must be {self.allowed()}")
+            raise ParameterError(f"{self.name} = {given!r}: must be {self.value.allowed()}")
         checked = items if many else items[0]
         try:
             value.check(self.name, checked)
@@ -114,11 +107,11 @@ class Parameter:
     @property
     def blank(self) -> Any:
         """What stands for a value that is missing or wrong: the default, or nothing."""
-        return ("" if self.kind is str else math.nan) if self.default is REQUIRED else self.default
+        return ("" if self.value.kind is str else math.nan) if self.default is REQUIRED else self.default
 
     def as_ros(self, value: Any) -> RosParameter:
         """The parameter with a value that `check` returned."""
-        return RosParameter(self.name, _TYPES[self.kind], value)
+        return RosParameter(self.name, _TYPES[self.value.kind], value)
 
     def descriptor(self, read_only: bool = False) -> ParameterDescriptor:
         value = self.value
@@ -126,7 +119,7 @@ class Parameter:
             name=self.name,
             type=_TYPES[value.kind].value,
             description=self.describe(),
-            additional_constraints=self.allowed(),
+            additional_constraints=value.allowed(),
             read_only=read_only,
         )
         bounded = not (math.isinf(value.low) and math.isinf(value.high))
@@ -149,11 +142,8 @@ def fields_of(group: str, config: Any) -> Callable[[str, Value, str], Parameter]
     return parameter
 
 
-def live(name: str, value: Value, description: str) -> Parameter:
-    """A parameter that may change while the node runs."""
-    return Parameter(name, value, description, live=True)
-
-
+#: A parameter that may change while the node runs.
+live = partial(Parameter, live=True)
 #: Of every lifecycle node.
 AUTOSTART = Parameter("autostart", switch(True), "Configure and activate by itself after the start.")
 
@@ -266,7 +256,7 @@ def _declared(node: Node, known: Mapping[str, Parameter]) -> Values:
         except ParameterError as error:
             values[name], values.problems[name] = parameter.blank, str(error)
         # An array by its type alone would be without a value, which hides all others from `ros2 param dump`.
-        node.declare_parameter(name, _TYPES[parameter.kind], parameter.descriptor(), ignore_override=True)
+        node.declare_parameter(name, _TYPES[parameter.value.kind], parameter.descriptor(), ignore_override=True)
         node.set_parameters([parameter.as_ros(values[name])])
     for name in given:
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
@@ -284,7 +274,7 @@ def _converted(parameter: Parameter, change: RosParameter) -> RosParameter:
     try:
         return parameter.as_ros(parameter.check([] if empty else change.value))
     except ParameterError as error:
-        if change.type_ == _TYPES[parameter.kind]:
+        if change.type_ == _TYPES[parameter.value.kind]:
             return change
         raise _RefusedParameterError(str(error)) from error  # what rclpy says of another type names no parameter
 
