@@ -17,7 +17,7 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.recalibration.drift import Drift
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.messages import doubles, recipe_book_message, time_message
+from dm_common.messages import doubles, recipe_book_message, taken, time_message
 
 # Fields of the message that are named as those of a calibration and of its fit.
 _NAMES = (
@@ -27,18 +27,14 @@ _NAMES = (
 _RANGE = ("method", "actuators", "signal_min", "signal_max")
 _FIGURES = ("in_sample_rms", "held_out_rms", "held_out_max_zernike", "condition_number")
 _MODEL = ("influence_zernike", "zernike_offset", "influence_sag", "sag_offset")
+#: Arrays of a hysteresis model that the message has under the same names.
+_LAW = ("play_radius", "play_weight", "creep_time", "creep_spectrum", "lag_spectrum", "crept", "creep_covariance")
 
 
 def driver_facts(message: MirrorInfo) -> dict[str, Any]:
     """What maps depend on beside the mirror itself: wiring, electronics and volts."""
-    return {
-        "wiring": message.wiring,
-        "channels": list(message.channels),
-        "electronics": message.electronics,
-        "volts_min": message.volts_min,
-        "volts_max": message.volts_max,
-        "slew_rate_max": message.slew_rate_max,
-    }
+    same = taken(message, "wiring", "electronics", "volts_min", "volts_max", "slew_rate_max")
+    return same | {"channels": list(message.channels)}
 
 
 def calibration_message(
@@ -128,22 +124,13 @@ def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
     law = hysteresis.law
     return ActuatorHysteresis(
         law=hysteresis.name,
-        play_radius=doubles(law.play_radius),
+        **{name: doubles(getattr(law, name)) for name in _LAW},
         powers=law.play_weight.shape[-1],
-        play_weight=doubles(law.play_weight),
         duhem_slope=doubles(_slopes(law)),
         duhem_weight=doubles(np.atleast_1d(law.duhem_weight)),
-        creep_rate=law.creep_rate,
-        creep_time=doubles(law.creep_time),
-        creep_spectrum=doubles(law.creep_spectrum),
         lags=law.lag_spectrum.shape[-1],
-        lag_spectrum=doubles(law.lag_spectrum),
-        creep_slope=law.creep_slope,
         crept_at=time_message(round(1e9 * law.crept_at)),
-        crept=doubles(law.crept),
-        creep_covariance=doubles(law.creep_covariance),
+        **taken(law, "creep_rate", "creep_slope"),
         zernike_sigma=doubles(hysteresis.zernike_sigma),
-        held_out_max_zernike=hysteresis.held_out_max_zernike,
-        unknown_sigma=hysteresis.unknown_sigma,
-        maps=hysteresis.maps,
+        **taken(hysteresis, "held_out_max_zernike", "unknown_sigma", "maps"),
     )

@@ -31,6 +31,11 @@ def doubles(values: Floats) -> array[float]:
     return buffer
 
 
+def taken(source: Any, *names: str) -> dict[str, Any]:
+    """Fields of `source` by their names, for what has them under the same."""
+    return {name: getattr(source, name) for name in names}
+
+
 def time_message(stamp_ns: int) -> Time:
     """ns since the epoch of the clock as a message."""
     return Time(sec=int(stamp_ns // 10**9), nanosec=int(stamp_ns % 10**9))
@@ -77,6 +82,11 @@ def mirror_from(message: MirrorInfo) -> Mirror:
     )
 
 
+#: Fields of Measurement that dm_msgs/SurfaceMapInfo and dm_msgs/ZernikeCoefficients have under the same names.
+OF_FILE = ("reference_surface", "instrument_error", "scale_error", "instrument", "pitch", "system_error_subtracted")
+OF_FIT = ("residual_rms", "valid_fraction", "radius", "wavelength")
+
+
 def measurement_from(response: Any) -> Measurement:
     """The map in an answer of the service `measure`.
 
@@ -87,7 +97,7 @@ def measurement_from(response: Any) -> Measurement:
     from dm_common.measurement import Measurement
     from dm_common.optics.sampling import SamplePoints
 
-    zernike, samples = response.zernike, response.samples
+    zernike, samples, info = response.zernike, response.samples, response.info
     if zernike.convention != ZernikeCoefficients.BORN_WOLF:
         raise ValueError(f"zernike.convention = {zernike.convention}: must be {ZernikeCoefficients.BORN_WOLF}")
     if not len(samples.sag) == len(samples.x) == len(samples.y) == len(samples.weight) > 0:
@@ -100,22 +110,12 @@ def measurement_from(response: Any) -> Measurement:
         coefficients=coefficients,
         sigma=sigma if sigma.shape == coefficients.shape else np.full(coefficients.shape, np.nan),
         stamp_ns=stamp_ns(zernike.header.stamp),
-        residual_rms=zernike.residual_rms,
-        valid_fraction=zernike.valid_fraction,
-        radius=zernike.radius,
-        wavelength=zernike.wavelength,
-        system_error_subtracted=response.info.system_error_subtracted,
-        reference_surface=response.info.reference_surface,
-        instrument_error=response.info.instrument_error,
-        scale_error=response.info.scale_error,
-        file=response.info.file,
-        sha256=response.info.sha256,
-        instrument=response.info.instrument,
-        pitch=response.info.pitch,
-        camera=(response.info.width, response.info.height),
-        centre=(response.info.centre_x, response.info.centre_y),
-        radius_px=response.info.aperture_radius_px,
-        orientation=(response.info.flip_x, response.info.flip_y, response.info.rotate_deg),
+        **taken(zernike, *OF_FIT),
+        **taken(info, "file", "sha256", *OF_FILE),
+        camera=(info.width, info.height),
+        centre=(info.centre_x, info.centre_y),
+        radius_px=info.aperture_radius_px,
+        orientation=(info.flip_x, info.flip_y, info.rotate_deg),
     )
 
 
@@ -126,11 +126,8 @@ def applied_from(message: ActuatorState, heard: float = -math.inf) -> Applied:
     return Applied(
         time=seconds(message.header.stamp),
         signals=signals,
-        turns=message.turns,
         turned_at=turned_at if turned_at.shape == signals.shape else None,
-        degausses=message.degausses,
-        history_known=message.history_known,
-        moving=message.moving,
+        **taken(message, "turns", "degausses", "history_known", "moving"),
         requested=np.array(message.requested, dtype=np.float64),
         active=message.driver_state == ActuatorState.STATE_ACTIVE,
         linked=message.driver_state != ActuatorState.STATE_LINK_LOST,
@@ -250,7 +247,7 @@ def recipe_book_from(message: RecipeBookMsg) -> RecipeBook:
             effective=np.array(recipe.effective, dtype=np.float64),
             signals=np.array(recipe.signals, dtype=np.float64),
             zernike=tuple(recipe.zernike),
-            **{name: getattr(recipe, name) for name in _NUMBERS},
+            **taken(recipe, *_NUMBERS),
         )
         for recipe in message.recipes
     ]

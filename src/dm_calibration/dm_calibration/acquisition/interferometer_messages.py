@@ -13,7 +13,7 @@ from dm_calibration.acquisition.reference_surface import MapRejectedError
 from dm_calibration.acquisition.sensor import sensor_surface
 from dm_calibration.map_files import SurfaceMap
 from dm_common.measurement import Measurement
-from dm_common.messages import doubles
+from dm_common.messages import OF_FILE, OF_FIT, doubles, taken
 from dm_common.optics.zernike import TERMS, ansi_to_born_wolf, fringe_to_born_wolf, noll_to_born_wolf
 
 
@@ -47,26 +47,15 @@ def info_message(surface: SurfaceMap, measured: Measurement, header: Header) -> 
         header=header,
         width=measured.camera[0],
         height=measured.camera[1],
-        pitch=measured.pitch,
-        wavelength=measured.wavelength,
         centre_x=measured.centre[0],
         centre_y=measured.centre[1],
         aperture_radius_px=measured.radius_px,
         aperture_radius=measured.radius,
-        valid_fraction=measured.valid_fraction,
-        pv=surface.pv,
-        rms=surface.rms,
-        piston_tilt_removed=surface.piston_tilt_removed,
-        system_error_subtracted=measured.system_error_subtracted,
-        reference_surface=measured.reference_surface,
-        instrument_error=measured.instrument_error,
-        scale_error=measured.scale_error,
+        **taken(measured, "wavelength", "valid_fraction", *OF_FILE),
+        **taken(surface, "pv", "rms", "piston_tilt_removed", "file", "sha256"),
         flip_x=measured.orientation[0],
         flip_y=measured.orientation[1],
         rotate_deg=measured.orientation[2],
-        instrument=measured.instrument,
-        file=surface.file,
-        sha256=surface.sha256,
     )
 
 
@@ -76,14 +65,11 @@ def zernike_message(measured: Measurement, header: Header) -> ZernikeCoefficient
     return ZernikeCoefficients(
         header=header,
         convention=ZernikeCoefficients.BORN_WOLF,
-        radius=measured.radius,
         centre_x=(x - (width - 1) / 2) * measured.pitch,
         centre_y=((height - 1) / 2 - y) * measured.pitch,
-        wavelength=measured.wavelength,
         coefficients=doubles(measured.coefficients),
         sigma=doubles(measured.sigma),
-        residual_rms=measured.residual_rms,
-        valid_fraction=measured.valid_fraction,
+        **taken(measured, *OF_FIT),
     )
 
 
