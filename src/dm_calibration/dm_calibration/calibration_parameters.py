@@ -1,7 +1,6 @@
 """Parameters of the node `calibration`."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 from dm_calibration.influence.fit import FitOptions
@@ -11,6 +10,7 @@ from dm_calibration.recalibration.drift_filter import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
 from dm_common.mirror import APERTURE_TOLERANCE
 from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, switch, text, whole
+from dm_common.values import named
 
 PARAMETERS = (
     AUTOSTART,
@@ -146,33 +146,28 @@ PARAMETERS = (
 )
 
 
-def _named(kind: Any, values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The parameters called as fields of the dataclass `kind`, behind `prefix`."""
-    return {field.name: values[prefix + field.name] for field in fields(kind) if prefix + field.name in values}
-
-
 def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
     """Options of a fit from the node's parameters; `method` empty = the default."""
     return FitOptions(
-        **_named(FitOptions, values) | {"method": method or FitOptions().method, "epsilon": values["epsilon"] or None}
+        **named(FitOptions, values) | {"method": method or FitOptions().method, "epsilon": values["epsilon"] or None}
     )
 
 
 def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> ProcedureOptions:
     """Options of a run from the node's parameters; `maps_per_state` 0 = 1."""
     return ProcedureOptions(
-        **_named(ProcedureOptions, values),
+        **named(ProcedureOptions, values),
         maps_per_state=maps_per_state or 1,
         fit=fit_options(values),
-        bump=BumpOptions(**_named(BumpOptions, values), **_named(BumpOptions, values, "bump.")),
+        bump=BumpOptions(**named(BumpOptions, values), **named(BumpOptions, values, "bump.")),
     )
 
 
 def update_options(values: Mapping[str, Any]) -> UpdateOptions:
     """Options of updates from the node's parameters."""
     return UpdateOptions(
-        **_named(UpdateOptions, values),
-        **_named(UpdateOptions, values, "updates."),
+        **named(UpdateOptions, values),
+        **named(UpdateOptions, values, "updates."),
         # Without a hysteresis model, an actuator may stand on any branch of its loop.
         signal_sigma=0.5 * values["hysteresis_allowance"],
         rates=DriftRates(values["updates.gain_rate"], values["updates.figure_rate"]),

@@ -14,6 +14,7 @@ from dm_calibration.map_files import XYZ_UNITS, SurfaceMap
 from dm_calibration.optics.instrument import RETRACE_SIZE
 from dm_calibration.optics.orientation import Orientation
 from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, reals, switch, text, texts
+from dm_common.values import named
 
 PARAMETERS = (
     AUTOSTART,
@@ -155,24 +156,16 @@ def ingest_settings(
 ) -> IngestSettings:
     """What maps are read with, of a mirror of `mirror_radius`, m; 0 = not known."""
     return IngestSettings(
-        xyz_unit=values["xyz_unit"],
-        pitch=values["pitch"],
+        **named(IngestSettings, values) | {"retrace": tuple(values["retrace"])},
         wavelength=values["wavelength.expected"],
         wavelength_tolerance=values["wavelength.tolerance"],
-        orientation=Orientation(
-            values["orientation.flip_x"], values["orientation.flip_y"], values["orientation.rotate_deg"]
-        ),
+        orientation=Orientation(**named(Orientation, values, "orientation.")),
         aperture_radius=values["aperture.radius"],
         mirror_radius=mirror_radius,
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
         aperture_follow=values["aperture.follow"],
         minimum_valid_fraction=values["aperture.minimum_valid_fraction"],
         reference=reference,
-        retrace=tuple(values["retrace"]),
-        distortion=values["distortion"],
-        instrument_error=values["instrument_error"],
-        scale_error=values["scale_error"],
-        remove_piston_tilt=values["remove_piston_tilt"],
     )
 
 

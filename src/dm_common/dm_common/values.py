@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from operator import attrgetter
 from typing import Any
@@ -117,6 +117,11 @@ class Value:
 
 real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, bool))
 reals, wholes, texts = (partial(Value, kind) for kind in ("float[]", "int[]", "str[]"))
+
+
+def named(kind: Any, values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Those of `values` that are called as fields of the dataclass `kind`, behind `prefix`, by their fields."""
+    return {field.name: values[prefix + field.name] for field in fields(kind) if prefix + field.name in values}
 
 
 class Fields:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dm_common.errors import Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
+from dm_common.values import named
 from dm_driver.degauss import degauss_move
 from dm_driver.electronics import DriveElectronics, ElectronicsSettings, make_electronics
 from dm_driver.electronics.frame_format import FrameFormat
@@ -58,13 +59,11 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
     kind = values["electronics.kind"]
     serial_port = values["electronics.serial_port"]
     settings = ElectronicsSettings(
-        address=values["electronics.address"],
+        **named(ElectronicsSettings, values, "electronics.")
+        | {"serial_port": str(Path(serial_port).expanduser()) if serial_port else ""},
         channels=actuators,
-        port=values["electronics.port"],
-        discovery_port=values["electronics.discovery_port"],
-        serial_port=str(Path(serial_port).expanduser()) if serial_port else "",
         timeout_s=values["electronics.timeout"],
-        frame=_frame(values) if kind == "framed_serial" else FrameFormat(),
+        frame=FrameFormat(**named(FrameFormat, values, "framed_serial.") if kind == "framed_serial" else {}),
     )
     back_end = make_electronics(kind, settings)  # finds a missing setting now
     channel_of_actuator = wiring_table(values["mirror.wiring"], values["mirror.channels"], actuators, back_end.channels)
@@ -84,15 +83,11 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
             f" mirror.full_aperture_diameter = {values['mirror.full_aperture_diameter']:g} m"
         )
     limits = DriverLimits(
+        **named(DriverLimits, values, "limits.") | {"step": values["limits.step"] / back_end.frames_per_step},
         actuators=actuators,
         low=values["limits.signal_min"],
         high=values["limits.signal_max"],
-        neighbour_difference=values["limits.neighbour_difference"],
         pairs=neighbour_pairs(x, y),
-        step=values["limits.step"] / back_end.frames_per_step,
-        slew_rate=values["limits.slew_rate"],
-        command_age=values["limits.command_age"],
-        command_lead=values["limits.command_lead"],
     )
     if limits.step < scale.resolution:
         raise ValueError(
@@ -116,11 +111,6 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         settings=replace(settings, doubt=doubt),
         kind=kind,
     )
-
-
-def _frame(values: Mapping[str, Any]) -> FrameFormat:
-    prefix = "framed_serial."
-    return FrameFormat(**{name.removeprefix(prefix): values[name] for name in values if name.startswith(prefix)})
 
 
 def _positions(values: Mapping[str, Any], actuators: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
