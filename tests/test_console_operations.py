@@ -12,7 +12,8 @@ from dm_msgs.action import Calibrate
 from console_browser import DESKTOP, PHONE, Browser, needs_browser, served, shots_folder
 from dm_common.ros.domains import own_domain
 from dm_tools.demo.demo_bench import bench_config
-from support import CommonLawsSuite, Observer, quick_trigger, wait_until
+from fault_injection.rigs.parts import quick_trigger
+from support import CommonLawsSuite, Observer, wait_until
 
 pytestmark = [pytest.mark.processes, needs_browser]
 
@@ -27,8 +28,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def bench(folder: Path) -> Iterator[tuple[int, str]]:
     """ROS domain and address of the console of a bench of its own."""
     config = bench_config(folder, "prandtl_ishlinskii", 0.01, 5, 20.0)
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
-    quick_trigger(config)
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
+    config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
     with own_domain() as domain, CommonLawsSuite(config, folder, domain) as suite, served(domain, folder) as address:
         yield domain, address
         suite.check()

@@ -35,6 +35,7 @@ from dm_tools.cli import app
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from documentation import Block, blocks
+from fault_injection.rigs.parts import quick_trigger
 from studies.documentation.parameters import TABLES
 from support import wait_until
 
@@ -282,7 +283,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
         (folder / name).symlink_to(ROOT / name)
     home = folder / "home"
     config = bench_config(folder / "bench", "drawn_preisach", 0.01, 1, 5.0)  # the shipped mirror in fast time
-    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.01}
+    config["virtual_bench"] |= {"interferometer.pixels": 236, "clock.period": 0.02}
+    config["interferometer"]["trigger_command"] = quick_trigger(config["virtual_bench"]["trigger.port"])
     config["calibration"] |= {"calibration_folder": "~/.ros/dm_calibrations", "load_on_start": "newest"}
     home.mkdir()
     save_config(config, folder / "my_bench.yaml")

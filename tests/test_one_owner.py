@@ -145,7 +145,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     folder: Path = tmp_path_factory.mktemp("suite")
     config = fast_bench(folder, 5)
     config["calibration"]["load_on_start"] = "newest"
-    config["autofocus"] = {"use_sim_time": True}
+    config["autofocus"] = {}
     with (
         own_domain() as domain,
         ForkedSuite(config, folder, domain) as suite,

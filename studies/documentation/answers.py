@@ -136,11 +136,11 @@ def run() -> Iterator[Answer]:
 
     with tempfile.TemporaryDirectory() as temporary, own_domain() as domain:
         folder = Path(temporary)
-        config = bench_config(folder, "off", 0.0, 3, 20.0)
+        config = bench_config(folder, "off", 0.0, 3, 5.0)
         config["virtual_bench"]["interferometer.pixels"] = 236
         config["virtual_bench"] |= {"camera.rate": 5.0, "camera.width": 64, "camera.height": 48}
         config["autofocus"] = {"optics.rest_distance": 10.0, "use_sim_time": True}
-        config["calibration"]["write_report"] = False
+        config["calibration"] |= {"write_report": False, "settle_time": 0.1}
         with running_bench(config, folder, domain, DeformableMirrorClient) as client:
             done = client.calibrate(
                 Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True), lambda _feedback: None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,10 +26,10 @@ from dm_common.ros.clients import ThreadedActionClient, answers_arrive
 from dm_simulation.bench import BenchConfig, FilesConfig
 from dm_simulation.electronics.monitor import MonitorConfig
 from dm_simulation.electronics.server import OFF, PortsConfig
-from dm_simulation.interferometer import trigger
 from dm_simulation.interferometer.interferometer import InterferometerConfig
 from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
 from fault_injection.rigs.forked_node import Process
+from fault_injection.rigs.parts import quick_trigger
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 NODES = ("interferometer", "calibration", "focus_controller")
@@ -58,12 +57,10 @@ class ProcessRig(DriverRig):
         self._nodes = nodes
         self.processes: dict[str, Process] = {}
         self.calibrations = folder / "calibrations"
-        port = self.bench.endpoints["trigger_port"]
-        script = str(Path(trigger.__file__))
         values: dict[str, dict[str, Any]] = {
             "interferometer": {
                 "watch_folder": str(folder / "maps"),
-                "trigger_command": [sys.executable, "-S", "-I", script, "--port", str(port), "--output", "{path}"],
+                "trigger_command": quick_trigger(self.bench.endpoints["trigger_port"]),
                 "trigger_output_suffix": ".dat",
                 "aperture.radius": 0.011,
                 "stable_time": 0.1,
