@@ -276,7 +276,7 @@ def test_a_calibration_that_was_not_heard_is_not_called_none() -> None:
 def test_status_knows_no_negative_zero() -> None:
     """Mid range is a step of the converter beside 0."""
     said = verb_status._now("", None, ActuatorState(applied=[-6e-6, -4e-6]))
-    assert said == "signals +0.00 to +0.00, not asked for as a curvature, so without a bound"
+    assert said == "signals +0.00 to +0.00, not asked for as a curvature: without a bound"
 
 
 def test_a_suite_is_ready_when_the_controller_has_taken_the_calibration() -> None:

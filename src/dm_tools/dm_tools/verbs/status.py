@@ -84,7 +84,7 @@ def _now(by: str, shape: SettledShape | None, state: Any) -> str:
         return "nothing was commanded yet, or the driver is not heard"
     low, high = (round(signal, 2) + 0.0 for signal in (min(state.applied), max(state.applied)))  # no "-0.00"
     moving = ", moving" if state.moving else ""
-    return f"signals {low:+.2f} to {high:+.2f}, not asked for as a curvature, so without a bound{moving}"
+    return f"signals {low:+.2f} to {high:+.2f}, not asked for as a curvature: without a bound{moving}"
 
 
 def _calibration(calibration: Any) -> str:
