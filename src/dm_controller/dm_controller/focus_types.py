@@ -1,6 +1,5 @@
 """What goes into the focus controller and what comes out of it, without ROS."""
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -220,8 +219,7 @@ class CommandedShape:
         What was written again after a lost link is on another branch of the hysteresis than it was found for.
         """
         plan, lost = self.move.plan, self.move.known and not known
-        spread = plan.max_zernike_upper - plan.max_zernike
-        return plan.max_zernike + math.hypot(spread, self.planner.unknown_max_zernike if lost else 0.0)
+        return plan.max_zernike + self.planner.error_bound(not lost, plan.max_zernike_upper - plan.max_zernike)
 
     def send_on(self, signals: Floats, now: Moment, expected_turns: int = 0) -> SendCommand:
         """Another command for the shape that was commanded last, on behalf of the same holder."""
