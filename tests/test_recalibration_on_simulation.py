@@ -14,6 +14,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS, basis
+from dm_simulation.mirror.piezo import PiezoConfig
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
@@ -21,14 +22,15 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("common_laws")]
 #: Tried by `common_laws`: that of the simulation among them.
 TRIED_LAWS = ("linear", "Preisach")
 NIGHTS = 100
+CONFIG = SimulationConfig(law="preisach", seed=41)
 ASTIGMATISM = 4
 
 
 class AgeingSimulation:
     """A Preisach simulation whose gains and figure drift, with what its driver has reported."""
 
-    def __init__(self) -> None:
-        self.bench = SimulatedBench(SimulationConfig(law="preisach", seed=41))
+    def __init__(self, config: SimulationConfig) -> None:
+        self.bench = SimulatedBench(config)
         self.calibration = self.bench.calibrate(PlanKind.HYSTERESIS, PlanOptions(hysteresis_maps=150))
         self.history = AppliedHistory()
         assert self.calibration.hysteresis is not None
@@ -45,6 +47,10 @@ class AgeingSimulation:
     def night(self, rng: np.random.Generator) -> None:
         """A day passes; then another shape."""
         self.bench.time += 86400.0
+        self.move(rng)
+
+    def move(self, rng: np.random.Generator) -> None:
+        """Another shape."""
         self.bench.apply(np.clip(rng.uniform(-0.6, 0.6) + 0.25 * rng.standard_normal(37), -1.0, 1.0))
         self.bench.settle()
         for applied in self.bench.reports[self._heard :]:
@@ -66,7 +72,28 @@ class AgeingSimulation:
 
 @pytest.fixture(scope="module")
 def simulation() -> AgeingSimulation:
-    return AgeingSimulation()
+    return AgeingSimulation(CONFIG)
+
+
+def test_two_maps_show_creep_that_the_calibration_could_not(tmp_path: Path) -> None:
+    """Creep ends after minutes, a shape is held for a day, and the law expects that it went on."""
+    simulation = AgeingSimulation(replace(CONFIG, creep=0.02, piezo=PiezoConfig(creep_slowest=100.0)))
+    updates = RecalibrationManager(tmp_path, UpdateOptions)
+    assert updates.begin(simulation.calibration) == ""
+    simulation.bench.apply(np.full(37, 0.9))
+    simulation.bench.time += 86400.0
+    rng = np.random.default_rng(44)
+    errors = []
+    for checks in range(8):
+        simulation.move(rng)
+        measured = simulation.measurement(simulation.bench.take_map())
+        standing = simulation.history.settled(1e-9 * measured.stamp_ns, 0.1)
+        fits = (simulation.calibration.fit, updates.changed_fit())
+        errors.append([simulation.error(fit, standing.effective) for fit in fits if fit is not None])
+        if checks < 2:
+            assert updates.take(measured, standing).accepted
+    without, kept = np.median(errors[2:], axis=0)
+    assert kept < 0.5 * without
 
 
 def test_a_mirror_that_does_not_drift_is_not_made_worse(simulation: AgeingSimulation, tmp_path: Path) -> None:

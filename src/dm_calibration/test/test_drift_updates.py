@@ -415,7 +415,8 @@ def test_updates_of_before_temperatures_were_kept_are_read(
     read = known(begun(made, tmp_path))
     assert read.revision == 1 and np.array_equal(read.gain, stored.gain)
     assert np.array_equal(read.covariance[:size, :size], before["covariance"])
-    assert not read.thermal.any() and np.diag(read.covariance)[size:].all() and read.thermal_trust == 0.0
+    assert not read.thermal.any() and not read.crept.any() and read.thermal_trust == 0.0
+    assert np.diag(read.covariance)[size : size + read.thermal.size].all()
     file.write_bytes(write_image({**before, "covariance": before["covariance"][None]}, kept))
     assert known(begun(made, tmp_path, remark="finite numbers")).revision == 0
 

@@ -25,10 +25,10 @@ class DriftRates:
     warm_figure: float = 2e-9
 
     def growth(self, actuators: int, values: int) -> Floats:
-        """(N + 2 R + 1, N + 2 R + 1) that one day adds to the covariance of a drift."""
+        """(N + 3 R + 1, N + 3 R + 1) that one day adds to the covariance of a drift."""
         figure = self.figure**2 / values * np.eye(values)
         gains = 0.5 * self.gain**2 * (np.eye(actuators) + 1.0)
-        return np.asarray(block_diag(gains, figure, np.zeros((1 + values, 1 + values))))
+        return np.asarray(block_diag(gains, figure, np.zeros((1 + 2 * values,) * 2)))
 
     def warm(self, values: int) -> Floats:
         """(1 + R,) variances of what one K does."""
@@ -41,9 +41,10 @@ class Drift:
 
     Attributes:
         gain: (N,) relative changes.
-        offset: (R,) m rms, change of the figure in reduced values.
+        offset: (R,) m rms, change of the figure that stays, in reduced values.
         thermal: (1 + R,) per K: relative change of all gains, and m rms, change of the figure in reduced values.
-        covariance: (N + 2 R + 1, N + 2 R + 1) of gain, offset and thermal.
+        crept: (R,) m rms, change of the figure by slow creep at `stamp_ns`, in reduced values; it fades.
+        covariance: (N + 3 R + 1, N + 3 R + 1) of gain, offset, thermal and crept.
         stamp_ns: time it holds for.
         revision: maps taken in.
         checked_ns: stamp of the last of them; 0 = none.
@@ -58,6 +59,7 @@ class Drift:
     gain: Floats
     offset: Floats
     thermal: Floats
+    crept: Floats
     covariance: Floats
     stamp_ns: int
     stuck: Floats
@@ -120,9 +122,14 @@ class Drift:
         }
 
     @property
+    def figure(self) -> Floats:
+        """(R,) m rms, change of the figure, drift and creep together."""
+        return self.offset + self.crept
+
+    @property
     def offset_rms(self) -> float:
         """Change of the figure as it is used, m rms."""
-        return self.trust * float(np.linalg.norm(self.offset))
+        return self.trust * float(np.linalg.norm(self.figure))
 
 
 class Taken(NamedTuple):

@@ -1,11 +1,11 @@
 """Gains and figure of a calibrated mirror, followed by recursive least squares over maps that arrive later.
 
 In the reduced values of a map (:class:`~dm_calibration.hysteresis.reduction.Reduction`) a calibration says ``v = v0 + V
-e`` with the effective signals e. Later it is ``v = v0 + d + V diag(e) (1 + g)``: gains have changed by the shares g,
-the figure by d. Where maps tell the temperature, t above that of the calibration, ``k t V e + h t`` comes on top: k of
-all gains and h of the figure do not change. Gains and figure walk at random, so what is known of them fades with time;
-each map is one step of the Kalman filter, which is recursive least squares with that forgetting (Ljung, System
-Identification, 2nd ed., section 11.3).
+e`` with the effective signals e. Later it is ``v = v0 + d + c + V diag(e) (1 + g)``: gains have changed by the shares
+g, the figure by d, and by c of creep slower than the calibration's run shows. Where maps tell the temperature, t above
+that of the calibration, ``k t V e + h t`` comes on top: k of all gains and h of the figure do not change. Creep fades,
+gains and figure walk at random, so what is known of them fades with time; each map is one step of the Kalman filter,
+which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section 11.3).
 
 An estimate of drift is noise as well, and on a mirror that stands still nothing else: taken over as it is, it makes the
 calibration worse. So each map is first a test of what the maps before it made out: the change that they foretell,
@@ -33,6 +33,8 @@ from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.displaced import displaced_actuators, displacement
 from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, Taken
 from dm_common import Floats
+from dm_common.hysteresis.creep_record import slow_creep
+from dm_common.hysteresis.model import HysteresisModel
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
@@ -53,8 +55,9 @@ class _Innovation(NamedTuple):
     """A map against its prediction, in R reduced values.
 
     Attributes:
-        prior: (N + 2 R + 1, N + 2 R + 1) covariance of gains, figure and what temperature does, at its time.
-        design: (R, N + 2 R + 1) what it shows of them.
+        prior: (N + 3 R + 1, N + 3 R + 1) covariance of gains, figure, what temperature does and creep, at its time.
+        crept: (R,) m rms, what creep did by then as the maps before foretell it.
+        design: (R, N + 3 R + 1) what it shows of them.
         foretold, warm, shown: (R,) change that the maps before foretell, that they foretell of the temperature, and
             that it shows, m rms.
         expected: (R, R) covariance of their difference.
@@ -63,6 +66,7 @@ class _Innovation(NamedTuple):
     """
 
     prior: Floats
+    crept: Floats
     design: Floats
     foretold: Floats
     warm: Floats
@@ -96,7 +100,9 @@ class DriftFilter:
         scatter = self._scatter(maps if hysteresis is None else effective_maps(maps, hysteresis.law))
         if hysteresis is not None:
             signal_sigma = self._law_sigma(hysteresis)
-        self._law = signal_sigma**2 * (self._gain @ self._gain.T)
+        self._creep_law = HysteresisModel.linear() if hysteresis is None else hysteresis.law
+        self._signals = self._gain @ self._gain.T
+        self._law = signal_sigma**2 * self._signals
         self._noise = np.maximum(scatter - np.diag(self._law), NOISE_SHARE_MIN * scatter) + NOISE_MIN
         self._rates, self._growth = rates, rates.growth(fit.actuators, self.reduction.size)
         known = np.isfinite(maps.temperature) & fit.used
@@ -114,7 +120,8 @@ class DriftFilter:
             gain=np.zeros(fit.actuators),
             offset=np.zeros(values),
             thermal=np.zeros(1 + values),
-            covariance=np.diag(np.concatenate((gain, offset, warm))),
+            crept=np.zeros(values),
+            covariance=np.diag(np.concatenate((gain, offset, warm, np.zeros(values)))),
             stamp_ns=stamp_ns,
             stuck=np.full(fit.actuators, np.nan),
             temperatures=np.full(3, self._temperature),
@@ -127,7 +134,7 @@ class DriftFilter:
         prior, design, factor = seen.prior, seen.design, seen.factor
         innovation = seen.shown - seen.foretold - seen.warm
         shared = prior @ design.T
-        gain, offset, thermal = self._parts(shared @ cho_solve(factor, innovation))
+        gain, offset, thermal, crept = self._parts(shared @ cho_solve(factor, innovation))
         # Joseph form: symmetric and positive whatever the rounding.
         kalman = cho_solve(factor, shared.T).T
         left = np.eye(len(prior)) - kalman @ design
@@ -146,6 +153,7 @@ class DriftFilter:
             gain=drift.gain + gain,
             offset=drift.offset + offset,
             thermal=drift.thermal + thermal,
+            crept=seen.crept + crept,
             covariance=0.5 * (covariance + covariance.T),
             stamp_ns=max(stamp_ns, drift.stamp_ns),
             revision=drift.revision + 1,
@@ -189,25 +197,37 @@ class DriftFilter:
             stuck[actuator] = at[actuator] + more
         return replace(drift, stuck=stuck)
 
-    def _parts(self, values: Floats) -> tuple[Floats, Floats, Floats]:
-        """Gains, figure and what temperature does, in `values` (N + 2 R + 1, ...)."""
-        ends = self._fit.actuators, self._fit.actuators + self.reduction.size
-        gain, offset, thermal = np.split(values, ends)
-        return gain, offset, thermal
+    def _parts(self, values: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Gains, figure, what temperature does and creep, in `values` (N + 3 R + 1, ...)."""
+        ends = np.cumsum((self._fit.actuators, self.reduction.size, 1 + self.reduction.size))
+        gain, offset, thermal, crept = np.split(values, ends)
+        return gain, offset, thermal, crept
+
+    def _at(self, drift: Drift, stamp_ns: int) -> Drift:
+        """`drift` at a later time, with the stamp that it has."""
+        elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns))
+        grown, most = (slow_creep(self._creep_law, time) for time in (elapsed, np.inf))
+        kept = float(np.sqrt(1.0 - (grown / most) ** 2)) if most else 1.0
+        fade = np.ones(len(drift.covariance))
+        creep = slice(-self.reduction.size, None)
+        fade[creep] = kept
+        covariance = drift.covariance * np.outer(fade, fade) + elapsed / DAY_S * self._growth
+        covariance[creep, creep] += grown**2 * self._signals
+        return replace(drift, crept=kept * drift.crept, covariance=covariance)
 
     def _innovation(self, drift: Drift, taken: Taken) -> _Innovation:
         coefficients, sag, effective, stamp_ns, repeat, temperature = taken
-        elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns)) / DAY_S
-        prior = drift.covariance + elapsed * self._growth
+        drift = self._at(drift, stamp_ns)
+        prior = drift.covariance
         moved = self._gain * np.where(np.isnan(drift.stuck), effective, 0.0)
         figure, warmer = np.eye(self.reduction.size), drift.warmer(temperature)
         warmed = warmer * np.column_stack((moved.sum(axis=1), figure))
-        design = np.hstack((moved, figure, warmed))
+        design = np.hstack((moved, figure, warmed, figure))
         changed = self.changed(drift, temperature)
         predicted_sag = changed.sag_offset + changed.influence_sag @ effective
         zernike_error = coefficients - changed.zernike_offset - changed.influence_zernike @ effective
         sag_error = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0] - predicted_sag
-        foretold, warm = moved @ drift.gain + drift.offset, warmed @ drift.thermal
+        foretold, warm = moved @ drift.gain + drift.figure, warmed @ drift.thermal
         used = drift.trust * foretold + drift.thermal_trust * warm
         shown = self.reduction.reduce(zernike_error, sag_error) + used
         # What the calibration itself does not know of its influence function, beyond gains.
@@ -217,7 +237,7 @@ class DriftFilter:
             unknown = np.column_stack((moved.sum(axis=1), figure)) @ drift.thermal
             expected += (drift.thermal_trust * drift.temperature_range) ** 2 * np.outer(unknown, unknown)
         return _Innovation(
-            prior, design, foretold, warm, shown, expected, cho_factor(expected), zernike_error, sag_error
+            prior, drift.crept, design, foretold, warm, shown, expected, cho_factor(expected), zernike_error, sag_error
         )
 
     def warm_error(self, drift: Drift) -> float:
@@ -236,7 +256,7 @@ class DriftFilter:
         """
         fit, moves = self._fit, np.isnan(drift.stuck)
         warmer = drift.thermal_trust * drift.warmer(temperature)
-        coefficients, sag = self.reduction.expand(drift.trust * drift.offset + warmer * drift.thermal[1:])
+        coefficients, sag = self.reduction.expand(drift.trust * drift.figure + warmer * drift.thermal[1:])
         gain = 1.0 + drift.trust * drift.gain + warmer * drift.thermal[0]
         zernike, surface = fit.influence_zernike * gain, fit.influence_sag * gain
         at = np.where(moves, 0.0, drift.stuck)

@@ -15,7 +15,7 @@ from dm_common.atomic_write import write_whole
 SCHEMA = "dm_calibration/updates"
 SCHEMA_VERSION = 1
 
-_ARRAYS = ("gain", "offset", "thermal", "covariance")
+_ARRAYS = ("gain", "offset", "thermal", "crept", "covariance")
 _NUMBERS = ("stamp_ns", "revision", "checked_ns", "surprising")
 #: Not in files of before there were such figures: what they hold was used whole, and is: a trust of exactly 1.
 _EVIDENCE = {"foretold": 100.0, "borne_out": 110.0, "warm_foretold": 0.0, "warm_borne_out": 0.0}
@@ -78,9 +78,10 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a whole number from 0")
     arrays = {name: columns.get(name) for name in _ARRAYS}
     covariance = arrays["covariance"]
-    if "thermal" not in columns and isinstance(covariance, np.ndarray) and covariance.ndim == 2:
-        size = len(like.covariance) - len(like.thermal)
-        arrays |= {"thermal": like.thermal, "covariance": block_diag(covariance, like.covariance[size:, size:])}
+    later = {name: getattr(like, name) for name in ("thermal", "crept") if name not in columns}
+    if later and isinstance(covariance, np.ndarray) and covariance.ndim == 2:
+        size = len(like.covariance) - sum(map(len, later.values()))
+        arrays |= later | {"covariance": block_diag(covariance, like.covariance[size:, size:])}
     for name, value in arrays.items():
         shape = getattr(like, name).shape
         if not isinstance(value, np.ndarray) or value.shape != shape or not np.isfinite(value).all():

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Standard deviation of a shape that was held unseen, in shapes of the whole range: nearly all of them are within one.
 UNSEEN = 0.5
+#: Time constant, s, above which a calibration's run does not show an element, and by what share its weight may be off.
+SLOW_S, SLOW_SHARE = 300.0, 0.35
 
 
 class CreepRecord(NamedTuple):
@@ -121,6 +123,12 @@ def rested(
 def held_unseen(law: HysteresisModel, sigma: Floats, elapsed: float) -> Floats:
     """(J,) `crept_sigma` after `elapsed` s at a shape that nobody saw, of which `sigma` is what that left of it."""
     return np.hypot(sigma, UNSEEN * -np.expm1(-max(elapsed, 0.0) / law.creep_time))
+
+
+def slow_creep(law: HysteresisModel, elapsed: float) -> float:
+    """Standard deviation of an effective signal by creep that no run shows, `elapsed` s after a map showed it."""
+    share = np.where(law.creep_time > SLOW_S, np.atleast_2d(law.creep_share).mean(axis=0), 0.0)
+    return SLOW_SHARE * float(held_unseen(law, np.zeros(len(share)), elapsed) @ share)
 
 
 def record_of(law: HysteresisModel, state: HysteresisState | None, now: float) -> CreepRecord | None:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dm_common import Floats
+from dm_common.hysteresis.creep_record import SLOW_S
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
 
 #: Ages of a shape that a bound holds for, s, beside the moment when it is to be right.
@@ -17,7 +18,7 @@ ONE, LARGEST = 1.96, 2.5
 MEASURED_S = (1.0, 5.0)
 #: Share of creep that is known no better: of an element that the calibration says nothing of, by its time constant, s,
 #: below which and above which; and of what was held before the calibration.
-UNKNOWN_SHARE, UNKNOWN_BELOW, UNKNOWN_ABOVE = 0.5, 1.0, 300.0
+UNKNOWN_SHARE, UNKNOWN_BELOW, UNKNOWN_ABOVE = 0.5, 1.0, SLOW_S
 
 
 class CreepBound(NamedTuple):
