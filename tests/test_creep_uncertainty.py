@@ -15,7 +15,7 @@ from dm_calibration.hysteresis.responses import Responses
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import UNSEEN, record_of, rested
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_controller.planning.creep_error import IN_FIGURE_S, CreepError
+from dm_controller.planning.creep_error import IN_FIGURE_S, CreepError, CreepShown
 from linear_mirror import make_mirror
 
 MIRROR = make_mirror(rings=1)
@@ -92,8 +92,8 @@ def test_a_run_is_as_sure_of_creep_as_it_may_be() -> None:
     assert sigma < 0.5 * spread
 
 
-def creep_error(law: HysteresisModel) -> CreepError:
-    return CreepError(law, RESPONSE, 1e-6 * np.eye(COUNT), np.full(COUNT, 0.8))
+def creep_error(law: HysteresisModel, shown: CreepShown | None = None) -> CreepError:
+    return CreepError(law, RESPONSE, 1e-6 * np.eye(COUNT), np.full(COUNT, 0.8), shown)
 
 
 def test_what_was_held_unseen_widens_the_bound_until_it_has_faded() -> None:
@@ -159,6 +159,28 @@ def test_what_was_held_before_a_calibration_is_in_doubt_while_it_fades() -> None
     others = size * rng.standard_normal((400, COUNT)) @ RESPONSE.T * (law.creep_share @ faded)
     assert 0.85 < np.mean(np.abs(others).max(axis=1) < hours[-1]) < 1.0
     assert error.bound(law.advance(state, 11800.0), rest, 0.05, measured=True).max_zernike == 0.0
+
+
+def test_bounds_count_creep_from_the_last_check_on() -> None:
+    """A shape held for a day, partly unseen; after it maps show what it left, and later another is held for hours."""
+    law = replace(CREEPS, creep_covariance=creep_covariance(run_of(CREEPS, 150), CREEPS))
+    rest, shape = np.zeros(COUNT), np.linspace(-0.5, 0.5, COUNT)
+    held = law.advance(law.move(rested(law, rest, 0.0), shape, 0.0), 86_400.0)
+    checked = law.degaussed(held, 86_400.0)
+
+    moved = law.move(checked, -shape, 86_460.0)
+    states = [law.advance(checked, 86_460.0), law.advance(checked, 90_000.0), law.advance(moved, 100_000.0)]
+
+    def bounds(share: float | None) -> list[float]:
+        shown = None if share is None else CreepShown(checked.time, checked.crept, checked.crept_sigma, share)
+        error = creep_error(law, shown)
+        return [error.bound(state, rest, 0.05).max_zernike for state in states]
+
+    whole, half, none = bounds(1.0), bounds(0.5), bounds(0.0)
+    assert none == pytest.approx(bounds(None))
+    assert whole[0] < 0.3 * none[0] and whole[0] < half[0] < none[0]
+    assert whole[0] < 0.8 * whole[1]  # what was shown fades, and the figure does not
+    assert whole[2] > 0.8 * none[2]  # what was held since is as uncertain as ever
 
 
 def test_a_longer_move_is_known_less_well() -> None:

@@ -75,9 +75,15 @@ class DrivenMirror:
             self._tracker.observe(report)
         self._seen = len(self.bench.reports)
 
-    def under(self, planner: Planner) -> DrivenMirror:
-        """The same mirror from here on with another planner of the same hysteresis model."""
+    def under(self, planner: Planner, creep_shown: float) -> DrivenMirror:
+        """The same mirror from here on with another planner of the same hysteresis model.
+
+        Args:
+            creep_shown: of its calibration, as the message says.
+        """
         other = copy.copy(self)
+        assert self._tracker.state is not None
+        planner.note_creep_shown(self._tracker.state, creep_shown)
         other._plan_with(planner)
         return other
 

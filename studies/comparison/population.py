@@ -197,7 +197,8 @@ def _judged(mirror: DrawnMirror, options: PopulationOptions, progress: Progress)
     progress(f"seed {seed}: check maps")
     checked = _checked(other, calibration, driven, draw_targets(active, CHECK_MAPS, rng))
     first = draw_targets(checked, FIRST_REQUESTS, rng)
-    groups[CHECKED] = judge_requests(driven.under(checked.planner), checked, surface, first, short)
+    driven = driven.under(checked.planner, checked.calibration.creep_shown)
+    groups[CHECKED] = judge_requests(driven, checked, surface, first, short)
 
     groups[RECIPES] = Requests.none(unreachable)
     if book.recipes:

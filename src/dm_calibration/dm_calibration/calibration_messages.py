@@ -101,6 +101,7 @@ def put_updates(
     message.checked = time_message(updates.checked_ns)
     message.gain_drift = abs(updates.largest_gain[0])
     message.offset_drift = updates.offset_rms
+    message.creep_shown = updates.trust
     message.known_limitations = [*message.known_limitations, *doubts]
     message.actuator_grade = _grades(fit)
     if updates.given_up:

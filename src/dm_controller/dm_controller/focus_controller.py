@@ -83,6 +83,7 @@ class FocusController:
             elif not before.planner.law.same_as(active.planner.law):
                 self.hold.end("the hysteresis model changed")
             self.observer.use(active.planner.law, active.middle, active.planner.hysteresis is not None)
+            active.note_creep_shown(before, self.observer.state)
             self.active, self._at_rest = active, None
             effects.append(Log("info", f"using calibration {active.calibration.id} of {mirror.serial}"))
             if self._values["hold_tilt"] and active.mirror.tilt is None:

@@ -26,7 +26,7 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.creep_record import CreepRecord
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.hysteresis.observer import Applied
-from dm_common.messages import doubles
+from dm_common.messages import doubles, time_message
 from dm_common.optics.zernike import basis
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import capabilities_message, health
@@ -405,6 +405,26 @@ def test_a_degauss_does_not_cure_old_creep() -> None:
     bench.report()
     later = bench.ask(dry_run=True)
     assert move_of(later).plan.max_zernike_upper < 0.3 * move_of(soon).plan.max_zernike_upper
+
+
+def test_a_check_map_that_shows_old_creep_narrows_the_bounds() -> None:
+    bench = Bench()
+    bench.degauss()
+    bench.time += 1800.0
+    bench.report()
+
+    def bound(**fields: Any) -> float:
+        if fields:
+            bench.do(bench.controller.use(calibration(**fields), MIRROR))
+        return move_of(bench.ask(dry_run=True)).plan.max_zernike_upper
+
+    before = bound()
+    checked = {"revision": 1, "checked": time_message(bench.now.ns), "creep_shown": 1.0}
+    shown = bound(**checked)
+    assert shown < 0.3 * before
+    bench.time += 10.0
+    assert bound(**checked, offset_drift=1e-9) == pytest.approx(shown, rel=0.1)  # published again
+    assert bound(revision=0) == pytest.approx(before, rel=0.1)  # updates were dropped
 
 
 def test_unknown_history_is_told_and_cured_by_a_degauss() -> None:

@@ -11,6 +11,7 @@ from dm_msgs.msg import Calibration, MirrorInfo
 
 from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
+from dm_common.hysteresis.model import HysteresisState
 from dm_common.limits import Limits
 from dm_common.messages import hysteresis_model_from, limits_from, mirror_from, recipe_book_from, stamp_ns
 from dm_common.mirror import APERTURE_TOLERANCE, mismatch
@@ -71,6 +72,25 @@ class ActiveCalibration:
     def conditioned_error(self) -> float:
         """m, bound of the largest coefficient error of a conditioned move; 0 = no recipes."""
         return self.corrections.worst if self.recipes.recipes else 0.0
+
+    def note_creep_shown(self, before: "ActiveCalibration | None", state: HysteresisState | None) -> None:
+        """Let bounds count creep from the last check on, as far as this takes in what maps have shown of it.
+
+        Args:
+            before: what was used until now; a check that it does not know was made at `state`.
+        """
+        planner, last = self.planner, self.calibration.checked
+        if (
+            before is None
+            or before.calibration.id != self.calibration.id
+            or not before.planner.law.same_as(planner.law)
+        ):
+            return
+        if before.calibration.checked == last:
+            planner.creep_shown = before.planner.creep_shown
+        elif state is not None:
+            state = planner.law.advance(state, max(state.time, 1e-9 * stamp_ns(last)))
+            planner.note_creep_shown(state, self.calibration.creep_shown)
 
     def stale(self, now_ns: int, age_max_s: float) -> str:
         """The reason why the calibration should be renewed; "" = it is fresh, or of unknown age."""

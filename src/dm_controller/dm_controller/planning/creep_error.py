@@ -33,6 +33,22 @@ class CreepBound(NamedTuple):
     rms: float
 
 
+class CreepShown(NamedTuple):
+    """Where creep stood when maps showed what it does to the figure.
+
+    Attributes:
+        time: s.
+        crept: (N, J) effective signals that the elements had followed by then.
+        sigma: (J,) of what was held unseen, see :class:`~dm_common.hysteresis.model.HysteresisState`.
+        share: of what slow creep did by then that the figure takes in since.
+    """
+
+    time: float
+    crept: Floats
+    sigma: Floats
+    share: float
+
+
 class CreepError:
     """Errors of creep of one mirror under one law.
 
@@ -41,9 +57,12 @@ class CreepError:
         zernike: (K - 3, N) m per unit effective signal, coefficients beyond tilt.
         sag_root: (N, N) m; its product with effective signals is as long as their rms sag.
         whole: (N,) effective signals of a shape of the whole range.
+        shown: by check maps; None = the figure is that of the calibration.
     """
 
-    def __init__(self, law: HysteresisModel, zernike: Floats, sag_root: Floats, whole: Floats) -> None:
+    def __init__(
+        self, law: HysteresisModel, zernike: Floats, sag_root: Floats, whole: Floats, shown: CreepShown | None = None
+    ) -> None:
         self._law = law
         covariance = law.creep_covariance if law.creep_covariance.size else _default_covariance(law)
         size, axes = np.linalg.eigh(covariance[0])
@@ -54,6 +73,9 @@ class CreepError:
         self._in_figure = np.zeros((len(whole), len(law.creep_time)))
         if law.crept.shape == whole.shape:
             self._in_figure = law.crept[:, None] * np.exp(-IN_FIGURE_S / law.creep_time)
+        self._shown = shown or CreepShown(0.0, self._in_figure, np.zeros(len(law.creep_time)), 0.0)
+        self._share = self._shown.share * (law.creep_time > SLOW_S)
+        self._in_figure = self._in_figure + self._share * (self._shown.crept - self._in_figure)
         # What a shape of the whole range held unseen would leave, by element.
         share = np.atleast_2d(law.creep_share).mean(axis=0)
         share[: len(law.lag_time)] += np.atleast_2d(law.lag_share).mean(axis=0)  # what they follow of the signals
@@ -83,12 +105,17 @@ class CreepError:
             features[:, :, 0] = 0.0
             features[:, :, 1:] = followed - position[:, None] * (1.0 - then[:, None])
         shared = np.square(self._rows @ (features @ self._root)).sum(axis=2)  # (T, K - 3 + N)
-        shared += np.square((state.crept_sigma * faded) @ self._unseen.T)  # one shape that all elements have followed
+        # One shape that all elements have followed, and which maps have shown in part; and what was held since.
+        time, shown = self._law.creep_time, self._shown
+        same = np.minimum(shown.sigma * np.exp(-np.maximum(state.time - shown.time, 0.0) / time), state.crept_sigma)
+        since = np.sqrt(np.square(state.crept_sigma) - np.square(same))
+        figure = 0.0 if measured else self._share * shown.sigma
+        shared += np.square((same * faded - figure) @ self._unseen.T) + np.square((since * faded) @ self._unseen.T)
         each = np.einsum("tnj,jk,tnk->tn", features, self._each, features, optimize=True)
         if not measured:
-            since = np.maximum(state.time + ages - self._law.crept_at, 0.0)
-            fade = np.exp(-since[:, None] / self._law.creep_time) - np.exp(-IN_FIGURE_S / self._law.creep_time)
-            each += np.square(fade @ self._old)[:, None]
+            at = np.array([*(state.time + ages), shown.time]) - self._law.crept_at
+            fade = np.exp(-np.maximum(at, 0.0)[:, None] / time) - np.exp(-IN_FIGURE_S / time)
+            each += np.square((fade[:-1] - self._share * fade[-1]) @ self._old)[:, None]
         each = each @ np.square(self._rows).T
         count = self._coefficients
         largest = ONE**2 * shared[:, :count].max(axis=1) + LARGEST**2 * each[:, :count].max(axis=1)

@@ -25,7 +25,7 @@ from dm_controller.planning.mirror_model import CalibratedMirror, Plan, rms_boun
 from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
-    from dm_controller.planning.creep_error import CreepError
+    from dm_controller.planning.creep_error import CreepError, CreepShown
 
 #: When a shape is to be right unless configured otherwise, s after the way.
 SETTLE_S = 0.05
@@ -98,6 +98,8 @@ class Planner:
         self._closed_form = ClosedForm(mirror)
         self._prepared: PreparedInverse | None = None
         self._limits = within(mirror.limits)
+        #: By check maps that the figure takes in.
+        self.creep_shown: CreepShown | None = None
 
     @cached_property
     def _constrained(self) -> ConstrainedInverse:
@@ -207,6 +209,12 @@ class Planner:
         """Largest coefficient beyond tilt, m, of effective signals (N,)."""
         return float(np.abs(self._zernike @ effective).max())
 
+    def note_creep_shown(self, state: HysteresisState, share: float) -> None:
+        """Count this `share` of what slow creep had done by the time of `state` as in the figure; before any plan."""
+        from dm_controller.planning.creep_error import CreepShown  # a command does not wait for it
+
+        self.creep_shown = CreepShown(state.time, state.crept, state.crept_sigma, share)
+
     @cached_property
     def _creep_error(self) -> CreepError:
         """Relative to shapes as large as the mirror takes, of the sign that it takes further."""
@@ -216,7 +224,7 @@ class Planner:
         whole = self.mirror.command(sphere.with_curvature(far))[0]
         from dm_controller.planning.creep_error import CreepError  # a command does not wait for it
 
-        return CreepError(self.law, self._zernike, self.mirror.sag_root, whole)
+        return CreepError(self.law, self._zernike, self.mirror.sag_root, whole, self.creep_shown)
 
     def error_bound(self, known: bool, error: float | None = None) -> float:
         """m, 95 % bound of the largest coefficient error, but for creep, with the history `known` or not.
