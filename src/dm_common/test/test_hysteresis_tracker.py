@@ -34,8 +34,10 @@ def tracker() -> HysteresisTracker:
 def test_before_a_degauss_nothing_is_known() -> None:
     tracker = HysteresisTracker(LAW)
     assert tracker.unknown
-    tracker.observe(report(0.0, A))
+    tracker.observe(report(0.0, A, degausses=0, history_known=False))
     assert "before this node" in tracker.unknown
+    tracker.observe(report(1.0, B, 1, A, degausses=0, history_known=False))
+    assert "before this node" in tracker.unknown  # that is why, and not that writes were lost
 
 
 def test_moves_are_followed(tracker: HysteresisTracker) -> None:
@@ -78,6 +80,8 @@ def test_lost_writes_are_noticed(tracker: HysteresisTracker) -> None:
 
 def test_another_activation_begins_anew(tracker: HysteresisTracker) -> None:
     tracker.observe(report(2.0, A, 0, None, degausses=0, history_known=False))
+    assert "activated again" in tracker.unknown
+    tracker.observe(report(3.0, B, 1, A, degausses=0, history_known=False))
     assert "activated again" in tracker.unknown
 
 
