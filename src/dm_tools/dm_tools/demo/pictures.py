@@ -10,11 +10,11 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from PIL import Image
 
 from dm_autofocus.sharpness import check_region, cut
 
@@ -86,7 +86,7 @@ def save_animation(
         title: of the animation.
         frames_per_second: of the animation.
     """
-    figure: Figure = plt.figure(figsize=(8.4, 3.8), layout="constrained")
+    figure: Figure = plt.figure(figsize=(8.4, 3.8), dpi=80, layout="constrained")
     figure.suptitle(title, fontsize=8, color="gray")
     left, right = figure.subplots(1, 2)
     picture, frame = _draw_image(left, found[0].shots[0].image, found[0].region, COLOURS[0])
@@ -149,22 +149,24 @@ def save_animation(
         text = f"4  Tracking: the object comes nearer, {approach.distances[shown]:.1f} m"
         show(approach.shots[shown], text, COLOURS[0], found[0].region)
 
-    schedule: list[tuple[Callable[..., None], tuple[int, ...]]] = []
+    # A row is (what to draw, its arguments, for how many frames it stays).
+    schedule: list[tuple[Callable[..., None], tuple[int, ...], int]] = []
     for number, item in enumerate(found):
-        schedule += [(search, (number, shown)) for shown in range(len(item.shots) + HOLD)]
-    schedule += [(stand, (shown,)) for shown in range(len(sweep.shots))]
-    schedule += [(everything, (0,))] * 2 * HOLD
-    schedule += [(track, (shown,)) for shown in range(len(approach.shots))]
-    schedule += [(track, (len(approach.shots) - 1,))] * HOLD if approach.shots else []
+        schedule += [(search, (number, shown), 1) for shown in range(len(item.shots))]
+        schedule += [(search, (number, len(item.shots)), HOLD)]
+    schedule += [(stand, (shown,), 1) for shown in range(len(sweep.shots))]
+    schedule += [(everything, (0,), 2 * HOLD)]
+    schedule += [(track, (shown,), 1) for shown in range(len(approach.shots))]
+    schedule += [(track, (len(approach.shots) - 1,), HOLD)] if approach.shots else []
 
-    def draw(at: tuple[Callable[..., None], tuple[int, ...]]) -> list[Any]:
-        at[0](*at[1])
-        return []
-
-    draw(schedule[0])
-    figure.canvas.draw()
-    figure.set_layout_engine("none")  # else every frame is laid out anew
-    animation = FuncAnimation(figure, draw, frames=schedule, init_func=list)
-    animation.save(path, writer=PillowWriter(fps=frames_per_second), dpi=80)
+    canvas: Any = figure.canvas
+    images = []
+    for draw, arguments, _ in schedule:
+        draw(*arguments)
+        canvas.draw()
+        figure.set_layout_engine("none")  # else every frame is laid out anew
+        images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
+    durations = [1000 * frames // frames_per_second for _, _, frames in schedule]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
     plt.close(figure)
     return path
