@@ -169,17 +169,18 @@ def test_the_bound_holds_on_laws_that_really_err() -> None:
                 for shape in shapes
             ]
         )
-        curvatures = [shape.curvature for shape in shapes]
-        near = random_shape(rng, 1e-7 if spheres else 1e-6)
-        target = FocusTarget(
-            float(rng.uniform(min(curvatures), max(curvatures))), float(rng.uniform(-300.0, 300.0)), near.zernike
-        )
-        try:
-            found = Corrections(recipes, planner).find(target)
-        except RecipeError:
-            continue
-        error = largest(found.effective - own(target) - law(own(target)))
-        inside.setdefault((spheres, count), []).append(error <= found.error)
+        corrections, curvatures = Corrections(recipes, planner), [shape.curvature for shape in shapes]
+        for _ in range(3):
+            near = random_shape(rng, 1e-7 if spheres else 1e-6)
+            target = FocusTarget(
+                float(rng.uniform(min(curvatures), max(curvatures))), float(rng.uniform(-300.0, 300.0)), near.zernike
+            )
+            try:
+                found = corrections.find(target)
+            except RecipeError:
+                continue
+            error = largest(found.effective - own(target) - law(own(target)))
+            inside.setdefault((spheres, count), []).append(error <= found.error)
     shares = {kind: np.mean(those) for kind, those in inside.items()}
     assert min(shares.values()) >= 0.9, shares
     assert np.mean(np.concatenate(list(inside.values()))) >= 0.95, shares
