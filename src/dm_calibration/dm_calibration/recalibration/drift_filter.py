@@ -101,8 +101,9 @@ class DriftFilter:
         if hysteresis is not None:
             signal_sigma = self._law_sigma(hysteresis)
         self._creep_law = HysteresisModel.linear() if hysteresis is None else hysteresis.law
-        self._signals = self._gain @ self._gain.T
-        self._law = signal_sigma**2 * self._signals
+        # What effective signals that err by 1 each, whichever way, make of the values.
+        self._unit = self._gain @ self._gain.T
+        self._law = signal_sigma**2 * self._unit
         self._noise = np.maximum(scatter - np.diag(self._law), NOISE_SHARE_MIN * scatter) + NOISE_MIN
         self._rates, self._growth = rates, rates.growth(fit.actuators, self.reduction.size)
         known = np.isfinite(maps.temperature) & fit.used
@@ -204,7 +205,7 @@ class DriftFilter:
         return gain, offset, thermal, crept
 
     def _at(self, drift: Drift, stamp_ns: int) -> Drift:
-        """`drift` at a later time, with the stamp that it has."""
+        """`drift` as expected at `stamp_ns`, still with its own stamp: creep fades, and all is known less well."""
         elapsed = max(0.0, 1e-9 * (stamp_ns - drift.stamp_ns))
         grown, most = (slow_creep(self._creep_law, time) for time in (elapsed, np.inf))
         kept = float(np.sqrt(1.0 - (grown / most) ** 2)) if most else 1.0
@@ -212,7 +213,7 @@ class DriftFilter:
         creep = slice(-self.reduction.size, None)
         fade[creep] = kept
         covariance = drift.covariance * np.outer(fade, fade) + elapsed / DAY_S * self._growth
-        covariance[creep, creep] += grown**2 * self._signals
+        covariance[creep, creep] += grown**2 * self._unit
         return replace(drift, crept=kept * drift.crept, covariance=covariance)
 
     def _innovation(self, drift: Drift, taken: Taken) -> _Innovation:
