@@ -86,7 +86,7 @@ def test_a_calibration_that_is_cancelled_says_so(page: Browser) -> None:
     page.press("Calibrate")  # the longest plan: it must not end before it is cancelled
     page.wait_for("Step ", 30)
     page.press("Cancel calibration")
-    wait_until(lambda: "cancel" in page.alerts(), 60, "the sentence of the node")
+    wait_until(lambda: "cancel" in page.alerts(), 180, "the sentence of the node")
     assert "the mirror is back at mid range" in page.alerts()
     page.press("Dismiss: Calibration")
     wait_until(lambda: page.alerts() == "", 60, "the dismissal")
