@@ -89,10 +89,14 @@ class FilmedScene:
         self._camera.start()
         return self
 
-    def aperture(self, radius: float) -> None:
-        """Publish capabilities with an aperture of this radius, m."""
+    def aperture(self, radius: float, error_bound: float = 0.0) -> None:
+        """Publish capabilities with an aperture of this radius and this bound of a move's error, m."""
         capabilities = Capabilities(
-            quality=Capabilities.CALIBRATED, curvature_min=LOW, curvature_max=HIGH, aperture_radius=radius
+            quality=Capabilities.CALIBRATED,
+            curvature_min=LOW,
+            curvature_max=HIGH,
+            aperture_radius=radius,
+            error_bound=error_bound,
         )
         self._capabilities.publish(capabilities)
 
@@ -104,6 +108,7 @@ class FilmedScene:
         state = FocusState(curvature=request.curvature, signals=[request.curvature] * 3)
         state.applied = abs(request.curvature) <= self.refuse_beyond
         state.history_known = self.history_known
+        state.predicted_max_zernike_upper = 500e-9  # after a night, most of it creep of hours
         state.header.stamp = self.node.get_clock().now().to_msg()
         if not state.applied:
             state.error_code, state.message = ErrorCode.UNREACHABLE, "curvature: beyond the played range"
@@ -202,6 +207,12 @@ def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer:
     assert found.error_code == ErrorCode.OK, found.message
     assert found.curvature == pytest.approx(0.0173, abs=depth_of_focus(lens.aperture_radius) / 2)
     assert found.images <= 10 and len(scene.requests) <= found.images + 1, "nothing is passed without an image"
+
+    scene.aperture(lens.aperture_radius, 500e-9)  # every move errs by as much
+    time.sleep(0.3)
+    found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert "the range was swept: the mirror's hysteresis is not known" in found.message
+    scene.aperture(lens.aperture_radius)
 
     scene.info.publish(CameraInfo(k=[lens.focal_length_px / 2, *8 * [0.0]]))
     time.sleep(0.3)

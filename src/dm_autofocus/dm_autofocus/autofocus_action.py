@@ -27,7 +27,7 @@ from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerGoal
 from dm_common.values import Fields, real, reals
 
-#: Uncertainty of the mirror's curvature with which it stands where it is sent, in depths of focus.
+#: Uncertainty of a move's curvature with which the mirror stands where it is sent, in depths of focus.
 TRUSTED = 2.0
 
 
@@ -135,11 +135,12 @@ class AutofocusAction(ProbeAction):
             return str(error)
 
     def _stands_where_sent(self) -> bool:
-        """Whether the mirror has the curvature that was asked for, by what the controller answered last."""
-        answer, radius = self._probe.answer, ready_capabilities(self._probe).aperture_radius
+        """Whether the mirror's moves are those asked for. Creep of hours is not: it is the same in all images."""
+        answer, capabilities = self._probe.answer, ready_capabilities(self._probe)
         if answer is None or not answer.history_known:
             return False
-        uncertainty = curvature_of_defocus(answer.predicted_max_zernike_upper, radius)
+        radius = capabilities.aperture_radius
+        uncertainty = curvature_of_defocus(capabilities.error_bound, radius)
         return uncertainty < TRUSTED * depth_of_focus(radius, self._values["optics.wavelength"])
 
     def _draw_in(self, search: FocusSearch, error: Refusal) -> None:
