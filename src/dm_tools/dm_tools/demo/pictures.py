@@ -21,7 +21,9 @@ from dm_autofocus.sharpness import check_region, cut
 #: Okabe-Ito, one per object.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 #: Images on which the animation rests at the end of each search.
-HOLD = 12
+HOLD = 14
+#: Colours and greys of the animation, the same in all its images.
+PALETTE, GREYS = 32, 48
 
 
 def _draw_image(axes: Axes, image: Any, region: Sequence[float], colour: str) -> Any:
@@ -75,7 +77,7 @@ def save_contact_sheet(found: Sequence[Any], path: Path, title: str) -> Path:
 
 
 def save_animation(
-    found: Sequence[Any], sweep: Any, approach: Any, path: Path, title: str, frames_per_second: int = 12
+    found: Sequence[Any], sweep: Any, approach: Any, path: Path, title: str, frames_per_second: int = 7
 ) -> Path:
     """What the camera does, as a GIF: searches, a sweep in which the picture stands still, its depth, and tracking.
 
@@ -167,6 +169,13 @@ def save_animation(
         figure.set_layout_engine("none")  # else every frame is laid out anew
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     durations = [1000 * frames // frames_per_second for _, _, frames in schedule]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
+    # One palette for all: the colours of those on which the animation rests, and greys for the pictures.
+    rests = [image for image, (_, _, frames) in zip(images, schedule, strict=True) if frames > 1]
+    sheet = Image.fromarray(np.concatenate([np.asarray(image) for image in rests]))
+    palette = sheet.quantize(PALETTE, Image.Quantize.MAXCOVERAGE)
+    greys = np.repeat(np.linspace(0, 255, GREYS).astype(int), 3)
+    palette.putpalette([*(palette.getpalette() or ())[: 3 * PALETTE], *greys.tolist()])
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
     plt.close(figure)
     return path
