@@ -161,38 +161,6 @@ def test_an_answer_quicker_than_the_sender_is_not_lost(observer: Observer, monke
     assert accepted.result().accepted
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_a_goal_whose_answer_is_lost_or_late_runs_to_its_end(
-    observer: Observer, late: bool, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """A server that has not discovered the client yet drops its answer, and carries out the goal."""
-    mover = Mover(observer, "refuse")
-    withheld: dict[str, Any] = {}
-
-    class Deaf(ThreadedActionClient):
-        def take_data(self) -> Any:
-            data = super().take_data()
-            if "goal" in data:
-                withheld["goal"] = data.pop("goal")
-            elif late and "status" not in data:
-                data |= withheld
-                withheld.clear()
-            return data
-
-    client = Deaf(observer.node, MoveFocus, "move")
-    wait_until(lambda: answers_arrive(client, client.server_is_ready))
-    feedback: list[Any] = []
-    accepted = client.send_goal_async(MoveFocus.Goal(tolerance=2.5), feedback.append)
-    wait_until(accepted.done)
-    wait_until(lambda: len(feedback) > 3 and (withheld or late))
-    mover.release.set()
-    finished = accepted.result().get_result_async()
-    wait_until(finished.done)
-    assert finished.result().status == GoalStatus.STATUS_SUCCEEDED
-    assert finished.result().result.duration == 2.5
-    assert "unexpected" not in "".join(capfd.readouterr())
-
-
 def test_action_cancel_is_honoured(observer: Observer) -> None:
     Mover(observer, "refuse")
     handle, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())

@@ -69,14 +69,10 @@ def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[],
 
 
 class ThreadedActionClient(ActionClient):
-    """`rclpy.action.ActionClient` that misses no answer to a goal.
+    """`rclpy.action.ActionClient` whose requests and answers exclude each other.
 
     rclpy sends a request first and notes its number afterwards. An answer that the executor takes in between is thrown
-    away ("Ignoring unexpected goal response"), and the caller waits for ever. So requests and answers exclude each
-    other here.
-
-    A server on a busy machine that has not discovered the client yet drops its answer ("client will not receive
-    response") and carries out the goal. Its latched status arrives all the same, and lists accepted goals alone.
+    away ("Ignoring unexpected goal response"), and the caller waits for ever.
     """
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
@@ -97,18 +93,7 @@ class ThreadedActionClient(ActionClient):
 
     async def execute(self, taken_data: Any) -> None:
         with self._sending:
-            if "goal" in taken_data and taken_data["goal"][0] not in self._goal_sequence_number_to_goal_id:
-                del taken_data["goal"]  # its status was quicker
             await super().execute(taken_data)
-            if "status" not in taken_data:
-                return
-            listed = {bytes(status.goal_info.goal_id.uuid) for status in taken_data["status"].status_list}
-            for number, goal_id in list(self._goal_sequence_number_to_goal_id.items()):
-                pending = self._pending_goal_requests.get(number)
-                if bytes(goal_id.uuid) in listed and pending is not None and not pending.done():
-                    accepted = self._action_type.Impl.SendGoalService.Response(accepted=True)
-                    await super().execute({"goal": (number, accepted)})
-                    self._goal_sequence_number_to_goal_id.pop(number, None)
 
 
 def run_goal(
