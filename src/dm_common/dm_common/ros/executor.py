@@ -37,6 +37,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dm_common.ros import SUPERVISOR
+from dm_common.ros.answers import until_discovered
 
 #: Signals that end a node in order.
 STOPPING = (signal.SIGINT, signal.SIGTERM)
@@ -63,6 +64,8 @@ def spin(executor: Executor, until: Callable[[], bool] | None = None) -> None:
     context = executor.context
     for node in executor.get_nodes():
         getattr(node, "autostart", lambda: None)()
+        for service in node.services:
+            service.send_response = until_discovered(service.send_response)
     while context.ok() and not (until is not None and until()):
         try:
             executor.spin_once(timeout_sec=WAKE_PERIOD_S)

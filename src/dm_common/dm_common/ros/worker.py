@@ -22,6 +22,7 @@ from rclpy.service import Service
 
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.ros import qos
+from dm_common.ros.answers import PatientActionServer, until_discovered
 from dm_common.values import Fields, without_figures
 
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
@@ -100,7 +101,7 @@ class WorkerService:
         )
         # The executor calls `callback` and passes what it returns to `send_response(response, header)`: the only place
         # where the header that a later answer needs can be had.
-        self._send: Callable[[Any, Any], None] = self._service.send_response
+        self._send = until_discovered(self._service.send_response)
         self._service.send_response = self._start
 
     def _start(self, request_and_response: tuple[Any, Any], header: Any) -> None:
@@ -147,7 +148,7 @@ class WorkerGoal:
         return "a newer goal has taken over" if self.taken_over else ""
 
 
-class WorkerActionServer(ActionServer):
+class WorkerActionServer(PatientActionServer):
     """An action server whose body runs in a worker thread.
 
     `body(goal) -> (outcome, result)` may block; `outcome` is "succeed", "abort" or "canceled". It should return soon

@@ -1,0 +1,102 @@
+"""Answers that the middleware drops, since it has not discovered the client yet, reach it all the same."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+from action_msgs.msg import GoalStatus
+from dm_msgs.action import Degauss
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.service import Service
+from std_srvs.srv import Trigger
+
+from dm_common.ros import answers
+from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.worker import WorkerActionServer, WorkerService
+from ros_fixtures import Observer, wait_until
+
+
+def test_the_middleware_takes_a_tenth_of_a_second_to_drop_an_answer(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client that wants the answers of before its time never matches a server that keeps none."""
+    dropped: list[bool] = []
+    judge = answers._dropped
+
+    def spy(*arguments: Any) -> bool:
+        dropped.append(judge(*arguments))
+        return dropped[-1]
+
+    monkeypatch.setattr(answers, "_dropped", spy)
+    monkeypatch.setattr(answers, "PAUSES_S", (0.05, 0.05))
+    WorkerService(observer.node, Trigger, "ask", lambda request, response: response)
+    assert observer.call(Trigger, "ask", Trigger.Request()) == Trigger.Response()
+    assert dropped == [False]
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    client = observer.node.create_client(Trigger, "ask", qos_profile=latched)
+    wait_until(lambda: client.call_async(Trigger.Request()) and len(dropped) > 5)
+    assert all(dropped[1:])
+
+
+class Dropping:
+    """Sends as the middleware does that drops the first answers of each kind."""
+
+    def __init__(self, handle: Any = None, drops: int = 2) -> None:
+        self._handle, self._drops = handle, drops
+        self.sent: list[str] = []
+
+    def send(self, kind: str, send: Any, *answer: Any) -> None:
+        self.sent.append(kind)
+        if self.sent.count(kind) <= self._drops:
+            time.sleep(0.1)
+        else:
+            send(*answer)
+
+    def __getattr__(self, name: str) -> Any:
+        there = getattr(self._handle, name)
+        if name in ("send_goal_response", "send_result_response"):
+            return lambda *answer: self.send(name, there, *answer)
+        return there
+
+
+@pytest.mark.parametrize("worker", [True, False])
+def test_the_answer_of_a_service_is_sent_again(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch, worker: bool
+) -> None:
+    dropping, send = Dropping(), Service.send_response
+    monkeypatch.setattr(Service, "send_response", lambda *answer: dropping.send("answer", send, *answer))
+    node = Node("server", context=observer.node.context)
+    if worker:
+        WorkerService(node, Trigger, "ask", lambda request, response: Trigger.Response(message="here"))
+    else:
+        node.create_service(Trigger, "ask", lambda request, response: Trigger.Response(message="here"))
+    served = BackgroundExecutor(node)
+    client = observer.node.create_client(Trigger, "ask")
+    wait_until(client.service_is_ready)
+    answered = client.call_async(Trigger.Request())
+    wait_until(answered.done)
+    assert answered.result().message == "here"
+    assert len(dropping.sent) == 3
+    served.destroy_node()
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_acceptance_and_result_of_a_goal_are_sent_again(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch, accepted: bool
+) -> None:
+    server = WorkerActionServer(observer.node, Degauss, "run", lambda goal: ("succeed", Degauss.Result(message="done")))
+    if not accepted:
+        monkeypatch.setattr(WorkerActionServer, "busy", True)
+    dropping = Dropping(server._handle)
+    monkeypatch.setattr(server, "_handle", dropping)
+    handle, result = observer.send_goal(Degauss, "run", Degauss.Goal())
+    assert handle.accepted == accepted
+    if accepted:
+        wait_until(result.done)
+        assert (result.result().status, result.result().result.message) == (GoalStatus.STATUS_SUCCEEDED, "done")
+    assert {kind: dropping.sent.count(kind) for kind in dropping.sent} == (
+        {"send_goal_response": 3, "send_result_response": 3} if accepted else {"send_goal_response": 3}
+    )
