@@ -21,7 +21,7 @@ from dm_msgs.msg import ActuatorState, FocusState
 from dm_client.connection import Connection
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
-from dm_common.ros.clients import answers_arrive, call
+from dm_common.ros.clients import call
 from studies.documentation.answer_cases import CASES
 from studies.documentation.state_answers import SHOWN, Nodes
 
@@ -120,7 +120,7 @@ class Asker(Connection):
         return self.messages.get(topic, before)
 
     def _goal(self, client: Any, goal: Any) -> Any:
-        self.wait(lambda: answers_arrive(client, client.server_is_ready))
+        self.wait(client.server_is_ready)
         accepted = client.send_goal_async(goal)
         self.wait(accepted.done)
         finished = accepted.result().get_result_async()

@@ -13,7 +13,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
-from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, answers_arrive, call
+from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, call
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.qos import Liveliness
 
@@ -165,7 +165,6 @@ class Connection:
     def _check(self, name: str, gone: Callable[[], str]) -> None:
         """Raise DeformableMirrorError when the node that serves `name` is `gone`."""
         if text := gone():
-            answers_arrive(self.clients[name], lambda: False)  # the next one has to discover the client anew
             code = UNAVAILABLE.get(self._servers[name].name, ErrorCode.TIMEOUT)
             raise DeformableMirrorError(code, f"{name}: {text}")
 
@@ -185,7 +184,7 @@ class Connection:
         """
         client, gone = self.clients[name], self._since_now(name)
         self._check(name, gone)
-        if not self.wait(lambda: answers_arrive(client, client.server_is_ready)):
+        if not self.wait(client.server_is_ready):
             raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
         accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
         finished = None

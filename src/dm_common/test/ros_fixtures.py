@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import BackgroundExecutor
 from waiting import wait_until
@@ -46,15 +46,9 @@ class Observer:
         if name not in self._clients:
             self._clients[name] = self.node.create_client(service_type, name)
         client = self._clients[name]
-        wait_until(lambda: answers_arrive(client, client.service_is_ready), max(timeout_s, 60.0), f"service {name}")
-        message = request if request is not None else service_type.Request()
-        future = client.call_async(message)
-        try:
-            wait_until(future.done, timeout_s, f"answer of {name}")
-        except AssertionError:
-            # On a busy machine discovery can take longer than `answers_arrive` allows; that answer is lost.
-            future = client.call_async(message)
-            wait_until(future.done, timeout_s, f"second answer of {name}")
+        wait_until(client.service_is_ready, max(timeout_s, 60.0), f"service {name}")
+        future = client.call_async(request if request is not None else service_type.Request())
+        wait_until(future.done, timeout_s, f"answer of {name}")
         return future.result()
 
     def send_goal(
@@ -64,7 +58,7 @@ class Observer:
         if name not in self._clients:
             self._clients[name] = ThreadedActionClient(self.node, action_type, name)
         client = self._clients[name]
-        wait_until(lambda: answers_arrive(client, client.server_is_ready), 60, f"action {name}")
+        wait_until(client.server_is_ready, 60, f"action {name}")
         accepted = client.send_goal_async(goal, feedback_callback=feedback)
         wait_until(accepted.done, 60, f"acceptance by {name}")
         handle = accepted.result()

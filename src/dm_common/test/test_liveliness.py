@@ -95,7 +95,7 @@ def test_a_call_waits_for_a_node_that_others_know_to_be_back(watched: Watched, t
     time.at[110.5] = lambda: watched.change(1, 0)
     watched.wait_for_return()
     gone = watched.since_now()
-    assert gone() == "" and time.now >= 110.5 + qos.DISCOVERY_S
+    assert gone() == "" and time.now >= 110.5
     watched.change(-1, 1)
     began = time.now = 120.0
     watched.wait_for_return()

@@ -16,7 +16,7 @@ from dm_msgs.srv import Flatten, HoldMirror, SetSignals
 from std_msgs.msg import Int32
 
 from dm_common.errors import Refusal
-from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, answers_arrive, call
+from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, call
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, never_silent, sleep
 from dm_common.values import Fields, real
 from ros_fixtures import Observer
@@ -139,7 +139,7 @@ def test_an_answer_quicker_than_the_sender_is_not_lost(observer: Observer, monke
     mover = Mover(observer, "refuse")
     mover.release.set()
     client = ThreadedActionClient(observer.node, MoveFocus, "move")
-    wait_until(lambda: answers_arrive(client, client.server_is_ready))
+    wait_until(client.server_is_ready)
 
     class Dawdling:
         """The handle of the client, which is slow to return once a goal is sent."""

@@ -12,7 +12,7 @@ from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
@@ -186,7 +186,7 @@ class DegaussClient:
         self._call()
 
     def _call(self) -> None:
-        if self._waiting is None or not answers_arrive(self._client, self._client.server_is_ready):
+        if self._waiting is None or not self._client.server_is_ready():
             return
         number, steps, holder, take_over = self._waiting
         self._waiting = None

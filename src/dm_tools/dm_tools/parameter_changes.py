@@ -40,10 +40,9 @@ def _answer(client: Any, node: str, ask: Any) -> Any:
 
     from dm_client import DeformableMirrorError
     from dm_client.connection import UNAVAILABLE
-    from dm_common.ros.clients import answers_arrive
 
     parameters = AsyncParameterClient(client.node, node)
-    if client.wait(lambda: answers_arrive(parameters, parameters.services_are_ready)):
+    if client.wait(parameters.services_are_ready):
         answer = ask(parameters)
         if client.wait(answer.done):
             return answer.result()

@@ -24,7 +24,7 @@ from dm_msgs.msg import ErrorCode
 from dm_calibration.procedure.event_frames import map_hashes, record_hash
 from dm_calibration.procedure.run_journal import read_run
 from dm_calibration.store.calibration_store import CalibrationStore
-from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.clients import ThreadedActionClient
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import RigError
 from fault_injection.rigs.parts import checked
@@ -54,7 +54,7 @@ class _Runs:
     def start(self) -> None:
         """Send the goal."""
         self.feedback = []
-        self.rig.wait(lambda: answers_arrive(self._client, self._client.server_is_ready), "the action calibrate")
+        self.rig.wait(self._client.server_is_ready, "the action calibrate")
         accepted = self._client.send_goal_async(
             Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES),
             feedback_callback=lambda message: self.feedback.append(message.feedback),

@@ -27,7 +27,6 @@ from rclpy.node import Node
 
 from dm_bringup.nodes import MODULES
 from dm_common.ros import qos
-from dm_common.ros.clients import answers_arrive
 from dm_common.ros.executor import BackgroundExecutor
 from dm_simulation.bench import BenchConfig, FilesConfig, VirtualBench
 from dm_simulation.electronics.drive_unit import DriveConfig
@@ -177,7 +176,7 @@ class DriverRig:
     def begin(self, kind: Any, request: Any) -> Any:
         """Call a service of the driver without waiting; returns the future."""
         client = self._clients[kind]
-        self.wait(lambda: answers_arrive(client, client.service_is_ready), f"service {client.srv_name}")
+        self.wait(client.service_is_ready, f"service {client.srv_name}")
         return client.call_async(request)
 
     def wait_answer(self, future: Any) -> Any:

@@ -24,7 +24,7 @@ from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 
 from dm_common.ros import qos
-from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, answers_arrive, call
+from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, call
 from dm_common.ros.executor import BackgroundExecutor
 
 REACH = 0.02
@@ -56,14 +56,14 @@ class Clients:
                 goal_service_qos_profile=qos.SERVICE,
                 result_service_qos_profile=qos.SERVICE,
             )
-            self.ready.append(lambda: answers_arrive(action, action.server_is_ready))
+            self.ready.append(action.server_is_ready)
             return action, self._move
         kind, name, work = (
             (Flatten, "flatten", self._flatten) if number % 10 == 8 else (SetFocus, "set_focus", self._focus)
         )
         # Every client's reader gets the answers to all of them.
         client = node.create_client(kind, name, qos_profile=qos.SERVICE)
-        self.ready.append(lambda: answers_arrive(client, client.service_is_ready))
+        self.ready.append(client.service_is_ready)
         return client, work
 
     def run(self) -> None:

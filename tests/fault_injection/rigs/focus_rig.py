@@ -33,7 +33,7 @@ from dm_bringup.nodes import MODULES
 from dm_common.messages import doubles, limits_from, recipe_book_message
 from dm_common.recipes import Recipe, RecipeBook
 from dm_common.ros import qos
-from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.worker import WorkerService
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
@@ -114,7 +114,7 @@ class FocusRig(DriverRig):
         self.wait(lambda: self._infos, "mirror_info")
         self.calibrate()
         self.wait(
-            lambda: all(answers_arrive(client, client.server_is_ready) for client in self.actions.values()),
+            lambda: all(client.server_is_ready() for client in self.actions.values()),
             "the controller's actions",
         )
         return self

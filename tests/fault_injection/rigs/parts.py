@@ -13,7 +13,7 @@ from dm_msgs.msg import ActuatorState, FocusState
 from numpy.typing import ArrayLike
 
 from dm_common.messages import stamp_ns
-from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.clients import ThreadedActionClient
 from fault_injection.fault import FaultRecord
 from fault_injection.rigs.driver_rig import PATIENCE_S, DriverRig
 
@@ -63,7 +63,7 @@ def overtaken(reports: Iterable[ActuatorState], state: FocusState) -> bool:
 def begin_degauss(rig: DriverRig, steps: int) -> Any:
     """Begin a degauss; returns the future of its result."""
     client = ThreadedActionClient(rig.node, Degauss, "degauss")
-    rig.wait(lambda: answers_arrive(client, client.server_is_ready), "action degauss")
+    rig.wait(client.server_is_ready, "action degauss")
     accepted = client.send_goal_async(Degauss.Goal(steps=steps))
     rig.wait(accepted.done, "acceptance of the degauss")
     return accepted.result().get_result_async()

@@ -22,7 +22,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.procedure.plan import PlanKind
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.ros import qos
-from dm_common.ros.clients import ThreadedActionClient, answers_arrive
+from dm_common.ros.clients import ThreadedActionClient
 from dm_simulation.bench import BenchConfig, FilesConfig
 from dm_simulation.electronics.monitor import MonitorConfig
 from dm_simulation.electronics.server import OFF, PortsConfig
@@ -133,7 +133,7 @@ class ProcessRig(DriverRig):
             RigError: it is not accepted.
         """
         client = self._actions[kind]
-        self.wait(lambda: answers_arrive(client, client.server_is_ready), f"the action {kind.__name__}")
+        self.wait(client.server_is_ready, f"the action {kind.__name__}")
         accepted = client.send_goal_async(goal, feedback_callback=feedback)
         self.wait(accepted.done, "the acceptance of a goal")
         if not accepted.result().accepted:

@@ -23,7 +23,7 @@ from dm_common import Floats
 from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal
 from dm_common.messages import doubles, measurement_from, stamp_ns
 from dm_common.ros import qos
-from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, answers_arrive, call, run_goal
+from dm_common.ros.clients import MirrorHolder, ServiceCallError, ThreadedActionClient, call, run_goal
 from dm_common.ros.worker import sleep
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ class BenchServices:
     def _interferometer_returns(self) -> bool:
         """Wait for an interferometer that has died, as long as for a map; whether it is back. Raises Cancelled."""
         deadline = time.monotonic() + self._values["measure_timeout"]
-        while not answers_arrive(self._measure, lambda: not self._no_interferometer()):
+        while self._no_interferometer():
             if self._stopping():
                 raise self.hold.lost or Cancelled("cancelled")
             if time.monotonic() > deadline:

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from dm_msgs.srv import HoldMirror
 from rclpy.action import ActionClient
@@ -14,7 +13,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.ros.qos import DISCOVERY_S
 
 #: How often a hold is renewed, s: several times within the driver's lease of 3 s.
 RENEW_S = 0.7
@@ -23,23 +21,9 @@ RELEASE_S = 1.0
 #: Longest wait for the end of a goal that was cancelled, s.
 CANCEL_S = 20.0
 
-_first_seen: WeakKeyDictionary[Any, float] = WeakKeyDictionary()
-
 
 class ServiceCallError(Exception):
     """A service did not answer: not there, too slow, or the wait was cancelled."""
-
-
-def answers_arrive(client: Any, is_ready: Callable[[], bool]) -> bool:
-    """Whether a service or action server is there, and has had time to discover the client in its turn.
-
-    A server that answers before it knows the client's reader drops the answer; no API says whether it does. So a
-    server counts as there only some time after it was first seen.
-    """
-    if not is_ready():
-        _first_seen.pop(client, None)
-        return False
-    return time.monotonic() >= _first_seen.setdefault(client, time.monotonic()) + DISCOVERY_S
 
 
 def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], object] = lambda: False) -> Any:
@@ -51,7 +35,7 @@ def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[],
         ServiceCallError: no server within `timeout_s`, no answer within `timeout_s`, or `cancelled()` became true.
     """
     deadline = time.monotonic() + timeout_s
-    while not answers_arrive(client, client.service_is_ready):
+    while not client.service_is_ready():
         if cancelled():
             raise ServiceCallError(f"{client.srv_name}: cancelled")
         if time.monotonic() > deadline:
@@ -128,7 +112,7 @@ def run_goal(
                 raise ServiceCallError(f"{name}: {missing} within {timeout_s:g} s")
             time.sleep(0.01)
 
-    wait(lambda: answers_arrive(client, client.server_is_ready), "no such action")
+    wait(client.server_is_ready, "no such action")
     accepted = client.send_goal_async(goal)
     finished = None
     try:

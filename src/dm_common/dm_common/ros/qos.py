@@ -5,7 +5,6 @@ for every publisher with a lease, whatever is published; so the nodes that other
 who wait watch it here: they know within a second, also after kill -9.
 """
 
-import math
 import time
 from collections.abc import Callable
 from copy import copy
@@ -49,8 +48,6 @@ APPEAR_S = 5.0
 #: A node that was started again is known to one process sooner than to another, up to seconds on a busy machine: a call
 #: to one that is lost waits for so long before it counts as dead, s.
 RETURN_S = 1.2
-#: Time that discovery may take on a busy machine from one side to the other, s.
-DISCOVERY_S = 0.5
 #: What became of a node that is lost.
 GONE = "has died or was stopped: start it again"
 
@@ -87,7 +84,6 @@ class Liveliness:
     def __init__(self, node: Node, name: str, message_type: Any, topic: str, profile: QoSProfile) -> None:
         self.name, self.lost, self.starts = name, False, 0
         self._born = self._lost_at = self._heard_at = time.monotonic()
-        self._started_at = -math.inf
         node.create_subscription(
             message_type,
             topic,
@@ -105,13 +101,13 @@ class Liveliness:
         self._heard_at = time.monotonic()
 
     def wait_for_return(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait for a node that is lost, and until one that was started again knows this process; `RETURN_S` at most.
+        """Wait for a node that is lost; `RETURN_S` at most.
 
         Args:
             stop: ends the wait.
         """
         deadline = time.monotonic() + RETURN_S
-        while self.lost or time.monotonic() < self._started_at + DISCOVERY_S:
+        while self.lost:
             if stop() or time.monotonic() > deadline:
                 return
             time.sleep(0.02)
@@ -151,8 +147,6 @@ class Liveliness:
         # not always heard, when it came before the executor did; whatever changes afterwards, there was one.
         started = info.alive_count_change + info.not_alive_count_change > 0
         self.starts = max(self.starts + started, 1)
-        if started and self.starts > 1:
-            self._started_at = time.monotonic()
         if lost != self.lost:
             self.lost, self._lost_at = lost, time.monotonic()
 

@@ -22,7 +22,6 @@ from dm_client.connection import Connection, DeformableMirrorError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.ros import qos
-from dm_common.ros.clients import answers_arrive
 from dm_tools.console.state_observer import StateObserver
 from dm_tools.long_actions import LONG, ExternalGoals
 
@@ -193,7 +192,7 @@ class ConsoleNode:
     async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None], identity: Any) -> Any:
         """The handle of a goal that was accepted."""
         action = self._connection.clients[name]
-        if not await _until(lambda: answers_arrive(action, action.server_is_ready), ANSWER_S):
+        if not await _until(action.server_is_ready, ANSWER_S):
             raise Refusal(ErrorCode.TIMEOUT, f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
         if self._beginning[name]:
             raise Refusal(ErrorCode.CANCELED, f"{name}: cancelled before it began; nothing has changed")
