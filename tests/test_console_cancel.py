@@ -87,9 +87,13 @@ def test_a_goal_whose_answer_was_lost_is_seen_and_can_be_cancelled(
     asyncio.run(asyncio.wait_for(scene(), LONGEST_S)).destroy_node()
 
 
-def test_a_goal_that_is_not_sent_yet_never_begins(bench: tuple[ConsoleNode, Node]) -> None:
+def test_a_goal_that_is_not_sent_yet_never_begins(
+    bench: tuple[ConsoleNode, Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
     side, node = bench
     served = BackgroundExecutor(node)
+    found = iter([False])
+    monkeypatch.setattr(side._connection.clients["calibrate"], "server_is_ready", lambda: next(found, True))
 
     async def scene() -> None:
         run = asyncio.create_task(side.run("calibrate", Calibrate.Goal(), lambda _feedback: None))

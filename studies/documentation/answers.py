@@ -116,6 +116,7 @@ class Asker(Connection):
         self.wait(lambda: topic in self.messages and not getattr(self.messages[topic], "moving", False), 3.0)
         before = self.messages.pop(topic, None)
         publisher.publish(message)
+        time.sleep(0.2)  # the first to come may be of before
         self.wait(lambda: topic in self.messages, 5.0)
         return self.messages.get(topic, before)
 

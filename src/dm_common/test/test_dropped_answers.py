@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.service import Service
 from std_srvs.srv import Trigger
 
-from dm_common.ros import answers
+from dm_common.ros import executor
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import WorkerActionServer, WorkerService
 from ros_fixtures import Observer, wait_until
@@ -24,14 +24,14 @@ def test_the_middleware_takes_a_tenth_of_a_second_to_drop_an_answer(
 ) -> None:
     """A client that wants the answers of before its time never matches a server that keeps none."""
     dropped: list[bool] = []
-    judge = answers._dropped
+    judge = executor._dropped
 
     def spy(*arguments: Any) -> bool:
         dropped.append(judge(*arguments))
         return dropped[-1]
 
-    monkeypatch.setattr(answers, "_dropped", spy)
-    monkeypatch.setattr(answers, "PAUSES_S", (0.05, 0.05))
+    monkeypatch.setattr(executor, "_dropped", spy)
+    monkeypatch.setattr(executor, "PAUSES_S", (0.05, 0.05))
     WorkerService(observer.node, Trigger, "ask", lambda request, response: response)
     assert observer.call(Trigger, "ask", Trigger.Request()) == Trigger.Response()
     assert dropped == [False]

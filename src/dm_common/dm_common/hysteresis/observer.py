@@ -116,7 +116,7 @@ class HysteresisTracker:
             return
         if (missed := report.turns - last.turns - 1) > 0:
             reason = f"{missed} turns were not seen" if missed > 1 else "a turn was not seen"
-            self._guess_keeping_creep(report, reason, report.time)
+            self._guess_keeping_creep(report, self.unknown or reason, report.time)
         else:
             self._follow(report, last)
 

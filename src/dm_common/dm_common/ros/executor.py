@@ -11,6 +11,9 @@ with care (measured with rclpy 7.1.6):
 * It keeps a hold on every entity it serves: a node destroyed before its executor is shut down stays in the ROS graph,
   latched messages and all. (So does one with action clients or servers, for `Node.destroy_node` passes these over and
   each holds its node: see `destroy`.)
+* A client may have discovered a server on a busy machine before that one has discovered the client. rmw_fastrtps then
+  waits 0.1 s for it and drops the answer, of which rclpy tells only by a warning ("client will not receive response"):
+  whoever asked waits for ever (ros2/rmw_fastrtps#706, ros2/rclcpp#2760). `until_discovered` sends it again.
 * A signal may raise KeyboardInterrupt inside any callback, and is not noticed while the loop sleeps. `StopOnSignals`
   turns SIGINT and SIGTERM into an orderly end instead.
 """
@@ -26,18 +29,20 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import rclpy
-from rclpy.action import ActionClient, ActionServer
-from rclpy.exceptions import ParameterException
+from rclpy.action import ActionClient, ActionServer, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.experimental import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from dm_common.ros import SUPERVISOR
-from dm_common.ros.answers import until_discovered
 
 #: Signals that end a node in order.
 STOPPING = (signal.SIGINT, signal.SIGTERM)
@@ -45,6 +50,10 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKE_PERIOD_S = 1.0
 #: Where Fast DDS keeps its segments. One that is younger may not be locked by its process yet, s.
 SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
+#: An answer that took so long to send was dropped, s; others take less than a millisecond.
+DROPPED_S = 0.09
+#: After how long it is sent again, s, each counted from the one before: a client may be gone, or never match.
+PAUSES_S = (0.2, 0.4, 0.8, 1.6, 3.2)
 
 
 def make_executor(*nodes: Node) -> Executor:
@@ -223,3 +232,64 @@ def run_node(make_node: Callable[[], Node], args: Sequence[str] | None = None) -
         rclpy.try_shutdown()  # worker threads know by it that the node is about to go
         if node is not None:
             node.destroy_node()
+
+
+def until_discovered(send: Callable[..., None]) -> Callable[..., None]:
+    """`send`, which repeats an answer that was dropped, from a thread of its own."""
+
+    def patient(*answer: Any) -> None:
+        if _dropped(send, *answer):
+            _send_again(send, *answer)
+
+    return patient
+
+
+class PatientActionServer(ActionServer):
+    """An action server that repeats acceptance and result of a goal when they were dropped."""
+
+    def __init__(self, *arguments: Any, goal_callback: Callable[[Any], GoalResponse], **keywords: Any) -> None:
+        self._judged = self._begun = 0.0
+
+        def judge(goal: Any) -> GoalResponse:
+            try:
+                return goal_callback(goal)
+            finally:
+                self._judged = time.monotonic()
+
+        def begin(goal_handle: ServerGoalHandle) -> None:
+            self._begun = time.monotonic()
+            goal_handle.execute()
+
+        super().__init__(*arguments, goal_callback=judge, handle_accepted_callback=begin, **keywords)
+
+    async def _execute_goal_request(self, request: Any) -> None:
+        self._judged, self._begun = time.monotonic(), 0.0
+        await super()._execute_goal_request(request)
+        # rclpy sends the answer between judging a goal and beginning it.
+        accepted = self._begun > self._judged
+        if (self._begun if accepted else time.monotonic()) - self._judged >= DROPPED_S:
+            answer = self._action_type.Impl.SendGoalService.Response(accepted=accepted)
+            _send_again(self._handle.send_goal_response, request[0], answer)
+
+    def _send_result_response(self, request_header: Any, future: Any) -> None:
+        with suppress(rclpy_implementation.RCLError):  # the client may have gone
+            until_discovered(self._handle.send_result_response)(request_header, future.result())
+
+
+def _send_again(send: Callable[..., None], *answer: Any) -> None:
+    """Have an answer that was dropped sent again until its client takes it, or for some seconds."""
+
+    def repeat() -> None:
+        with suppress(InvalidHandle, rclpy_implementation.RCLError):  # the node has ended
+            for pause in PAUSES_S:
+                time.sleep(pause)
+                if not _dropped(send, *answer):
+                    return
+
+    threading.Thread(target=repeat, daemon=True).start()
+
+
+def _dropped(send: Callable[..., None], *answer: Any) -> bool:
+    began = time.monotonic()
+    send(*answer)
+    return time.monotonic() - began >= DROPPED_S

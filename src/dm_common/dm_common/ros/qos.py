@@ -49,7 +49,7 @@ APPEAR_S = 5.0
 #: to one that is lost waits for so long before it counts as dead, s.
 RETURN_S = 1.2
 #: What became of a node that is lost.
-GONE = "has died or was stopped: start it again"
+GONE = "has died, was stopped or hangs: start it again"
 
 
 def with_lease(profile: QoSProfile) -> QoSProfile:

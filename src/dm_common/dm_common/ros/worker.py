@@ -22,7 +22,7 @@ from rclpy.service import Service
 
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.ros import qos
-from dm_common.ros.answers import PatientActionServer, until_discovered
+from dm_common.ros.executor import PatientActionServer, until_discovered
 from dm_common.values import Fields, without_figures
 
 #: Results are fetched at once by every client we know; rclpy's default of 900 s makes servers slower with every goal.
