@@ -58,11 +58,14 @@ def test_one_turn_may_be_missed(tracker: HysteresisTracker) -> None:
     assert not tracker.unknown
 
 
-def test_two_missed_turns_are_noticed(tracker: HysteresisTracker) -> None:
-    tracker.observe(report(3.0, C, 4, B))
-    assert tracker.unknown == "2 turns were not seen"
-    tracker.observe(report(4.0, A, 6, B))
-    assert tracker.unknown == "a turn was not seen"
+@pytest.mark.parametrize(("missed", "text"), [(2, "2 turns were not seen"), (1, "a turn was not seen")])
+def test_missed_turns_are_noticed_and_the_first_reason_stays(
+    tracker: HysteresisTracker, missed: int, text: str
+) -> None:
+    tracker.observe(report(3.0, C, 2 + missed, B))
+    assert tracker.unknown == text
+    tracker.observe(report(4.0, A, 12, B))
+    assert tracker.unknown == text
 
 
 def test_a_degauss_cures(tracker: HysteresisTracker) -> None:

@@ -175,7 +175,7 @@ class DegaussClient:
         return bool(self._client.server_is_ready())
 
     def start(self, run: StartDegauss) -> None:
-        """Call the driver, or keep `run` until the driver has discovered the client: its answer would be lost."""
+        """Call the driver, or keep `run` until there is one."""
         self._waiting = run
         self._call()
 
