@@ -135,7 +135,7 @@ class AutofocusAction(ProbeAction):
             return str(error)
 
     def _stands_where_sent(self) -> bool:
-        """Whether the mirror's moves are those asked for. Creep of hours is not: it is the same in all images."""
+        """Whether the mirror moves as it is asked to. Creep of hours is no matter: it is the same in all images."""
         answer, capabilities = self._probe.answer, ready_capabilities(self._probe)
         if answer is None or not answer.history_known:
             return False
