@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dm_common.ros.domains import PORT_BASE, PORTS, held_by, inhabited_domains, own_domain
+from dm_common.ros.domains import COMMAND_MAX, PORT_BASE, PORTS, held_by, inhabited_domains, own_domain
 
 
 def test_ports_that_are_in_use_tell_the_domains(tmp_path: Path) -> None:
@@ -39,6 +39,6 @@ def test_who_holds_a_port_is_named(kind: socket.SocketKind) -> None:
         port = endpoint.getsockname()[1]
         if kind == socket.SOCK_STREAM:
             endpoint.listen()
-        command = " ".join(sys.orig_argv[:3])
+        command = " ".join(sys.orig_argv[:3])[:COMMAND_MAX]
         assert f" by {command} (process {os.getpid()}, ROS domain " in held_by(port)
     assert held_by(port) == ""

@@ -13,6 +13,8 @@ PORT_BASE, PORTS = 7400, 250
 #: Where the kernel lists the UDP ports that are in use.
 UDP_PORTS = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
 PROCESSES = Path("/proc")
+#: Characters of a command that are told.
+COMMAND_MAX = 120
 
 
 def inhabited_domains(tables: Iterable[Path] = UDP_PORTS) -> set[int]:
@@ -33,7 +35,7 @@ def holders(targets: Collection[Path]) -> list[str]:
                 command = (process / "cmdline").read_text(errors="replace").split("\0")[:3]
                 variables = (process / "environ").read_text(errors="replace").split("\0")
                 domain = dict(variable.partition("=")[::2] for variable in variables).get("ROS_DOMAIN_ID", "0")
-                found.append(f"{' '.join(command).strip()} (process {process.name}, ROS domain {domain})")
+                found.append(f"{' '.join(command).strip()[:COMMAND_MAX]} (process {process.name}, ROS domain {domain})")
     return found
 
 

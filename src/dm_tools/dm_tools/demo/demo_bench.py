@@ -1,6 +1,7 @@
 """The virtual bench of a run: a configuration with ports and folders of its own."""
 
 import contextlib
+import random
 import shutil
 import socket
 from collections.abc import Iterator
@@ -10,6 +11,8 @@ from typing import Any
 
 #: A port of the virtual bench that is not offered.
 OFF = -1
+#: Above those that the kernel hands out to whoever asks for any (net.ipv4.ip_local_port_range).
+PORTS = range(61000, 65536)
 #: Parameters of a bench whose actuators follow one law.
 SAME_ACTUATORS = {f"piezo.{name}_spread": 0.0 for name in ("hysteresis", "creep", "spectrum")}
 
@@ -25,23 +28,20 @@ class Hysteresis(StrEnum):
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that are free on loopback now, for TCP and UDP alike."""
-    sockets: list[socket.socket] = []
-    while len(sockets) < count:
-        stream = socket.create_server(("127.0.0.1", 0))
-        datagram = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            datagram.bind(stream.getsockname())
-        except OSError:
-            stream.close()
-            continue
-        finally:
-            datagram.close()
-        sockets.append(stream)
-    ports = [item.getsockname()[1] for item in sockets]
-    for item in sockets:
-        item.close()
-    return ports
+    """Ports that are free on loopback now, for TCP and UDP alike; others ask for none of them by chance.
+
+    Raises:
+        RuntimeError: there are not so many.
+    """
+    ports: list[int] = []
+    for port in random.SystemRandom().sample(PORTS, len(PORTS)):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagram:
+            datagram.bind(("127.0.0.1", port))
+            socket.create_server(("127.0.0.1", port)).close()
+            ports.append(port)
+        if len(ports) == count:
+            return ports
+    raise RuntimeError(f"no {count} free ports from {PORTS.start} on")
 
 
 def bench_config(
