@@ -149,7 +149,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     with (
         own_domain() as domain,
         ForkedSuite(config, folder, domain) as suite,
-        # An answer that a node just started loses, since it does not know the client yet, is soon asked for again.
+        # A call to a node that is killed meanwhile is soon given up.
         CameraFocusClient(domain=domain, timeout_s=15.0) as client,
     ):
         client.wait_until_active()

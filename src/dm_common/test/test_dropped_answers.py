@@ -83,6 +83,30 @@ def test_the_answer_of_a_service_is_sent_again(
     served.destroy_node()
 
 
+def test_a_request_that_is_slowly_handed_to_its_worker_is_carried_out_once(
+    observer: Observer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A machine that stalls takes as long for that as the middleware to drop an answer."""
+    start, carried_out = WorkerService._start, []
+
+    def slowly(self: WorkerService, *arguments: Any) -> None:
+        time.sleep(0.1)
+        start(self, *arguments)
+
+    def answer(_request: Any, response: Any) -> Any:
+        carried_out.append(response)
+        return response
+
+    monkeypatch.setattr(WorkerService, "_start", slowly)
+    node = Node("server", context=observer.node.context)
+    WorkerService(node, Trigger, "ask", answer)
+    served = BackgroundExecutor(node)
+    observer.call(Trigger, "ask", Trigger.Request())
+    time.sleep(2 * executor.PAUSES_S[0])
+    assert len(carried_out) == 1
+    served.destroy_node()
+
+
 @pytest.mark.parametrize("accepted", [True, False])
 def test_acceptance_and_result_of_a_goal_are_sent_again(
     observer: Observer, monkeypatch: pytest.MonkeyPatch, accepted: bool

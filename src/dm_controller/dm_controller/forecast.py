@@ -24,8 +24,7 @@ from dm_controller.planning.target import FocusTarget
 
 #: Number of curvatures over the reachable range for which the share of hysteresis is fetched.
 GRID = 11
-#: Answers that have not come within this time are asked for again, s: a server that has not discovered the client yet
-#: answers into the void.
+#: Answers that have not come within this time are asked for again, s: the node that was asked may have died.
 RETRY_S = 10.0
 
 

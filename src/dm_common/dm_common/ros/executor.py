@@ -74,7 +74,8 @@ def spin(executor: Executor, until: Callable[[], bool] | None = None) -> None:
     for node in executor.get_nodes():
         getattr(node, "autostart", lambda: None)()
         for service in node.services:
-            service.send_response = until_discovered(service.send_response)
+            if "send_response" not in vars(service):  # else it only hands the request on, see `worker.WorkerService`
+                service.send_response = until_discovered(service.send_response)
     while context.ok() and not (until is not None and until()):
         try:
             executor.spin_once(timeout_sec=WAKE_PERIOD_S)
