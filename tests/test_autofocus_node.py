@@ -100,6 +100,11 @@ class FilmedScene:
         )
         self._capabilities.publish(capabilities)
 
+    def until_known(self, observer: Observer) -> None:
+        """Wait until the node has taken an image and the capabilities, which come in any order."""
+        wait_until(lambda: self.states, what="the first figure of an image")
+        wait_until(lambda: observer.call(GetFocusRange, "get_focus_range").error_code == ErrorCode.OK, what="the range")
+
     def __exit__(self, *_exception: object) -> None:
         self._stop.set()
         self._camera.join()
@@ -170,7 +175,7 @@ Start = Callable[..., NodeProcess]
 def scene(start: Start, observer: Observer) -> Iterator[FilmedScene]:
     with FilmedScene(observer, object_curvature=0.0173) as played:
         start("dm_autofocus", "autofocus", PARAMETERS)
-        wait_until(lambda: played.states, 60, "the first figure of an image")
+        played.until_known(observer)
         yield played
 
 
@@ -282,7 +287,7 @@ def test_compressed_images_are_taken_as_they_come(start: Start, observer: Observ
         played.compressed = True
         parameters, remap = {**PARAMETERS, "image_transport": "compressed"}, "image_raw:=/camera/image"
         start("dm_autofocus", "autofocus", parameters, "--ros-args", "-r", remap, "--")
-        wait_until(lambda: played.states, 60, "the first figure of an image")
+        played.until_known(observer)
         found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
         assert found.error_code == ErrorCode.OK, found.message
         assert found.curvature == pytest.approx(0.0173, abs=0.0012)
@@ -305,7 +310,7 @@ def test_a_slow_camera_is_named_and_a_fast_one_is_no_harm(
 ) -> None:
     with FilmedScene(observer, object_curvature=0.0173, rate=rate) as played:
         start("dm_autofocus", "autofocus", {**PARAMETERS, "image_timeout": 0.1})
-        wait_until(lambda: played.states, 60, "the first figure of an image")
+        played.until_known(observer)
         found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert found.error_code == code and re.search(text, found.message), found.message
 
