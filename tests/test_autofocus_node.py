@@ -421,6 +421,14 @@ def test_without_controller_and_camera_the_reason_is_told(start: Start, observer
     assert "focus_controller" in answer.message
 
 
+def test_a_goal_waits_for_a_controller_that_starts_later(start: Start, observer: Observer) -> None:
+    start("dm_autofocus", "autofocus", PARAMETERS)
+    _handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal())
+    with FilmedScene(observer, object_curvature=0.0173):
+        wait_until(result.done, what="the end of the search")
+    assert result.result().result.error_code == ErrorCode.OK, result.result().result.message
+
+
 def test_a_senseless_region_keeps_the_node_from_its_work_with_the_reason(start: Start, observer: Observer) -> None:
     process = start("dm_autofocus", "autofocus", {"region": [0.5, 0.0, 0.9, 1.0]})
     answer = observer.call(GetFocusRange, "get_focus_range")

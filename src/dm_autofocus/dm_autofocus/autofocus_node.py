@@ -1,7 +1,5 @@
 """Node `autofocus`: a camera's images in, focus requests out; focus by object distance and by dioptre."""
 
-from __future__ import annotations
-
 import math
 import sys
 from typing import Any

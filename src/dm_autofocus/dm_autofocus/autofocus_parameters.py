@@ -1,7 +1,5 @@
 """Parameters of the node `autofocus`, and what is made from their values."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, Final

@@ -11,8 +11,6 @@ Shifts come from the phase of the cross-power spectrum [34]. Only low spatial fr
 the mean slope, that of higher ones shows aberrations too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A plain Python face of the camera pipeline: no callbacks, no executors. See docs/camera.md."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """What `autofocus` does at one curvature: move the focus there and measure the sharpness of the images."""
 
-from __future__ import annotations
-
 import math
 import statistics
 import sys

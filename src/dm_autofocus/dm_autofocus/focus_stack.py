@@ -5,8 +5,6 @@ parabola over focus, whose vertex follows from the three images around the large
 rise above its noise have no such place. The image shows each cell as it was when it was sharpest.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Images of a camera: their grey levels as arrays, and which of them show the focus that was asked for."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the actions of the node have in common: they move the focus and take images until they are done or stopped."""
 
-from __future__ import annotations
-
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -21,10 +19,15 @@ from dm_common.values import Fields
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
 MARGIN = 0.002
 
+#: How long a goal waits for a controller that was started together with this node, s.
+START_GRACE_S = 5.0
 
-def ready_capabilities(probe: FocusProbe) -> Capabilities:
-    """The mirror's capabilities. Raises Refusal when it cannot be focused."""
-    capabilities = probe.capabilities
+
+def ready_capabilities(probe: FocusProbe, wait_s: float = 0.0) -> Capabilities:
+    """The mirror's capabilities; a worker thread may wait for the first. Raises Refusal when it cannot be focused."""
+    deadline = time.monotonic() + wait_s
+    while (capabilities := probe.capabilities) is None and time.monotonic() < deadline:
+        time.sleep(0.02)
     if capabilities is None:
         raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
     if capabilities.quality == Capabilities.UNCALIBRATED:

@@ -5,8 +5,6 @@ Both are divided by the squared mean grey level, so that exposure, gain and flic
 finer detail and to noise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -11,8 +11,6 @@ be known. The transfer of a pupil of radius a with w waves of defocus at its edg
 with the frequency u in cycles per pixel, f the focal length in pixels and w = (c - b) a^2 / lambda.
 """
 
-from __future__ import annotations
-
 import math
 from copy import copy
 from dataclasses import dataclass, replace

@@ -8,8 +8,6 @@ confirms it: the top must stand above both. The place is the mean of the probabi
 on either side: where the pupil is not ideal, what one side says is wrong by as much as the other, the other way.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

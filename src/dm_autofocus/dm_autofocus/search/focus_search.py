@@ -1,7 +1,5 @@
 """The search of the node: from a few images where that is possible, else by sweeps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ optics (`DefocusModel`) where it is, if it moved at a speed: each speed of a few
 what the object has moved since. What is believed already weighs as a normal distribution of both.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

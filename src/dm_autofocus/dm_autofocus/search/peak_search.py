@@ -13,8 +13,6 @@ that all of them rise on the same branch. Without that the hill that a long swee
 it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """Staying on the sharpest focus: a state machine like `PeakSearch`, for a scene that changes."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence
