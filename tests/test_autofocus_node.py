@@ -419,6 +419,10 @@ def test_without_controller_and_camera_the_reason_is_told(start: Start, observer
     answer = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
     assert answer.error_code == ErrorCode.TIMEOUT
     assert "focus_controller" in answer.message
+    handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal())
+    handle.cancel_goal_async()  # while it waits for one
+    wait_until(result.done, what="the end after cancel")
+    assert result.result().status == GoalStatus.STATUS_CANCELED
 
 
 def test_a_goal_waits_for_a_controller_that_starts_later(start: Start, observer: Observer) -> None:

@@ -11,7 +11,7 @@ from dm_autofocus.autofocus_parameters import focus_lens, given_focal_length, se
 from dm_autofocus.focus_probe import SharpnessSample, raw_image
 from dm_autofocus.images import exposure_fault, grey
 from dm_autofocus.optics import depth_of_focus, distance_of
-from dm_autofocus.probe_action import START_GRACE_S, ProbeAction, range_of, ready_capabilities
+from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
@@ -41,7 +41,7 @@ class AutofocusAction(ProbeAction):
         super().__init__(node, Autofocus, "autofocus", AUTOFOCUS, *shared)
 
     def _plan(self, goal: Any) -> tuple[SearchConfig, Region]:
-        capabilities = ready_capabilities(self._probe, START_GRACE_S)
+        capabilities = ready_capabilities(self._probe)
         low, high = range_of(goal, capabilities)
         try:
             region = check_region(goal.region if len(goal.region) else self._values["region"])

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from dm_autofocus.autofocus_parameters import tolerance_of
 from dm_autofocus.focus_stack import FEWEST, ImageStack
 from dm_autofocus.images import exposure_fault, grey, pixels_of
-from dm_autofocus.probe_action import START_GRACE_S, ProbeAction, range_of, ready_capabilities
+from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
 from dm_autofocus.sharpness import WHOLE
 from dm_common.errors import ErrorCode, Refusal
@@ -41,7 +41,7 @@ class FocusStackAction(ProbeAction):
 
     def _plan(self, goal: Any) -> NDArray[np.float64]:
         """Curvatures of the images, rising: so that hysteresis that is not known is on one branch."""
-        capabilities = ready_capabilities(self._probe, START_GRACE_S)
+        capabilities = ready_capabilities(self._probe)
         low, high = range_of(goal, capabilities)
         if 0 < goal.images < FEWEST:
             raise Refusal(ErrorCode.OUT_OF_RANGE, f"images = {goal.images}: must be {FEWEST} to {MOST}, or 0")

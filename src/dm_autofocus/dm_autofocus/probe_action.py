@@ -19,15 +19,13 @@ from dm_common.values import Fields
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
 MARGIN = 0.002
 
-#: How long a goal waits for a controller that was started together with this node, s.
+#: How long a goal waits for a controller that may be starting still, s.
 START_GRACE_S = 5.0
 
 
-def ready_capabilities(probe: FocusProbe, wait_s: float = 0.0) -> Capabilities:
-    """The mirror's capabilities; a worker thread may wait for the first. Raises Refusal when it cannot be focused."""
-    deadline = time.monotonic() + wait_s
-    while (capabilities := probe.capabilities) is None and time.monotonic() < deadline:
-        time.sleep(0.02)
+def ready_capabilities(probe: FocusProbe) -> Capabilities:
+    """The mirror's capabilities. Raises Refusal when it cannot be focused."""
+    capabilities = probe.capabilities
     if capabilities is None:
         raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
     if capabilities.quality == Capabilities.UNCALIBRATED:
@@ -104,6 +102,7 @@ class ProbeAction(ABC):
         result = self._type.Result()
         outcome = "succeed"
         try:
+            self._await_controller(goal_handle)
             plan = self._plan(goal_handle.request)
             with self._probe.held(goal_handle.request, self._name):
                 try:
@@ -115,6 +114,12 @@ class ProbeAction(ABC):
             result.error_code, result.message = error.error_code, str(error)
         result.duration = time.monotonic() - started
         return outcome, result
+
+    def _await_controller(self, goal_handle: WorkerGoal) -> None:
+        deadline = time.monotonic() + START_GRACE_S
+        while self._probe.capabilities is None and time.monotonic() < deadline:
+            self._check_stop(goal_handle)
+            time.sleep(0.02)
 
     def _go(self, goal_handle: WorkerGoal, curvature: float) -> None:
         self._probe.move(curvature, lambda: self._stopping(goal_handle))
