@@ -51,7 +51,7 @@ def raw_image(message: Image | CompressedImage) -> Image:
 
 
 class FocusProbe:
-    """Moves by `focus_request` and measures on `image_raw`; `move` and `measure` wait: call them from a worker thread.
+    """Moves by `focus_request` and measures on `image_raw`. Methods with a `stop` wait: call them in a worker thread.
 
     Args:
         node: hosts the topics.
@@ -275,6 +275,10 @@ class FocusProbe:
         except (ImageError, ValueError) as error:
             raise Refusal(ErrorCode.INVALID_ARGUMENT, f"{self.topic}: {error}") from error
         return SharpnessSample(sharpness, image, (part,))
+
+    def await_capabilities(self, timeout_s: float, stop: Callable[[], bool]) -> None:
+        """Wait for the first capabilities, `timeout_s` at most, or for `stop()`."""
+        self._wait(lambda: self.capabilities is not None, timeout_s, stop)
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, stop: Callable[[], bool]) -> bool:
         """Wait for a condition or `stop()`; False when neither came in time. Raises Refusal on another's move."""

@@ -102,7 +102,8 @@ class ProbeAction(ABC):
         result = self._type.Result()
         outcome = "succeed"
         try:
-            self._await_controller(goal_handle)
+            self._probe.await_capabilities(START_GRACE_S, lambda: self._stopping(goal_handle))
+            self._check_stop(goal_handle)
             plan = self._plan(goal_handle.request)
             with self._probe.held(goal_handle.request, self._name):
                 try:
@@ -114,12 +115,6 @@ class ProbeAction(ABC):
             result.error_code, result.message = error.error_code, str(error)
         result.duration = time.monotonic() - started
         return outcome, result
-
-    def _await_controller(self, goal_handle: WorkerGoal) -> None:
-        deadline = time.monotonic() + START_GRACE_S
-        while self._probe.capabilities is None and time.monotonic() < deadline:
-            self._check_stop(goal_handle)
-            time.sleep(0.02)
 
     def _go(self, goal_handle: WorkerGoal, curvature: float) -> None:
         self._probe.move(curvature, lambda: self._stopping(goal_handle))
