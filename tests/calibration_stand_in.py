@@ -16,7 +16,7 @@ from described_mirror import mirror_info_of
 from dm_common.errors import Refusal
 from dm_common.mirror import Mirror
 from dm_common.ros import qos
-from dm_common.ros.worker import WorkerActionServer
+from dm_common.ros.worker import WorkerActionServer, WorkerService
 from dm_driver.commands.mirror_hold import MirrorHold
 from linear_mirror import RADIUS, LinearMirror
 
@@ -53,10 +53,10 @@ class StandIn:
         self.samples = node.create_publisher(SurfaceSamples, "surface_samples", qos.STATE)
         self.map_info = node.create_publisher(SurfaceMapInfo, "surface_map_info", qos.with_lease(qos.STATE))
         node.create_timer(0.1, self.publish_state)  # a driver reports in any case
-        node.create_service(SetSignals, "set_signals", self.on_set_signals)
+        WorkerService(node, SetSignals, "set_signals", self.on_set_signals)
         WorkerActionServer(node, Degauss, "degauss", lambda handle: self.on_degauss(handle.request.steps))
-        node.create_service(HoldMirror, "hold_mirror", self.on_hold_mirror)
-        node.create_service(Measure, "measure", self.on_measure)
+        WorkerService(node, HoldMirror, "hold_mirror", self.on_hold_mirror)
+        WorkerService(node, Measure, "measure", self.on_measure)
         self.publish_info(mirror)
         self.publish_state()
 

@@ -20,6 +20,7 @@ from dm_common.mirror import Mirror
 from dm_common.optics.sampling import edge_clustered_points
 from dm_common.optics.zernike import basis
 from dm_common.ros import qos
+from dm_common.ros.worker import WorkerService
 from dm_tools.running_suite import NEEDED
 
 RADIUS = 8e-3
@@ -46,9 +47,9 @@ class StandIn:
         ):
             publisher = node.create_publisher(type(message), topic, qos.LATCHED)
             publisher.publish(message)
-        node.create_service(SetSignals, "set_signals", self._on_set_signals)
-        node.create_service(ListCalibrations, "list_calibrations", lambda _request, response: response)
-        node.create_service(SetFocus, "set_focus", self._on_set_focus)
+        WorkerService(node, SetSignals, "set_signals", self._on_set_signals)
+        WorkerService(node, ListCalibrations, "list_calibrations", lambda _request, response: response)
+        WorkerService(node, SetFocus, "set_focus", self._on_set_focus)
         node.create_timer(0.2, self._publish)
 
     def _publish(self) -> None:

@@ -34,6 +34,7 @@ from dm_autofocus import CameraFocusClient
 from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
 from dm_client import DeformableMirrorError
 from dm_common.ros import qos
+from dm_common.ros.worker import WorkerService
 from documentation import unexplained
 from support import NodeProcess, Observer, wait_until
 
@@ -78,8 +79,8 @@ class FilmedScene:
         self._capabilities = self.node.create_publisher(Capabilities, "capabilities", qos.LATCHED)
         self.request = self.node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.node.create_subscription(FocusRequest, "focus_request", self._on_request, qos.COMMAND)
-        self.node.create_service(SetFocus, "set_focus", self._on_set_focus)
-        self.node.create_service(HoldMirror, "hold_mirror", lambda _request, response: response)
+        WorkerService(self.node, SetFocus, "set_focus", self._on_set_focus)
+        WorkerService(self.node, HoldMirror, "hold_mirror", lambda _request, response: response)
         self.states: list[AutofocusState] = observer.record(AutofocusState, "autofocus_state", qos.STATE)
         self._stop = threading.Event()
         self._camera = threading.Thread(target=self._film, args=(1 / rate,), daemon=True)
@@ -216,7 +217,7 @@ def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer:
     scene.aperture(lens.aperture_radius, 500e-9)  # every move errs by as much
     time.sleep(0.3)
     found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
-    assert "the range was swept: the mirror's hysteresis is not known" in found.message
+    assert "the range was swept: moves may err by 500 nm" in found.message
     scene.aperture(lens.aperture_radius)
 
     scene.info.publish(CameraInfo(k=[lens.focal_length_px / 2, *8 * [0.0]]))

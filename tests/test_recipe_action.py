@@ -18,6 +18,7 @@ from calibration_stand_in import StandIn
 from converge_stand_in import Host
 from dm_common.messages import recipe_book_from
 from dm_common.ros.executor import BackgroundExecutor
+from dm_common.ros.worker import WorkerService
 from dm_controller.planning.target import FocusTarget
 from linear_mirror import RADIUS
 from support import Observer, wait_until
@@ -29,7 +30,7 @@ class Store:
     def __init__(self, observer: Observer) -> None:
         self.requests: list[Any] = []
         self.answer = (ErrorCode.OK, "")
-        observer.node.create_service(StoreRecipes, "store_recipes", self._on_request)
+        WorkerService(observer.node, StoreRecipes, "store_recipes", self._on_request)
 
     def _on_request(self, request: Any, response: Any) -> Any:
         self.requests.append(request)

@@ -80,8 +80,8 @@ class AutofocusAction(ProbeAction):
                     raise
                 self._draw_in(search, error)
                 continue
-            if search.current.config.approach < approach and not self._stands_where_sent():
-                search.sweep("the mirror's hysteresis is not known", approach)
+            if search.current.config.approach < approach and (doubt := self._doubt()):
+                search.sweep(doubt, approach)
                 continue
             if not step.measured:
                 search.feed(None)
@@ -132,14 +132,15 @@ class AutofocusAction(ProbeAction):
         except ValueError as error:  # no focal length, or too small
             return str(error)
 
-    def _stands_where_sent(self) -> bool:
-        """Whether the mirror moves as it is asked to. Creep of hours is no matter: it is the same in all images."""
+    def _doubt(self) -> str:
+        """Why the mirror may not move as it is asked to; "" = it does. Creep of hours is the same in all images."""
         answer, capabilities = self._probe.answer, ready_capabilities(self._probe)
         if answer is None or not answer.history_known:
-            return False
-        radius = capabilities.aperture_radius
-        uncertainty = curvature_of_defocus(capabilities.error_bound, radius)
-        return uncertainty < TRUSTED * depth_of_focus(radius, self._values["optics.wavelength"])
+            return "the mirror's hysteresis is not known"
+        radius, bound = capabilities.aperture_radius, capabilities.error_bound
+        if curvature_of_defocus(bound, radius) < TRUSTED * depth_of_focus(radius, self._values["optics.wavelength"]):
+            return ""
+        return f"moves may err by {bound * 1e9:.0f} nm"
 
     def _draw_in(self, search: FocusSearch, error: Refusal) -> None:
         try:
@@ -182,7 +183,7 @@ class AutofocusAction(ProbeAction):
             values["track.wait"],
         )
         model = self._model(config, region)
-        if isinstance(model, DefocusModel) and trials.dither > 0 and self._stands_where_sent():
+        if isinstance(model, DefocusModel) and trials.dither > 0 and not self._doubt():
             return MotionTracker(peak, config, trials, model)
         return Tracker(peak.curvature, peak.sharpness, config.low, config.high, trials)
 

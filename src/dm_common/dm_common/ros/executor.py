@@ -52,8 +52,9 @@ WAKE_PERIOD_S = 1.0
 SHARED_MEMORY, LEAST_AGE_S = Path("/dev/shm"), 2.0
 #: An answer that took so long to send was dropped, s; others take less than a millisecond.
 DROPPED_S = 0.09
-#: After how long it is sent again, s, each counted from the one before: a client may be gone, or never match.
-PAUSES_S = (0.2, 0.4, 0.8, 1.6, 3.2)
+#: After how long it is sent again, s, each counted from the one before. Each try stops the process for a tenth of a
+#: second, and a client may never match.
+PAUSES_S = (0.3, 1.0, 3.0)
 
 
 def make_executor(*nodes: Node) -> Executor:
@@ -286,6 +287,7 @@ def _send_again(send: Callable[..., None], *answer: Any) -> None:
                 time.sleep(pause)
                 if not _dropped(send, *answer):
                     return
+            get_logger("dm_common.ros").warning("an answer was lost: its client could not be discovered")
 
     threading.Thread(target=repeat, daemon=True).start()
 

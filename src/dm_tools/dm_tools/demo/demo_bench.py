@@ -11,7 +11,7 @@ from typing import Any
 
 #: A port of the virtual bench that is not offered.
 OFF = -1
-#: Above those that the kernel hands out to whoever asks for any (net.ipv4.ip_local_port_range).
+#: Above those that Linux by default hands out to whoever asks for any (net.ipv4.ip_local_port_range).
 PORTS = range(61000, 65536)
 #: Parameters of a bench whose actuators follow one law.
 SAME_ACTUATORS = {f"piezo.{name}_spread": 0.0 for name in ("hysteresis", "creep", "spectrum")}
@@ -28,7 +28,7 @@ class Hysteresis(StrEnum):
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that are free on loopback now, for TCP and UDP alike; others ask for none of them by chance.
+    """Ports that are free on loopback now, for TCP and UDP alike.
 
     Raises:
         RuntimeError: there are not so many.
