@@ -70,8 +70,9 @@ PARAMETERS: Final = (
     Parameter(
         "search.approach",
         real(1.0, 0.0, 1.0, "1/m"),
-        "Where the controller does not know the mirror's hysteresis, every sweep begins this far below its first "
-        "position, but not below the range: the whole range puts all sweeps on one branch of it, less is quicker.",
+        "Where the mirror's hysteresis is not known, or moves may err by two depths of focus, every sweep begins this "
+        "far below its first position, but not below the range: the whole range puts all sweeps on one branch, less is "
+        "quicker.",
     ),
     Parameter(
         "search.few_images",

@@ -7,10 +7,9 @@ Coarse to fine [23, 25]: a sweep over the whole range finds the hill, sweeps ove
 a parabola through the best points of the last gives its top. A sweep that sees the hill rise beyond its own end is
 repeated around that end.
 
-Where the mirror's hysteresis is not known (`approach` above 0), every sweep, and the final move to the top, first goes
-to the same turning point below. Hysteresis forgets what lies between two turning points once it is passed again, so
-that all of them rise on the same branch. Without that the hill that a long sweep saw is not where a short one expects
-it.
+Where moves are not trusted (`approach` above 0), every sweep, and the final move to the top, first goes to the same
+turning point below. Hysteresis forgets what lies between two turning points once it is passed again, so that all of
+them rise on the same branch. Without that the hill that a long sweep saw is not where a short one expects it.
 """
 
 import math
