@@ -117,7 +117,7 @@ def _grades(fit: InfluenceFit) -> array[int]:
 def _slopes(law: HysteresisModel) -> Floats:
     """As the message has them: of each actuator and way, where the weights are of each actuator."""
     slope, count = law.duhem_slope, np.size(law.duhem_weight)
-    return np.broadcast_to(slope, (count, 2, *slope.shape[-2:])) if count > 1 and slope.size else slope
+    return np.broadcast_to(slope, (count, 2, slope.shape[-1])) if count > 1 and slope.size else slope
 
 
 def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
@@ -127,7 +127,6 @@ def hysteresis_message(hysteresis: HysteresisFit) -> ActuatorHysteresis:
         law=hysteresis.name,
         **{name: doubles(getattr(law, name)) for name in _LAW},
         powers=law.play_weight.shape[-1],
-        duhem_orders=law.duhem_slope.shape[-1],
         duhem_slope=doubles(_slopes(law)),
         duhem_weight=doubles(np.atleast_1d(law.duhem_weight)),
         lags=law.lag_spectrum.shape[-1],

@@ -12,6 +12,7 @@ from dm_calibration.hysteresis.features import (
     fading_changes,
     fading_feature,
     own_slopes,
+    padded_slope,
     weights_of,
 )
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
@@ -25,7 +26,7 @@ ACTUATORS, WEIGHT = 4, -0.2
 def test_small_changes_of_the_slope_are_found() -> None:
     rng = np.random.default_rng(2)
     signals = rng.uniform(-1.0, 1.0, (300, ACTUATORS))
-    common = np.tile([1.4, 0.5], (ACTUATORS, 2, 2, 1))
+    common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
     true = common * (1.0 + 0.05 * rng.standard_normal(common.shape))
     values = WEIGHT * fading_feature(signals, DuhemOperator(true))[:, 0]
     columns = np.concatenate((fading_feature(signals, DuhemOperator(common)), fading_changes(signals, common)), axis=1)
@@ -36,8 +37,8 @@ def test_small_changes_of_the_slope_are_found() -> None:
 
 
 def test_nothing_is_said_of_an_operator_without_weight() -> None:
-    common = np.tile([1.4, 0.5], (ACTUATORS, 2, 2, 1))
-    assert own_slopes(common, np.full(ACTUATORS, 1e-3), np.full((8, ACTUATORS), 0.1)) == pytest.approx(common)
+    common = padded_slope(np.array([1.4, 0.5]), ACTUATORS)
+    assert own_slopes(common, np.full(ACTUATORS, 1e-3), np.full((6, ACTUATORS), 0.1)) == pytest.approx(common)
 
 
 def test_creep_block_by_block_is_that_of_the_whole_run_in_room_that_grows_with_it() -> None:
@@ -76,8 +77,8 @@ def test_weights_are_those_of_the_normal_equations() -> None:
 
 @pytest.mark.parametrize("own", [True, False])
 def test_slopes_and_lags_of_each_actuator_come_back_from_the_message(own: bool) -> None:
-    common = np.array([[1.4, 0.5, 0.1], [1.2, 0.3, 0.2]])
-    slope = common * np.linspace(0.9, 1.1, 2 * ACTUATORS).reshape(ACTUATORS, 2, 1, 1)
+    common = np.array([1.4, 0.5, 0.1])
+    slope = np.tile(common, (ACTUATORS, 2, 1)) * np.linspace(0.9, 1.1, 2 * ACTUATORS).reshape(ACTUATORS, 2, 1)
     play = np.ones((ACTUATORS, 1, 1)) if own else np.ones((1, 1))
     weight = np.full(ACTUATORS, WEIGHT) if own else WEIGHT
     lag = np.full((ACTUATORS, 4), 2.0) if own else np.full(4, 2.0)

@@ -9,7 +9,6 @@ import pytest
 
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
-from dm_common.hysteresis.duhem import DuhemOperator
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 
@@ -17,7 +16,7 @@ from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 MODEL = HysteresisModel(
     np.array([0.0, 0.1, 0.3]),
     np.array([[0.9, 0.05], [0.1, 0.02], [0.08, 0.01]]),
-    np.array([[1.6, 0.3], [1.2, 0.1]]),
+    np.array([1.6, 0.3]),
     -0.1,
     0.01,
     CREEP_TIMES,
@@ -82,21 +81,3 @@ def test_recipes_of_another_condition_are_not_merged() -> None:
         (0.03, 16),
         (0.0, 2),
     ]
-
-
-@pytest.mark.parametrize("own", [False, True])
-def test_slopes_from_before_they_differed_about_zero_mean_what_they_meant(own: bool) -> None:
-    slope = np.array([1.6, 0.3, 0.1])
-    columns = hysteresis_columns(HYSTERESIS)
-    columns["memory/law/duhem_slope"] = np.tile(slope, (3, 2, 1)) if own else slope
-    if own:
-        columns["memory/law/duhem_weight"] = np.full(3, -0.1)
-        columns["memory/law/play_weight"] = np.tile(MODEL.play_weight, (3, 1, 1))
-        columns["memory/law/lag_spectrum"] = np.zeros(0)
-    back = hysteresis_from(columns)
-    assert back is not None
-    operator, z = DuhemOperator(back.law.duhem_slope), np.linspace(-0.5, 0.5, 7)
-    for way in (1.0, -1.0):
-        for at in z:
-            expected = 1.0 - np.polynomial.polynomial.polyval(way * at, np.append(0.0, slope))
-            np.testing.assert_allclose(operator.rise(np.full(3, at), np.full(3, way)), expected, atol=1e-12)

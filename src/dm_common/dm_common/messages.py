@@ -158,10 +158,8 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
         raise ValueError(f"hysteresis: play_weight has 0 values, must be {radius.size} x {message.powers} (for each)")
     duhem_weight = np.array(message.duhem_weight, dtype=np.float64)
     duhem_slope = np.array(message.duhem_slope, dtype=np.float64)
-    slopes = (duhem_weight.size, 2, 2, message.duhem_orders) if duhem_weight.size > 1 else (2, message.duhem_orders)
-    if duhem_slope.size != math.prod(slopes):
-        wanted = " x ".join(map(str, slopes))
-        raise ValueError(f"hysteresis: duhem_slope has {duhem_slope.size} values, must be {wanted}")
+    if duhem_weight.size > 1 and duhem_slope.size % (2 * duhem_weight.size):
+        raise ValueError(f"hysteresis: duhem_slope has {duhem_slope.size} values, must be {duhem_weight.size} x 2 x A")
     creep_time = np.array(message.creep_time, dtype=np.float64)
     covariance = np.array(message.creep_covariance, dtype=np.float64)
     if covariance.size not in (0, 2 * (1 + creep_time.size) ** 2):
@@ -171,7 +169,7 @@ def hysteresis_model_from(message: ActuatorHysteresis) -> HysteresisModel | None
     return HysteresisModel(
         radius,
         weight,
-        duhem_slope.reshape(slopes) if duhem_slope.size else duhem_slope,
+        duhem_slope.reshape(duhem_weight.size, 2, -1) if duhem_weight.size > 1 and duhem_slope.size else duhem_slope,
         duhem_weight if duhem_weight.size > 1 else float(duhem_weight.sum()),
         message.creep_rate,
         creep_time,

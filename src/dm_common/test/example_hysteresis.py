@@ -20,7 +20,7 @@ def plays(creep_rate: float = 0.0) -> HysteresisModel:
 def rich(creep_rate: float = 0.01) -> HysteresisModel:
     """Preisach of second order and a Duhem operator, with creep."""
     weight = np.array([[0.9, 0.05], [0.1, 0.02], [0.08, 0.01], [0.05, 0.01]])
-    return HysteresisModel(RADIUS, weight, np.tile([1.6, 0.3], (2, 1)), -0.1, creep_rate, CREEP_TIMES)
+    return HysteresisModel(RADIUS, weight, np.array([1.6, 0.3]), -0.1, creep_rate, CREEP_TIMES)
 
 
 def lagging() -> HysteresisModel:

@@ -91,7 +91,7 @@ def _features(signals: Floats, time: Floats, start: float) -> Floats:
     """(M, F, N), the creep of the signal among them; without the signal itself, whose weight is in the gains."""
     plays = play_features(signals, RICHEST.radius, RICHEST.powers)
     own_creep = crept(signals[:, None, :], time, start)
-    fading = fading_feature(signals, DuhemOperator(np.full((2, 1), SLOPE)))
+    fading = fading_feature(signals, DuhemOperator(np.array([SLOPE])))
     static = np.concatenate((plays[:, 1:], fading), axis=1)
     return np.concatenate((static + CREEP_RATE * crept(static, time, start), own_creep), axis=1)
 

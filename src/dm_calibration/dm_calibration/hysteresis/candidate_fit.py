@@ -50,7 +50,7 @@ class Candidate:
         name: of the class of laws.
         plays: number of play operators beside the signal itself.
         powers: of their values.
-        slopes: coefficients of the Duhem operator's slope, half of them above 0; 0 = no such operator.
+        slopes: coefficients of the Duhem operator's slope; 0 = no such operator.
         own: each actuator has its own weights, drawn towards common ones (:mod:`~dm_calibration.hysteresis.own_laws`);
             its Duhem operator begins as that of the best common candidate that has one.
     """
@@ -193,9 +193,9 @@ class CandidateProblem:
         """
         slopes = self.candidate.slopes
         if start is None:
-            guess = np.append(np.tile(np.eye(1, slopes // 2)[0] * 1.5, 2), 0.01)
+            guess = np.concatenate((np.full(min(slopes, 1), 1.5), np.zeros(max(slopes - 1, 0)), [0.01]))
         else:
-            guess = np.append(start.law.duhem_slope, start.law.creep_rate)
+            guess = np.concatenate((start.law.duhem_slope, [start.law.creep_rate]))
         weights: list[Floats | None] = [None]
 
         def residual(nonlinear: Floats) -> Floats:
@@ -233,7 +233,7 @@ class CandidateProblem:
         features = self._plays + rate * self._plays_crept
         if not self.candidate.slopes:
             return features
-        operator = DuhemOperator(slope.reshape(2, -1))
+        operator = DuhemOperator(slope)
         fading = self.run.in_parts(lambda part, start: fading_feature(self.run.signals[part], operator))
         fading = fading + rate * np.tensordot(self.run.creep, fading, 1)
         return np.concatenate((features, fading), axis=1)
@@ -256,7 +256,7 @@ class CandidateProblem:
         law = HysteresisModel(
             self.radius,
             weights[:plays].reshape(len(self.radius), self.candidate.powers),
-            nonlinear[:-1].reshape(2, -1) if self.candidate.slopes else np.zeros(0),
+            nonlinear[:-1].copy(),
             float(weights[plays]) if self.candidate.slopes else 0.0,
             float(nonlinear[-1]),
             CREEP_TIMES,

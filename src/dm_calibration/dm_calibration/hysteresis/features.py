@@ -19,9 +19,9 @@ RATE_MIN = 1e-3
 
 #: Residual of the solved weights, relative: effective signals are within 1e-7 then.
 SOLVED = 1e-7
-#: Step for derivatives by the coefficients of a Duhem operator, their largest change, and the weight of an operator
-#: below which nothing can be said of them.
-SLOPE_STEP, CHANGE_MAX, DUHEM_WEIGHT_MIN = 0.02, 1.0, 0.01
+#: Fewest coefficients of a Duhem operator of its own, the step for derivatives by them, their largest change, and the
+#: weight of an operator below which nothing can be said of them.
+DUHEM_ORDERS, SLOPE_STEP, CHANGE_MAX, DUHEM_WEIGHT_MIN = 3, 0.02, 1.0, 0.01
 
 
 def play_values(signals: Floats, radius: Floats) -> Floats:
@@ -61,8 +61,15 @@ def fading_feature(signals: Floats, operator: DuhemOperator) -> Floats:
     return values
 
 
+def padded_slope(slope: Floats, actuators: int) -> Floats:
+    """(N, 2, A) coefficients of a Duhem operator that begins as `slope` (A,), A being at least DUHEM_ORDERS."""
+    padded = np.zeros(max(DUHEM_ORDERS, len(slope)))
+    padded[: len(slope)] = slope
+    return np.tile(padded, (actuators, 2, 1))
+
+
 def fading_changes(signals: Floats, slope: Floats) -> Floats:
-    """(M, 4 A, N) derivatives of :func:`fading_feature` by the coefficients `slope` (N, 2, 2, A) of its operator.
+    """(M, 2 A, N) derivatives of :func:`fading_feature` by the coefficients `slope` (N, 2, A) of its operator.
 
     0 for those whose change leads to no operator.
     """
@@ -79,11 +86,11 @@ def fading_changes(signals: Floats, slope: Floats) -> Floats:
 
 
 def own_slopes(slope: Floats, weight: Floats, changes: Floats) -> Floats:
-    """(N, 2, 2, A) coefficients of each actuator's operator, to first order.
+    """(N, 2, A) coefficients of each actuator's operator, to first order.
 
     Args:
-        slope: (N, 2, 2, A) to begin with.
-        weight, changes: (N,) and (4 A, N) weights of the operator and of :func:`fading_changes`.
+        slope: (N, 2, A) to begin with.
+        weight, changes: (N,) and (2 A, N) weights of the operator and of :func:`fading_changes`.
     """
     known = np.abs(weight) > DUHEM_WEIGHT_MIN
     change = np.where(known, changes / np.where(known, weight, 1.0), 0.0).T.reshape(slope.shape)

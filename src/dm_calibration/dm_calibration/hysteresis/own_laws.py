@@ -28,6 +28,7 @@ from dm_calibration.hysteresis.features import (
     fading_changes,
     fading_feature,
     own_slopes,
+    padded_slope,
     play_values,
     spectrum_prior,
     weight_of,
@@ -132,10 +133,10 @@ class OwnLaws:
             creep[: len(CREEP_TIMES)] = self._creep if self._creeps else 0.0
             scatter, slope = self._scatter, self._slope
             if slope.size:
-                slope = np.tile(slope, (actuators, 2, 1, 1))
+                slope = padded_slope(slope, actuators)
                 changing = np.concatenate((self._features(slope), self._fading_changes(slope)), axis=1)
                 patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
-                own = len(patterns) - slope[0].size
+                own = len(patterns) - 2 * slope.shape[2]
                 slope = own_slopes(slope, patterns[own - 1], patterns[own:])
                 patterns = patterns[:own]
         patterns, creep, scatter, residual = self._rounds(self._features(slope), keep, patterns, creep, scatter)
@@ -150,7 +151,7 @@ class OwnLaws:
         return np.concatenate((self._plain, fading), axis=1)
 
     def _fading_changes(self, slope: Floats) -> Floats:
-        """(M, 4 A, N) how the Duhem operator's value changes with its coefficients `slope` (N, 2, 2, A)."""
+        """(M, 2 A, N) how the Duhem operator's value changes with its coefficients `slope` (N, 2, A)."""
         signals = self.run.signals
         return self.run.in_parts(lambda part, start: fading_changes(signals[part], slope))
 

@@ -46,9 +46,6 @@ def hysteresis_from(columns: Mapping[str, Column]) -> HysteresisFit | None:
             continue  # a file from before there was this field
         value = np.asarray(columns[f"memory/law/{field.name}"], dtype=np.float64)
         values[field.name] = value if value.ndim else float(value)
-    slope = values["duhem_slope"]
-    if slope.size and slope.ndim in (1, 3):  # a file from before it was another above 0 than below
-        values["duhem_slope"] = np.repeat(slope[..., None, :], 2, axis=-2)
     held_out, unknown, maps = np.asarray(columns["memory/figures"], dtype=np.float64)
     sigma = np.asarray(columns["memory/zernike_sigma"], dtype=np.float64)
     if not (np.isfinite(sigma).all() and np.isfinite([held_out, unknown, maps]).all()):

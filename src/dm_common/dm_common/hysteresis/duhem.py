@@ -2,9 +2,8 @@
 
 ``dz/du = f(z)`` while the signal rises and ``f(-z)`` while it falls, f(0) = 1 [21]. Play operators never forget what
 was not wiped out by a larger swing; this one forgets exponentially, as some ceramics do. f is a polynomial whose
-coefficients are fitted, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``, another above z = 0 than below: after a turn a Bouc-Wen
-law is stiffer by another power of |z| than further on [20], and has a kink between both. The law a mirror really has
-need not be one of them. Actuators may have polynomials of their own, and others on falling than on rising moves.
+coefficients are fitted, ``f(z) = 1 - a_1 z - a_2 z^2 - ...``; the law a mirror really has need not be one of them.
+Actuators may have polynomials of their own, and others on falling than on rising moves.
 
 The equation has no u in it, so a move of any length is one look-up in the table of ``F(z) = integral dz / f``.
 """
@@ -27,8 +26,7 @@ class DuhemOperator:
     """The operator for any number of actuators at once.
 
     Args:
-        slope: (2, A) coefficients a_1, a_2, ... of f above and below 0, or (N, 2, 2, A) of each actuator, on rising
-            and on falling moves.
+        slope: (A,) coefficients a_1, a_2, ... of f, or (N, 2, A) of each actuator, on rising and on falling moves.
 
     Raises:
         ValueError: coefficients that are not finite, or a state that no table holds.
@@ -36,14 +34,13 @@ class DuhemOperator:
 
     def __init__(self, slope: Floats) -> None:
         self.slope = slope = np.asarray(slope, dtype=np.float64)
-        if slope.ndim not in (2, 4) or slope.shape[-2] != 2 or not slope.size or not np.isfinite(slope).all():
-            raise ValueError(f"duhem_slope = {slope.tolist()}: must be finite numbers, as many above 0 as below")
-        self._own = slope.ndim == 4
-        pieces = slope.reshape(-1, slope.shape[-1])  # those of a row one after the other, above 0 first
-        rows = np.arange(len(pieces) // 2)
-        self._polynomial = np.vstack((np.ones(len(pieces)), -pieces.T))
+        if slope.ndim not in (1, 3) or not slope.size or not np.isfinite(slope).all():
+            raise ValueError(f"duhem_slope = {slope.tolist()}: must be one or more finite numbers")
+        self._own = slope.ndim == 3
+        rows = np.arange(slope.size // slope.shape[-1])
+        self._polynomial = np.vstack((np.ones(len(rows)), -slope.reshape(len(rows), -1).T, np.zeros(len(rows))))
         z = np.linspace(-REACH, REACH, KNOTS)
-        f = self._slope(np.tile(z, (len(rows), 1)), rows[:, None])
+        f = np.polynomial.polynomial.polyval(z, self._polynomial)  # (rows, KNOTS)
         passable = np.maximum(f, SLOPE_MIN)
         steps = 0.5 * (1.0 / passable[:, 1:] + 1.0 / passable[:, :-1]) * np.diff(z)
         travel = np.hstack((np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)))
@@ -70,14 +67,6 @@ class DuhemOperator:
         actuators = np.arange(len(self.slope))
         return np.asarray(2 * (actuators if way.ndim == 1 else actuators[:, None]) + (way < 0.0))
 
-    def _slope(self, z: Floats, rows: NDArray[np.intp] | int) -> Floats:
-        """f(z) of these tables."""
-        piece = 2 * rows + (z < 0.0)
-        total = self._polynomial[-1][piece]
-        for coefficient in self._polynomial[-2::-1]:
-            total = total * z + coefficient[piece]
-        return np.asarray(total)
-
     def move(self, z: Floats, change: Floats) -> Floats:
         """The state after signals changed by `change` (N,) or (..., N, P) from `z` on, which may repeat."""
         way = np.where(change < 0.0, -1.0, 1.0)
@@ -88,4 +77,8 @@ class DuhemOperator:
     def rise(self, z: Floats, way: Floats) -> Floats:
         """dz/du at the state z, on a way that rises (`way` 1) or falls (-1); shapes as in :meth:`move`."""
         along = way * z
-        return self._slope(along, self._rows(np.broadcast_to(way, along.shape)))
+        rows = self._rows(np.broadcast_to(way, along.shape))
+        total = self._polynomial[-1][rows]
+        for coefficient in self._polynomial[-2::-1]:
+            total = total * along + coefficient[rows]
+        return np.asarray(total)

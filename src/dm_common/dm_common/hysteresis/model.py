@@ -67,7 +67,7 @@ class HysteresisModel:
     Attributes:
         play_radius: (R,) half-widths, normalised; 0 = the signal itself.
         play_weight: (R, D) weights of the powers 1 .. D of each play operator's value, or (N, R, D) for each actuator.
-        duhem_slope: (2, A) of the Duhem operator, or (N, 2, 2, A) of each actuator, rising and falling; empty = none.
+        duhem_slope: (A,) of the Duhem operator, or (N, 2, A) of each actuator, rising and falling; empty = none.
         duhem_weight: () or (N,) of the Duhem operator's value.
         creep_rate: growth of a step per decade of time, in the mean over actuators and elements.
         creep_time: (J,) s, evenly spaced over the logarithm; empty = no creep.
@@ -182,7 +182,7 @@ class HysteresisModel:
 
     @property
     def _own(self) -> tuple[tuple[int, ...], ...]:
-        slope = self.duhem_slope.shape[:-3]
+        slope = self.duhem_slope.shape[:-2]
         lag = self.lag_spectrum.shape[:-1]
         return self.play_weight.shape[:-2], slope, np.shape(self.duhem_weight), self.creep_spectrum.shape[:-1], lag
 
