@@ -237,7 +237,7 @@ def test_a_port_in_use_is_named() -> None:
     with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]
         assert doctor_bench.tcp("127.0.0.1", port) is None
-        finding = doctor_bench.free_ports(GOOD["virtual_bench"] | {"trigger.port": port})
+        finding = doctor_bench.taken_ports(GOOD["virtual_bench"] | {"trigger.port": port})
     assert finding is not None and f"trigger.port = {port}: Address already in use" in finding.problem
     gone = doctor_bench.tcp("127.0.0.1", port)
     assert gone is not None and "Connection refused" in gone.problem

@@ -299,9 +299,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
             )
         try:
             with DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
-                client.wait_until_active(90.0)
-                nodes = {"interferometer", "calibration", "focus_controller"}
-                wait_until(lambda: nodes <= set(client.node.get_node_names()), 90.0, "all nodes")
+                try:
+                    client.wait_until_active(90.0)
+                    nodes = {"interferometer", "calibration", "focus_controller"}
+                    wait_until(lambda: nodes <= set(client.node.get_node_names()), 90.0, "all nodes")
+                except Exception as error:
+                    heard = sorted(client.node.get_node_names())
+                    said = log.read_text(errors="replace")
+                    pytest.fail(f"{error}; domain {domain}, heard {heard}, status {up.poll()}, it said:\n{said}")
                 yield Scene(folder, environment, client)
         finally:
             up.send_signal(signal.SIGINT)

@@ -1,9 +1,12 @@
 """The virtual bench of a run: a configuration with ports and folders of its own."""
 
 import contextlib
+import fcntl
+import os
 import random
 import shutil
 import socket
+import tempfile
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -30,17 +33,27 @@ class Hysteresis(StrEnum):
 def free_ports(count: int) -> list[int]:
     """Ports that are free on loopback now, for TCP and UDP alike.
 
+    Handed out in turn over all processes of this user: what was drawn at random could be another's choice as well, as
+    long as neither had bound it.
+
     Raises:
         RuntimeError: there are not so many.
     """
     ports: list[int] = []
-    for port in random.SystemRandom().sample(PORTS, len(PORTS)):
-        with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagram:
-            datagram.bind(("127.0.0.1", port))
-            socket.create_server(("127.0.0.1", port)).close()
-            ports.append(port)
-        if len(ports) == count:
-            return ports
+    with (Path(tempfile.gettempdir()) / f"dm-ports-{os.getuid()}").open("a+") as turn:
+        fcntl.flock(turn, fcntl.LOCK_EX)
+        turn.seek(0)
+        last = int(turn.read().strip() or random.SystemRandom().choice(PORTS))
+        for step in range(len(PORTS)):
+            port = PORTS[(last + 1 + step - PORTS.start) % len(PORTS)]
+            with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagram:
+                datagram.bind(("127.0.0.1", port))
+                socket.create_server(("127.0.0.1", port)).close()
+                ports.append(port)
+            if len(ports) == count:
+                turn.truncate(0)
+                turn.write(f"{port}")
+                return ports
     raise RuntimeError(f"no {count} free ports from {PORTS.start} on")
 
 

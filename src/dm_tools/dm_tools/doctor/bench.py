@@ -42,7 +42,7 @@ def bench_checks(file: Path) -> Iterator[Check]:
     sound = {node: _sound(node, values) for node, values in config.items()}
     driver = sound.get("pdm_driver", {})
     if "virtual_bench" in config:
-        yield "ports of the virtual bench", lambda: free_ports(sound["virtual_bench"])
+        yield "ports of the virtual bench", lambda: taken_ports(sound["virtual_bench"])
     else:
         yield from _electronics(driver)
     watched = _folder_of(sound, "interferometer", "watch_folder")
@@ -206,8 +206,8 @@ def _group(path: Path) -> str:
         return str(path.stat().st_gid)
 
 
-def free_ports(bench: Mapping[str, Any]) -> Finding | None:
-    """Whether the ports that the bench wants are free."""
+def taken_ports(bench: Mapping[str, Any]) -> Finding | None:
+    """Ports that the bench wants and that others hold; None = all are free."""
     values, taken = effective("virtual_bench", bench), []
     for name, kind in (
         ("electronics.tcp_port", socket.SOCK_STREAM),

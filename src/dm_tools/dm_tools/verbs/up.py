@@ -72,7 +72,7 @@ def up(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
     from dm_bringup.suite import Suite
-    from dm_tools.doctor.bench import effective, free_ports
+    from dm_tools.doctor.bench import effective, taken_ports
 
     os.environ.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", LOG_FORMAT)
     mirrors = configurations(config or [], namespace or [""], camera)
@@ -84,7 +84,7 @@ def up(
         for name in mirrors:
             stack.enter_context(only_suite(name))
         for configuration in mirrors.values():  # else a driver would take the mirror of another bench for its own
-            if taken := free_ports(configuration["virtual_bench"]) if "virtual_bench" in configuration else None:
+            if taken := taken_ports(configuration["virtual_bench"]) if "virtual_bench" in configuration else None:
                 raise RuntimeError(f"virtual_bench: {taken.problem}: {taken.cure}")
         stack.callback(end, watchers, stop)  # the last of all: the mirrors are safe first
         folder = logs if logs is not None else Path(temporary)
