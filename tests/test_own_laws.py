@@ -110,3 +110,17 @@ def test_own_laws_that_cannot_be_inverted_are_tried_again_from_the_next_common_o
     coarser = replace(COMMON[1], name="coarser", plays=19)
     found = identify(run, check, (COMMON[0], coarser, *LAWS[1:]))
     assert found.fit.candidate.own and not found.refused and begun.count(7) == 2
+
+
+def test_own_laws_whose_fading_cannot_be_inverted_fade_as_the_common_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, check = relay_run(0.2, 14, 120)
+
+    def slope(law: HysteresisModel, low: float, high: float) -> float:
+        return -1.0 if law.duhem_slope.ndim == 3 else 1.0  # each actuator's
+
+    monkeypatch.setattr(law_shape, "slope_min", slope)
+    duhem = tuple(law for law in CANDIDATES if law.name.startswith("Preisach and Duhem"))
+    found, common = identify(run, check, (COMMON[0], *duhem)), identify(run, check, (COMMON[0], duhem[0]))
+    assert found.fit.candidate.own and not found.refused
+    assert found.fit.law.actuators == 7 and found.fit.law.duhem_slope.ndim == 1
+    assert held_out_rms(common) > 1.5 * held_out_rms(found)

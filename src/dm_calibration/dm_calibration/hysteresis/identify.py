@@ -70,7 +70,8 @@ def identify(
         test: (M,) maps that have no part in the choice and are predicted at the end; None = none.
         candidates: in this order; the first has no hysteresis to invert. An own one counts where the best before has
             hysteresis as it has, and begins with the best common one of its kind, if that comes near the best of all;
-            where it fades, with another if that leaves much less; where it cannot be inverted then, with the next.
+            where it fades, with another if that leaves much less; where it cannot be inverted then, with the next; at
+            last all actuators fade as the common one does.
         folds: parts of the run that are predicted from the others.
         blocks: contiguous rows that make a part, spread over the run: with several, no slow drift has to be foreseen.
         slope_min: smallest slope of a law over the signals of the run.
@@ -155,6 +156,8 @@ def _begun(
 ) -> Iterator[tuple[OwnLaws, LawFit]]:
     """Own laws that begin with each of the common ones `starts`, fitted to the rows `keep`, in the order to be tried.
 
+    After them those whose Duhem operators all fade alike.
+
     How hysteresis fades stays nearly as it begins, and a law without plays may begin far from what it is, or one that
     cannot be inverted near it: another than the first of `starts` comes first where it leaves much less.
     """
@@ -166,6 +169,9 @@ def _begun(
     left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
     for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
         yield made[number]
+    for fit in starts:  # none could be inverted: nearer to the common law, which can
+        own = OwnLaws(run, candidate, fit.law, scatter, own_slopes=False)
+        yield own, own.fit(keep)
 
 
 def _contains(richer: Candidate, simpler: Candidate) -> bool:

@@ -93,10 +93,13 @@ class OwnLaws:
         candidate: play operators and orders of the Legendre series.
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
+        own_slopes: False keeps the slope of the common Duhem operator.
     """
 
-    def __init__(self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats) -> None:
-        self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
+    def __init__(
+        self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats, own_slopes: bool = True
+    ) -> None:
+        self.run, self._scatter, self._slope, self._own_slopes = run, scatter, common.duhem_slope, own_slopes
         self.candidate = candidate
         self.radius = candidate.radius
         self._basis = pattern_basis(self.radius, candidate.powers)
@@ -132,7 +135,7 @@ class OwnLaws:
             creep = np.zeros((len(self._creep_root), actuators))
             creep[: len(CREEP_TIMES)] = self._creep if self._creeps else 0.0
             scatter, slope = self._scatter, self._slope
-            if slope.size:
+            if slope.size and self._own_slopes:
                 slope = padded_slope(slope, actuators)
                 changing = np.concatenate((self._features(slope), self._fading_changes(slope)), axis=1)
                 patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
