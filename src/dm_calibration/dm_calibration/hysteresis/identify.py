@@ -156,10 +156,9 @@ def _begun(
 ) -> Iterator[tuple[OwnLaws, LawFit]]:
     """Own laws that begin with each of the common ones `starts`, fitted to the rows `keep`, in the order to be tried.
 
-    After them those whose Duhem operators all fade alike.
-
     How hysteresis fades stays nearly as it begins, and a law without plays may begin far from what it is, or one that
     cannot be inverted near it: another than the first of `starts` comes first where it leaves much less.
+    At last come those that keep the Duhem operator they begin with, the same for all actuators.
     """
     fitted = ((own, own.fit(keep)) for own in (OwnLaws(run, candidate, fit.law, scatter) for fit in starts))
     if not candidate.slopes:
@@ -169,9 +168,8 @@ def _begun(
     left = [float(np.square(fit.residual[keep] / scatter).sum()) for _, fit in made]
     for number in sorted(range(len(made)), key=lambda number: left[number] * (PARSIMONY if number else 1.0)):
         yield made[number]
-    for fit in starts:  # none could be inverted: nearer to the common law, which can
-        own = OwnLaws(run, candidate, fit.law, scatter, own_slopes=False)
-        yield own, own.fit(keep)
+    for own, _ in made:
+        yield own, own.fit(keep, own_fading=False)
 
 
 def _contains(richer: Candidate, simpler: Candidate) -> bool:

@@ -93,13 +93,10 @@ class OwnLaws:
         candidate: play operators and orders of the Legendre series.
         common: law of all actuators to begin with.
         scatter: (D,) uncertainty of each response to begin with.
-        own_slopes: False keeps the slope of the common Duhem operator.
     """
 
-    def __init__(
-        self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats, own_slopes: bool = True
-    ) -> None:
-        self.run, self._scatter, self._slope, self._own_slopes = run, scatter, common.duhem_slope, own_slopes
+    def __init__(self, run: Run, candidate: Candidate, common: HysteresisModel, scatter: Floats) -> None:
+        self.run, self._scatter, self._slope = run, scatter, common.duhem_slope
         self.candidate = candidate
         self.radius = candidate.radius
         self._basis = pattern_basis(self.radius, candidate.powers)
@@ -124,8 +121,12 @@ class OwnLaws:
         self._creep_between = _alike(count, SPECTRUM_SPREAD)
         self._figure = figure_columns(run.time, run.parts, run.starts)
 
-    def fit(self, keep: Rows, start: LawFit | None = None) -> OwnFit:
-        """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all."""
+    def fit(self, keep: Rows, start: LawFit | None = None, own_fading: bool = True) -> OwnFit:
+        """Fit to the rows in `keep` (M,), from `start`, keeping its Duhem operators, or from no hysteresis at all.
+
+        Args:
+            own_fading: of those from no hysteresis: False keeps the common Duhem operator for all actuators.
+        """
         actuators = self._plain.shape[2]
         if isinstance(start, OwnFit):
             patterns, creep, scatter, slope = start.patterns, start.creep, start.scatter, start.law.duhem_slope
@@ -135,7 +136,7 @@ class OwnLaws:
             creep = np.zeros((len(self._creep_root), actuators))
             creep[: len(CREEP_TIMES)] = self._creep if self._creeps else 0.0
             scatter, slope = self._scatter, self._slope
-            if slope.size and self._own_slopes:
+            if slope.size and own_fading:
                 slope = padded_slope(slope, actuators)
                 changing = np.concatenate((self._features(slope), self._fading_changes(slope)), axis=1)
                 patterns, creep, scatter, _ = self._rounds(changing, keep, patterns, creep, scatter)
