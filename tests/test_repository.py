@@ -78,13 +78,6 @@ def test_a_packages_own_tests_need_that_package_and_below_only(package: str) -> 
         assert others <= reach, f"{path.relative_to(ROOT)} imports {others - reach}"
 
 
-def test_the_simulation_shares_no_code_with_what_it_judges() -> None:
-    for path in (SOURCE / "dm_simulation" / "dm_simulation").rglob("*.py"):
-        own = {name for name in imported(path) if name.startswith("dm_")}
-        allowed = ("dm_simulation", "dm_common.ros")
-        assert all(name.startswith(allowed) for name in own), f"{path.name} imports {own}"
-
-
 #: rosdep's names of modules; ROS packages go by their own.
 KEYS = {
     **{

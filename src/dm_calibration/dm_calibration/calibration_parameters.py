@@ -9,8 +9,8 @@ from dm_calibration.procedure.procedure import ProcedureOptions
 from dm_calibration.recalibration.drift_filter import DriftRates
 from dm_calibration.recalibration.updates import UpdateOptions
 from dm_common.mirror import APERTURE_TOLERANCE
-from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, switch, text, whole
-from dm_common.values import named
+from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of, real, switch, text, whole
+from dm_common.values import from_values
 
 PARAMETERS = (
     AUTOSTART,
@@ -34,8 +34,7 @@ PARAMETERS = (
         real(1.0, 0.001, 600.0, "s"),
         "What a map is said to take until one was taken, in ROS time.",
     ),
-    live("measure_retries", whole(1, 0, 20), "Further tries after a map that failed."),
-    live("failures_max", whole(3, 1, 1000), "Shapes in a row without a map after which a run is given up."),
+    *parameters_of("", ProcedureOptions),
     live("driver_timeout", real(30.0, 0.1, 600.0, "s"), "Longest wait for the driver to set a shape."),
     live("degauss_timeout", real(180.0, 0.1, 3600.0, "s"), "Longest wait for a degauss."),
     live("measure_timeout", real(60.0, 0.1, 3600.0, "s"), "Longest wait for one map."),
@@ -50,22 +49,7 @@ PARAMETERS = (
         switch(False),
         "The next goal sets interrupted runs aside and begins anew; false again as soon as it has begun.",
     ),
-    live(
-        "bump.tilt_max",
-        real(3e-6, 0.0, 1e-3, "m"),
-        "Largest change of tilt between two reference frames, as sag at the edge; 0 = not checked.",
-    ),
-    live(
-        "bump.shift_max",
-        real(1e-4, 0.0, 1e-2, "m"),
-        "Largest shift of the aperture on the map between two reference frames, at the mirror; 0 = not checked.",
-    ),
-    live(
-        "bump.figure_max",
-        real(50e-9, 0.0, 1e-3, "m"),
-        "Largest change of the rms figure between two reference frames, beyond what twice `hysteresis_allowance` "
-        "explains; 0 = not checked.",
-    ),
+    *parameters_of("bump.", BumpOptions),
     live(
         "aperture_tolerance",
         real(APERTURE_TOLERANCE, 1e-6, 0.5),
@@ -77,25 +61,7 @@ PARAMETERS = (
         real(0.0, 0.0, 1e-6, "m^2"),
         "Prior parameter of the region weights of AZWreg, Eq. (8); 0 = by cross-validation.",
     ),
-    live("valid_fraction_min", real(0.5, 0.0, 1.0), "Least share of valid pixels of a map."),
-    live(
-        "outlier_sigmas",
-        real(6.0, 3.0, 1e3),
-        "Residual of a map, in robust sigmas, beyond which it is dropped.",
-    ),
-    live(
-        "hysteresis_allowance",
-        real(0.10, 0.0, 1.0),
-        "Share of their moves by which actuators may miss their mark (hysteresis) without the map being an outlier; "
-        "0 = they have none, and moves without a law of it are promised what held-out maps show.",
-    ),
-    live("dead_sigmas", real(3.0, 0.0, 1e3), "Dead below this many standard errors."),
-    live(
-        "weak_sigmas",
-        real(10.0, 0.0, 1e3),
-        "Weak below this many standard errors, where they are twice those of the other actuators.",
-    ),
-    live("weak_share", real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring."),
+    *parameters_of("", FitOptions),
     live(
         "calibrated_error_max",
         real(32e-9, 0.0, 1e-3, "m"),
@@ -111,16 +77,7 @@ PARAMETERS = (
         real(0.5, 0.0, 600.0, "s"),
         "Before and after the stamp of a map the mirror must keep its shape for so long; creep corrections keep it.",
     ),
-    live(
-        "updates.surprise_max",
-        real(3.0, 1.0, 100.0),
-        "A map that differs from its prediction by more than this times the expected difference is not taken.",
-    ),
-    live(
-        "updates.surprises_max",
-        whole(3, 1, 1000),
-        "Maps in a row that differ so much after which the mirror counts as changed.",
-    ),
+    *parameters_of("updates.", UpdateOptions),
     Parameter(
         "updates.gain_rate",
         real(3e-4, 0.0, 1.0),
@@ -148,26 +105,28 @@ PARAMETERS = (
 
 def fit_options(values: Mapping[str, Any], method: str = "") -> FitOptions:
     """Options of a fit from the node's parameters; `method` empty = the default."""
-    return FitOptions(
-        **named(FitOptions, values) | {"method": method or FitOptions().method, "epsilon": values["epsilon"] or None}
-    )
+    return from_values(FitOptions, values, method=method or FitOptions().method, epsilon=values["epsilon"] or None)
 
 
 def procedure_options(values: Mapping[str, Any], maps_per_state: int = 0) -> ProcedureOptions:
     """Options of a run from the node's parameters; `maps_per_state` 0 = 1."""
-    return ProcedureOptions(
-        **named(ProcedureOptions, values),
+    return from_values(
+        ProcedureOptions,
+        values,
         maps_per_state=maps_per_state or 1,
         fit=fit_options(values),
-        bump=BumpOptions(**named(BumpOptions, values), **named(BumpOptions, values, "bump.")),
+        bump=from_values(BumpOptions, values, "bump.", hysteresis_allowance=values["hysteresis_allowance"]),
     )
 
 
 def update_options(values: Mapping[str, Any]) -> UpdateOptions:
     """Options of updates from the node's parameters."""
-    return UpdateOptions(
-        **named(UpdateOptions, values),
-        **named(UpdateOptions, values, "updates."),
+    return from_values(
+        UpdateOptions,
+        values,
+        "updates.",
+        valid_fraction_min=values["valid_fraction_min"],
+        aperture_tolerance=values["aperture_tolerance"],
         # Without a hysteresis model, an actuator may stand on any branch of its loop.
         signal_sigma=0.5 * values["hysteresis_allowance"],
         rates=DriftRates(values["updates.gain_rate"], values["updates.figure_rate"]),

@@ -10,11 +10,11 @@ from rclpy.validate_topic_name import validate_topic_name
 from dm_calibration.acquisition.acquisition import AcquisitionSettings
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.reference_surface import load_reference
-from dm_calibration.map_files import XYZ_UNITS, SurfaceMap
+from dm_calibration.map_files import SurfaceMap
 from dm_calibration.optics.instrument import RETRACE_SIZE
 from dm_calibration.optics.orientation import Orientation
-from dm_common.ros.parameters import AUTOSTART, Parameter, live, real, reals, switch, text, texts
-from dm_common.values import named
+from dm_common.ros.parameters import AUTOSTART, Parameter, live, parameters_of, real, switch, text, texts
+from dm_common.values import from_values
 
 PARAMETERS = (
     AUTOSTART,
@@ -67,13 +67,7 @@ PARAMETERS = (
         real(0.7, 0.0, 1.0),
         "Smallest share of valid pixels inside the aperture; maps with fewer are refused.",
     ),
-    live("orientation.flip_x", switch(False), "Exchange left and right of the instrument's picture."),
-    live("orientation.flip_y", switch(False), "Exchange top and bottom of the instrument's picture."),
-    live(
-        "orientation.rotate_deg",
-        real(0.0, -360.0, 360.0, "deg"),
-        "Then rotate it counter-clockwise. `./dm calibrate --plan poke-check` finds flips and angle.",
-    ),
+    *parameters_of("orientation.", Orientation),
     live(
         "wavelength.expected",
         real(0.0, 0.0, 2e-5, "m"),
@@ -92,38 +86,7 @@ PARAMETERS = (
         "Map file of the instrument's own error, as it shows it (before orientation.*), which is subtracted from every "
         "map; empty = nothing is.",
     ),
-    Parameter(
-        "retrace",
-        reals([], -1.0, 1.0),
-        "Error that goes with tilt, 36 numbers, as `./dm instrument retrace FILES` finds them; empty = none.",
-    ),
-    Parameter(
-        "distortion",
-        real(0.0, -0.1, 0.1),
-        "Radial distortion at the edge of the map, as a share, as `./dm instrument grid MARKS.csv MAP` finds it.",
-    ),
-    live(
-        "instrument_error",
-        real(0.0, 0.0, 1e-6, "m"),
-        "95 % bound on what is left of the instrument's error in any coefficient; results say what they are absolute "
-        "to by it. 0 = not known.",
-    ),
-    live(
-        "scale_error",
-        real(0.0, 0.0, 0.1),
-        "95 % bound on the relative error of the lateral scale, for the same; 0 = not known.",
-    ),
-    live(
-        "xyz_unit",
-        text("", choices=("", *XYZ_UNITS)),
-        "Unit of the values in .xyz files, which do not tell it, and in .fits files without BUNIT; empty = refuse "
-        "them.",
-    ),
-    live(
-        "remove_piston_tilt",
-        switch(False),
-        "Subtract piston and tilt from the published map; coefficients and samples keep them.",
-    ),
+    *parameters_of("", IngestSettings),
     live("publish_map", switch(True), "Publish the map itself, several megabytes."),
 )
 
@@ -155,11 +118,12 @@ def ingest_settings(
     values: Mapping[str, Any], mirror_radius: float = 0.0, reference: SurfaceMap | None = None
 ) -> IngestSettings:
     """What maps are read with, of a mirror of `mirror_radius`, m; 0 = not known."""
-    return IngestSettings(
-        **named(IngestSettings, values) | {"retrace": tuple(values["retrace"])},
+    return from_values(
+        IngestSettings,
+        values,
         wavelength=values["wavelength.expected"],
         wavelength_tolerance=values["wavelength.tolerance"],
-        orientation=Orientation(**named(Orientation, values, "orientation.")),
+        orientation=from_values(Orientation, values, "orientation."),
         aperture_radius=values["aperture.radius"],
         mirror_radius=mirror_radius,
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),

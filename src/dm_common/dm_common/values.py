@@ -3,15 +3,17 @@
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode, Refusal
+
+T = TypeVar("T")
 
 #: Most characters of a text that may name or describe anything.
 TEXT_MAX = 1000
@@ -119,9 +121,20 @@ real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, 
 reals, wholes, texts = (partial(Value, kind) for kind in ("float[]", "int[]", "str[]"))
 
 
-def named(kind: Any, values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Those of `values` that are called as fields of the dataclass `kind`, behind `prefix`, by their fields."""
-    return {field.name: values[prefix + field.name] for field in fields(kind) if prefix + field.name in values}
+def parameter(value: Value, description: str, live: bool = False) -> Any:
+    """A field of a dataclass that is a parameter of a node as well, see `dm_common.ros.parameters.parameters_of`."""
+    default = tuple(value.default) if value.many else value.default
+    return field(default=default, metadata={"value": value, "description": description, "live": live})
+
+
+#: One that may change while the node runs.
+live_parameter = partial(parameter, live=True)
+
+
+def from_values(kind: type[T], values: Mapping[str, Any], prefix: str = "", **others: Any) -> T:
+    """The dataclass `kind` of those `values` that are called as its fields behind `prefix`, and of `others`."""
+    own = {each.name: values[prefix + each.name] for each in fields(kind) if prefix + each.name in values}  # type: ignore[arg-type]
+    return kind(**{name: tuple(given) if isinstance(given, list) else given for name, given in own.items()} | others)
 
 
 class Fields:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dm_common.errors import Refusal
 from dm_common.geometry import hexagonal_positions, neighbour_pairs
-from dm_common.values import named
+from dm_common.values import from_values
 from dm_driver.degauss import degauss_move
 from dm_driver.electronics import DriveElectronics, ElectronicsSettings, make_electronics
 from dm_driver.electronics.frame_format import FrameFormat
@@ -58,12 +58,14 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
     actuators = values["mirror.actuators"]
     kind = values["electronics.kind"]
     serial_port = values["electronics.serial_port"]
-    settings = ElectronicsSettings(
-        **named(ElectronicsSettings, values, "electronics.")
-        | {"serial_port": str(Path(serial_port).expanduser()) if serial_port else ""},
+    settings = from_values(
+        ElectronicsSettings,
+        values,
+        "electronics.",
+        serial_port=str(Path(serial_port).expanduser()) if serial_port else "",
         channels=actuators,
         timeout_s=values["electronics.timeout"],
-        frame=FrameFormat(**named(FrameFormat, values, "framed_serial.") if kind == "framed_serial" else {}),
+        frame=from_values(FrameFormat, values if kind == "framed_serial" else {}, "framed_serial."),
     )
     back_end = make_electronics(kind, settings)  # finds a missing setting now
     channel_of_actuator = wiring_table(values["mirror.wiring"], values["mirror.channels"], actuators, back_end.channels)
@@ -82,8 +84,11 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
             f"mirror.working_aperture_diameter = {values['mirror.working_aperture_diameter']:g} m: must be at most"
             f" mirror.full_aperture_diameter = {values['mirror.full_aperture_diameter']:g} m"
         )
-    limits = DriverLimits(
-        **named(DriverLimits, values, "limits.") | {"step": values["limits.step"] / back_end.frames_per_step},
+    limits = from_values(
+        DriverLimits,
+        values,
+        "limits.",
+        step=values["limits.step"] / back_end.frames_per_step,
         actuators=actuators,
         low=values["limits.signal_min"],
         high=values["limits.signal_max"],

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.limits import SLACK, Limits
+from dm_common.values import parameter, real
 
 Shape = NDArray[np.float64]
 
@@ -27,20 +28,16 @@ class DriverLimits(Limits):
 
     Attributes:
         actuators: number of signals N.
-        step: largest change of a signal from one write to the next.
-        slew_rate: largest mean rate of change of a signal, 1/s.
-        command_age: a command older than this is refused, s.
-        command_lead: a command stamped this far in the future is refused, s.
 
     Raises:
         ValueError: naming the parameter that is wrong.
     """
 
     actuators: int
-    step: float = 0.1
-    slew_rate: float = 40.0
-    command_age: float = 1.0
-    command_lead: float = 0.5
+    slew_rate: float = parameter(real(40.0, 1e-3, 1e6, "1/s"), "Largest mean rate of change of a signal.")
+    step: float = parameter(real(0.1, 1e-4, 2.0), "Largest change of a signal in one write.")
+    command_age: float = parameter(real(1.0, 1e-3, 1e9, "s"), "Commands with an older stamp are refused.")
+    command_lead: float = parameter(real(0.5, 1e-3, 1e9, "s"), "Commands stamped further ahead are refused.")
 
     def __post_init__(self) -> None:
         if not -1.0 <= self.low < self.high <= 1.0:

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import parameter, real, switch, text
 from dm_simulation.camera import CameraConfig, SceneCamera
 from dm_simulation.electronics.drive_unit import DriveConfig, DriveUnit
 from dm_simulation.electronics.monitor import Monitor, MonitorConfig
 from dm_simulation.electronics.server import OFF, ElectronicsServer, PortsConfig
 from dm_simulation.interferometer.interferometer import Interferometer, InterferometerConfig
 from dm_simulation.interferometer.trigger_server import TriggerServer
-from dm_simulation.interferometer.zygo_files import FORMATS, deliver, encode_dat, encode_datx, prune
+from dm_simulation.interferometer.zygo_files import FORMATS, UNITS, deliver, encode_dat, encode_datx, prune
 from dm_simulation.mirror.membrane import Membrane, MembraneConfig
 from dm_simulation.mirror.piezo import DRAWN, PiezoActuators, PiezoConfig
 from dm_simulation.mirror.plate import Plate, PlateConfig, neighbour_pairs
@@ -24,16 +25,17 @@ from dm_simulation.mirror.zernike import Array
 
 @dataclass(frozen=True)
 class FilesConfig:
-    """Map files: where they go, "dat" or "datx", unit of .datx heights, intensity frame in .dat, seconds over which a
-    file grows (0: it appears whole), bytes of maps that are kept there (0: all), and the name of the part.
-    """
+    """Map files: their folder and form, and the name of the part in them."""
 
     folder: Path = Path("maps")
-    format: str = "datx"
-    datx_unit: str = "NanoMeters"
-    intensity: bool = False
-    slow_write: float = 0.0
-    limit: float = 5e8
+    format: str = parameter(text("datx", choices=FORMATS), "Format of maps without a given path.")
+    datx_unit: str = parameter(text("NanoMeters", choices=UNITS), "Unit of the heights in .datx files.")
+    intensity: bool = parameter(switch(False), "Whether .dat files have an intensity frame.")
+    slow_write: float = parameter(real(0.0, 0.0, 60.0, "s"), "Wall time over which a file grows; 0 = it appears whole.")
+    limit: float = parameter(
+        real(5e8, 0.0, 1e15, "B"),
+        "Maps in output_folder are removed, the oldest first, beyond this; 0 = all are kept.",
+    )
     part_name: str = "PDM30-37"
 
 

@@ -16,6 +16,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy import fft
 
+from dm_common.values import live_parameter, parameter, real, reals, whole
 from dm_simulation.mirror.zernike import Array
 
 #: Surfaces closer than this [m] over the whole pupil give the same image: creep at rest needs no new one.
@@ -26,30 +27,27 @@ MEAN_GREY = 100.0
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """The camera and its scene, SI units.
+    """The camera and its scene."""
 
-    Attributes:
-        rate: images per second of wall time; 0 = no camera.
-        width, height: image size, px.
-        pixel_pitch: m.
-        focal_length: of the lens, m.
-        rest_distance: object distance in focus while the mirror is flat, m; 0 = infinity.
-        relay_magnification: diameter of the beam on the mirror / diameter of the entrance pupil.
-        wavelength: m.
-        distances: of the objects, from left to right, m; 0 = infinity.
-        photons: electrons per pixel at the mean grey level: fixes the shot noise.
-    """
-
-    rate: float = 0.0
-    width: int = 320
-    height: int = 240
-    pixel_pitch: float = 3.45e-6
-    focal_length: float = 0.2
-    rest_distance: float = 10.0
-    relay_magnification: float = 1.0
-    wavelength: float = 550e-9
-    distances: Sequence[float] = (6.0, 15.0, 100.0)
-    photons: float = 5000.0
+    rate: float = parameter(real(0.0, 0.0, 200.0, "Hz"), "Images per second of wall time on image_raw; 0 = no camera.")
+    width: int = parameter(whole(320, 16, 2048, "px"), "Image width.")
+    height: int = parameter(whole(240, 16, 2048, "px"), "Image height.")
+    pixel_pitch: float = parameter(real(3.45e-6, 1e-7, 1e-3, "m"), "Pixel pitch.")
+    focal_length: float = parameter(real(0.2, 1e-3, 10.0, "m"), "Focal length of the lens.")
+    rest_distance: float = parameter(
+        real(10.0, 0.0, 1e6, "m"), "Object distance in focus while the mirror is flat; 0 = infinity."
+    )
+    relay_magnification: float = parameter(
+        real(1.0, 0.01, 100.0), "Diameter of the beam on the mirror / of the entrance pupil."
+    )
+    wavelength: float = parameter(real(550e-9, 1e-7, 2e-5, "m"), "Wavelength of the images.")
+    distances: Sequence[float] = live_parameter(
+        reals([6.0, 15.0, 100.0], 0.0, 1e6, "m"),
+        "Distances of the objects, from left to right; 0 = infinity. Their number stays.",
+    )
+    photons: float = parameter(
+        real(5000.0, 1.0, 1e9), "Electrons per pixel at the mean grey level, which fixes the shot noise."
+    )
 
 
 def camera_matrix(config: CameraConfig) -> list[float]:

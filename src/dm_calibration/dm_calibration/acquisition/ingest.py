@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.acquisition.reference_surface import MapRejectedError, absolute_sag, corrections
-from dm_calibration.map_files import SurfaceMap, read_map
+from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
 from dm_calibration.optics.aperture import Aperture, InsufficientDataError, configured_aperture, find_aperture
 from dm_calibration.optics.instrument import undistorted, without_retrace
 from dm_calibration.optics.map_fit import MapFitter
@@ -18,6 +18,7 @@ from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sampling import edge_clustered_points, sample_map
 from dm_common.optics.zernike import basis
+from dm_common.values import live_parameter, parameter, real, reals, switch, text
 
 #: Maps are searched for phase steps where the terms leave more than this at a sampling point, in wavelengths; a step of
 #: a fringe leaves more wherever it ends.
@@ -31,7 +32,6 @@ class IngestSettings:
     """How maps are read and judged.
 
     Attributes:
-        xyz_unit: unit of `.xyz` values; "" = refuse them.
         pitch: m per pixel, better known than to the files; 0 = as they tell.
         wavelength: expected, m; 0 = any.
         wavelength_tolerance: m.
@@ -42,12 +42,8 @@ class IngestSettings:
         aperture_follow: from the centre of the valid region, found anew in each map, instead.
         minimum_valid_fraction: valid pixels / pixels inside the aperture.
         reference: the instrument's own error, subtracted from every map before it is turned; None = not known.
-        retrace, distortion: of the instrument, taken off then; see :mod:`~dm_calibration.optics.instrument`. () = none.
-        instrument_error, scale_error: as of :class:`~dm_common.measurement.Measurement`.
-        remove_piston_tilt: subtract the map's plane from the map that is handed on; the fit keeps piston and tilt.
     """
 
-    xyz_unit: str = ""
     pitch: float = 0.0
     wavelength: float = 0.0
     wavelength_tolerance: float = 1e-9
@@ -58,11 +54,32 @@ class IngestSettings:
     aperture_follow: bool = False
     minimum_valid_fraction: float = 0.7
     reference: SurfaceMap | None = None
-    retrace: tuple[float, ...] = ()
-    distortion: float = 0.0
-    instrument_error: float = 0.0
-    scale_error: float = 0.0
-    remove_piston_tilt: bool = False
+    # Retrace and distortion are taken off then; see `dm_calibration.optics.instrument`.
+    retrace: tuple[float, ...] = parameter(
+        reals([], -1.0, 1.0),
+        "Error that goes with tilt, 36 numbers, as `./dm instrument retrace FILES` finds them; empty = none.",
+    )
+    distortion: float = parameter(
+        real(0.0, -0.1, 0.1),
+        "Radial distortion at the edge of the map, as a share, as `./dm instrument grid MARKS.csv MAP` finds it.",
+    )
+    instrument_error: float = live_parameter(
+        real(0.0, 0.0, 1e-6, "m"),
+        "95 % bound on what is left of the instrument's error in any coefficient; results say what they are absolute "
+        "to by it. 0 = not known.",
+    )
+    scale_error: float = live_parameter(
+        real(0.0, 0.0, 0.1),
+        "95 % bound on the relative error of the lateral scale, for the same; 0 = not known.",
+    )
+    xyz_unit: str = live_parameter(
+        text("", choices=("", *XYZ_UNITS)),
+        "Unit of the values in .xyz files, which do not tell it, and in .fits files without BUNIT; empty = refuse "
+        "them.",
+    )
+    remove_piston_tilt: bool = live_parameter(
+        switch(False), "Subtract piston and tilt from the published map; coefficients and samples keep them."
+    )
 
 
 def too_large(radius: float, mirror_radius: float) -> str:

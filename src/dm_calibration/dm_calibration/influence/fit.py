@@ -32,6 +32,7 @@ from dm_common.names import unknown_name
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT
+from dm_common.values import live_parameter, real
 
 
 @dataclass(frozen=True)
@@ -41,13 +42,6 @@ class FitOptions:
     Attributes:
         method: a name of METHODS.
         epsilon: m^2, above 0, the prior parameter of Eq. (8) for AZWreg; None = by cross-validation.
-        valid_fraction_min: least share of valid pixels in the aperture of a map.
-        outlier_sigmas: residual, in robust sigmas above the median, beyond which a map is an outlier.
-        hysteresis_allowance: share of an actuator's move by which it may miss its mark because of hysteresis (half the
-            loop, whose width is 7-15 % of the move) without the map counting as an outlier.
-        dead_sigmas: an actuator is dead below this many standard errors of its response.
-        weak_sigmas: it is weak below this many standard errors, where they stand out from those of the others ...
-        weak_share: ... or below this share of the median response of its ring.
 
     Raises:
         ValueError: fewer than 2 folds, or an epsilon that is not above 0.
@@ -56,12 +50,23 @@ class FitOptions:
     method: str = "AZreg"
     folds: int = 10
     epsilon: float | None = None
-    valid_fraction_min: float = 0.5
-    outlier_sigmas: float = 6.0
-    hysteresis_allowance: float = 0.10
-    dead_sigmas: float = 3.0
-    weak_sigmas: float = 10.0
-    weak_share: float = 0.4
+    valid_fraction_min: float = live_parameter(
+        real(0.5, 0.0, 1.0), "Least share of valid pixels in the aperture of a map."
+    )
+    outlier_sigmas: float = live_parameter(
+        real(6.0, 3.0, 1e3), "Residual of a map, in robust sigmas above the median, beyond which it is dropped."
+    )
+    hysteresis_allowance: float = live_parameter(
+        real(0.10, 0.0, 1.0),
+        "Share of their moves by which actuators may miss their mark (hysteresis: half the loop, whose width is 7-15 % "
+        "of the move) without the map being an outlier; 0 = they have none, and moves without a law of it are promised "
+        "what held-out maps show.",
+    )
+    dead_sigmas: float = live_parameter(real(3.0, 0.0, 1e3), "Dead below this many standard errors.")
+    weak_sigmas: float = live_parameter(
+        real(10.0, 0.0, 1e3), "Weak below this many standard errors, where they are twice those of the other actuators."
+    )
+    weak_share: float = live_parameter(real(0.4, 0.0, 1.0), "Weak below this share of the median response of its ring.")
 
     def __post_init__(self) -> None:
         if self.folds < 2:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import live_parameter, real, switch
+
 #: Rotations that differ less from a multiple of 90 degrees are one: no pixel of any camera moves by a tenth [degrees].
 _EXACT = 1e-3
 
@@ -16,15 +18,15 @@ _EXACT = 1e-3
 class Orientation:
     """How the instrument's picture must be turned: first the flips, then the rotation about the map's centre.
 
-    Attributes:
-        flip_x: exchange left and right.
-        flip_y: exchange top and bottom.
-        rotate_deg: counter-clockwise, degrees. Multiples of 90 move pixels; other rotations interpolate between them.
+    Multiples of 90 degrees move pixels; other rotations interpolate between them.
     """
 
-    flip_x: bool = False
-    flip_y: bool = False
-    rotate_deg: float = 0.0
+    flip_x: bool = live_parameter(switch(False), "Exchange left and right of the instrument's picture.")
+    flip_y: bool = live_parameter(switch(False), "Exchange top and bottom of the instrument's picture.")
+    rotate_deg: float = live_parameter(
+        real(0.0, -360.0, 360.0, "deg"),
+        "Then rotate it counter-clockwise. `./dm calibrate --plan poke-check` finds flips and angle.",
+    )
 
     def apply(self, sag: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the map in the mirror frame, C-contiguous.

@@ -13,6 +13,7 @@ from dm_calibration.influence.maps import REFERENCE
 from dm_calibration.procedure.outcome import MapTaken
 from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
+from dm_common.values import live_parameter, real
 
 #: An aperture found on a map may wander by so many pixels.
 _WANDER_PX = 1.5
@@ -26,16 +27,23 @@ class BumpOptions:
     """Largest changes between two reference frames; 0 = not checked.
 
     Attributes:
-        tilt_max: of the sag at the edge by tilt, m.
-        shift_max: of the aperture on the map, m at the mirror.
-        figure_max: of the rms figure, beyond what hysteresis may have left, m.
         hysteresis_allowance: share of their moves by which actuators may miss their mark; twice that is allowed for,
             since actuators that moved together err together.
     """
 
-    tilt_max: float = 3e-6
-    shift_max: float = 0.1e-3
-    figure_max: float = 50e-9
+    tilt_max: float = live_parameter(
+        real(3e-6, 0.0, 1e-3, "m"),
+        "Largest change of tilt between two reference frames, as sag at the edge; 0 = not checked.",
+    )
+    shift_max: float = live_parameter(
+        real(1e-4, 0.0, 1e-2, "m"),
+        "Largest shift of the aperture on the map between two reference frames, at the mirror; 0 = not checked.",
+    )
+    figure_max: float = live_parameter(
+        real(50e-9, 0.0, 1e-3, "m"),
+        "Largest change of the rms figure between two reference frames, beyond what twice `hysteresis_allowance` "
+        "explains; 0 = not checked.",
+    )
     hysteresis_allowance: float = 0.10
 
 

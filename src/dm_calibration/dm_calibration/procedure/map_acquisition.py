@@ -15,6 +15,7 @@ from dm_common import Floats
 from dm_common.errors import ErrorCode, MeasurementError, Refusal
 from dm_common.measurement import Bench, Measurement
 from dm_common.mirror import APERTURE_TOLERANCE, Mirror
+from dm_common.values import live_parameter, whole
 
 #: Largest relative difference of wavelengths between maps.
 WAVELENGTH_TOLERANCE = 1e-4
@@ -25,15 +26,15 @@ class ProcedureOptions:
     """Tries and checks of the measurements.
 
     Attributes:
-        measure_retries: further tries after a measurement that failed.
-        failures_max: states in a row without a map after which the run is given up.
         aperture_tolerance: largest relative deviation of a map's aperture radius from the mirror's.
         fit: options of the fit that the surfaces with a prescribed shape are solved from.
         bump: what reference frames may differ by.
     """
 
-    measure_retries: int = 1
-    failures_max: int = 3
+    measure_retries: int = live_parameter(whole(1, 0, 20), "Further tries after a map that failed.")
+    failures_max: int = live_parameter(
+        whole(3, 1, 1000), "Shapes in a row without a map after which a run is given up."
+    )
     maps_per_state: int = 1
     aperture_tolerance: float = APERTURE_TOLERANCE
     fit: FitOptions = field(default_factory=FitOptions)

@@ -26,6 +26,7 @@ from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_
 from dm_common.atomic_write import storing
 from dm_common.measurement import Measurement
 from dm_common.mirror import APERTURE_TOLERANCE
+from dm_common.values import live_parameter, real, whole
 
 #: Maps of one unmoved mirror within this time share the error of the hysteresis model, s.
 REPEAT_S = 3600.0
@@ -39,15 +40,18 @@ class UpdateOptions:
     """What is taken, and how far it may change the calibration.
 
     Attributes:
-        surprise_max: difference of a map from its prediction, over what is to be expected, beyond which it is bad.
-        surprises_max: bad maps in a row after which the mirror counts as changed.
         valid_fraction_min: least share of valid pixels.
         aperture_tolerance: largest relative deviation of a map's aperture radius from the calibration's.
         signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
     """
 
-    surprise_max: float = 3.0
-    surprises_max: int = 3
+    surprise_max: float = live_parameter(
+        real(3.0, 1.0, 100.0),
+        "A map that differs from its prediction by more than this times the expected difference is not taken.",
+    )
+    surprises_max: int = live_parameter(
+        whole(3, 1, 1000), "Maps in a row that differ so much after which the mirror counts as changed."
+    )
     valid_fraction_min: float = 0.5
     aperture_tolerance: float = APERTURE_TOLERANCE
     signal_sigma: float = 0.05

@@ -7,8 +7,8 @@ parameter pages of the documentation.
 import difflib
 import math
 from array import array
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -26,8 +26,8 @@ __all__ = [
     "ParameterError",
     "Values",
     "declare",
-    "fields_of",
     "live",
+    "parameters_of",
     "real",
     "reals",
     "switch",
@@ -130,16 +130,18 @@ class Parameter:
         return descriptor
 
 
-def fields_of(group: str, config: Any) -> Callable[[str, Value, str], Parameter]:
-    """A function that makes the parameters of `group` after fields of `config`; it takes what `Parameter` does.
+def parameters_of(prefix: str, config: Any) -> Iterator[Parameter]:
+    """The parameters that fields of a dataclass declare by `dm_common.values.parameter`, in their order.
 
-    The name is that of the field, as is the default, for which `...` stands.
+    Args:
+        prefix: what stands before the names of the fields.
+        config: the dataclass, or an object of it whose values are the defaults.
     """
-
-    def parameter(name: str, value: Value, description: str) -> Parameter:
-        return Parameter(f"{group}.{name}", replace(value, default=getattr(config, name)), description)
-
-    return parameter
+    for each in fields(config):
+        if each.metadata:
+            value, default = each.metadata["value"], getattr(config, each.name)
+            value = replace(value, default=list(default) if value.many else default)
+            yield Parameter(prefix + each.name, **{**each.metadata, "value": value})
 
 
 #: A parameter that may change while the node runs.

@@ -10,6 +10,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import parameter, text, whole
 from dm_driver.electronics.frame_format import FrameFormat
 
 #: `DriveElectronics.needs` of units at a serial port.
@@ -37,10 +38,6 @@ class ElectronicsSettings:
     """Where a unit is. Each back end takes what it needs.
 
     Attributes:
-        address: host name or IPv4 address, or the URI of a mirror on a device server.
-        port: TCP or UDP port.
-        discovery_port: UDP port on which the unit answers discovery; 0 = not used.
-        serial_port: device file.
         timeout_s: longest wait for the unit to take a frame or to answer.
         frame: of a framed serial unit.
         doubt: codes by which frames on their way may differ from what has surely arrived, where a back end can tell;
@@ -48,10 +45,17 @@ class ElectronicsSettings:
         channels: output channels of a unit that has as many as it has actuators.
     """
 
-    address: str = ""
-    port: int = 1234
-    discovery_port: int = 0
-    serial_port: str = ""
+    address: str = parameter(
+        text(""),
+        "EDAC40: host name or IPv4 address. microscope: URI of the mirror on the device server of python-microscope, "
+        "such as PYRO:Mirao52e@127.0.0.1:8000.",
+    )
+    port: int = parameter(whole(1234, 1, 65535), "EDAC40: TCP or UDP port.")
+    discovery_port: int = parameter(
+        whole(0, 0, 65535),
+        "EDAC40 over UDP: port of the discovery (30303 on real units) to check the link with; 0 = not checked.",
+    )
+    serial_port: str = parameter(text(""), "USB DAC-40, framed_serial: device file, for example /dev/ttyUSB0.")
     timeout_s: float = 1.0
     frame: FrameFormat = field(default_factory=FrameFormat)
     doubt: int = 0

@@ -14,6 +14,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import parameter, real, switch, text, whole, wholes
 from dm_driver.electronics.check_sums import CHECK_SUMS
 
 BYTE_ORDERS: Final = ("big", "little")
@@ -39,49 +40,43 @@ def parse_hex(name: str, text: str) -> bytes:
 
 @dataclass(frozen=True)
 class FrameFormat:
-    """One unit's frames and line. The names are those of the parameters `framed_serial.*`.
-
-    Attributes:
-        channels: output channels C.
-        bits: of a code; full scale is 2^bits - 1.
-        header, terminator: bytes before and after, hexadecimal.
-        channel_order: connector channels (from 0) in the order of their words; empty = 0, 1, 2, ...
-        word_bits: of a word on the wire; 0 = `bits` rounded up to whole bytes.
-        byte_order: "big": words begin with their most significant bit; "little": bytes, and bits in them, from the
-            least significant on.
-        scale, offset: integers that make a word of a code.
-        checksum: a key of `CHECK_SUMS`.
-        checksum_covers_header: whether the header counts.
-        checksum_byte_order: of check sums of two bytes.
-        opening: bytes sent once after opening, hexadecimal.
-        reply: what the unit answers to every frame, hexadecimal; empty = it does not answer.
-        baud_rate: bit/s.
-        parity: none, even or odd.
-        stop_bits: 1 or 2.
-        frame_rate: most frames per second, Hz; 0 = as fast as the line carries them.
+    """One unit's frames and line.
 
     Raises:
         ValueError: values that are each allowed and do not fit each other, naming the parameters.
     """
 
-    channels: int = 40
-    bits: int = 16
-    header: str = ""
-    terminator: str = ""
-    channel_order: Sequence[int] = ()
-    word_bits: int = 0
-    byte_order: str = "big"
-    scale: int = 1
-    offset: int = 0
-    checksum: str = "none"
-    checksum_covers_header: bool = True
-    checksum_byte_order: str = "big"
-    opening: str = ""
-    reply: str = ""
-    baud_rate: int = 115200
-    parity: str = "none"
-    stop_bits: int = 1
-    frame_rate: float = 0.0
+    channels: int = parameter(whole(40, 1, 4096), "Output channels of the unit.")
+    bits: int = parameter(whole(16, 1, MOST_BITS), "Bits of a code; full scale is 2^bits - 1.")
+    header: str = parameter(text(""), "Bytes before the words, hexadecimal, for example 'A5 5A'.")
+    terminator: str = parameter(text(""), "Bytes after the check sum, hexadecimal.")
+    channel_order: Sequence[int] = parameter(
+        wholes([], 0, 4095), "Connector channels, from 0, in the order of their words; empty = 0, 1, 2, ..."
+    )
+    word_bits: int = parameter(
+        whole(0, 0, MOST_WORD_BITS),
+        "Bits of a word on the wire, no gaps between words; 0 = framed_serial.bits rounded up to whole bytes.",
+    )
+    byte_order: str = parameter(
+        text("big", choices=BYTE_ORDERS),
+        "big: words begin with their most significant bit; little: with their least significant byte and bit.",
+    )
+    scale: int = parameter(whole(1, -(2**31), 2**31), "word = offset + scale * code.")
+    offset: int = parameter(
+        whole(0, -(2**31), 2**32), "word = offset + scale * code; negative words in two's complement."
+    )
+    checksum: str = parameter(text("none", choices=tuple(CHECK_SUMS)), "Check sum.")
+    checksum_covers_header: bool = parameter(switch(True), "The check sum counts the header.")
+    checksum_byte_order: str = parameter(text("big", choices=BYTE_ORDERS), "Of check sums of two bytes.")
+    opening: str = parameter(text(""), "Bytes sent once after opening, hexadecimal.")
+    reply: str = parameter(
+        text(""),
+        "What the unit answers to every frame within electronics.timeout, hexadecimal; empty = it does not answer.",
+    )
+    baud_rate: int = parameter(whole(115200, 50, 10_000_000, "bit/s"), "Of the line.")
+    parity: str = parameter(text("none", choices=PARITIES), "Parity bit.")
+    stop_bits: int = parameter(whole(1, 1, 2), "Stop bits.")
+    frame_rate: float = parameter(real(0.0, 0.0, 1e6, "Hz"), "Most frames per second; 0 = as many as the line carries.")
 
     def __post_init__(self) -> None:
         for name in ("header", "terminator", "opening", "reply"):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import parameter, real, whole
 from dm_simulation.electronics import frames
 from dm_simulation.mirror.zernike import Array
 
@@ -24,25 +25,25 @@ class DriveConfig:
     """What is soldered, stored and plugged.
 
     Attributes:
-        dac_volts_at_zero, dac_volts_at_full: DAC output at code 0 and at full scale, as the unit's NVRAM has them, V.
-        amplifier_gain: actuator volts per DAC volt.
-        amplifier_min, amplifier_max: where the amplifier saturates, V at the actuator.
         volts_min, volts_max: V at the actuator for signals -1 and +1.
         wiring: connector channel (0-based) that actuator 1, 2, ... is really connected to.
         squared: whether signals count the square of the volts, as a membrane does.
-        channels: at the connector; EDAC40 and USB DAC-40 have 40.
     """
 
-    dac_volts_at_zero: float = 0.0
-    dac_volts_at_full: float = 5.0
-    amplifier_gain: float = 80.0
-    amplifier_min: float = 0.0
-    amplifier_max: float = 400.0
+    channels: int = parameter(
+        whole(frames.CHANNELS, 1, 4096), "Channels at the connector; EDAC40 and USB DAC-40 have 40."
+    )
+    dac_volts_at_zero: float = parameter(
+        real(0.0, -100.0, 100.0, "V"), "DAC output at code 0, as the unit's NVRAM has it."
+    )
+    dac_volts_at_full: float = parameter(real(5.0, -100.0, 100.0, "V"), "DAC output at full code, likewise.")
+    amplifier_gain: float = parameter(real(80.0, -1e4, 1e4), "Actuator V per DAC V.")
+    amplifier_min: float = parameter(real(0.0, -1e4, 1e4, "V"), "Lowest actuator volts, where the amplifier saturates.")
+    amplifier_max: float = parameter(real(400.0, -1e4, 1e4, "V"), "Highest actuator volts.")
     volts_min: float = 0.0
     volts_max: float = 300.0
     squared: bool = False
     wiring: Sequence[int] = TRIHEX
-    channels: int = frames.CHANNELS
 
 
 class DriveUnit:

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import parameter, switch, text, whole, wholes
 from dm_simulation.electronics.frames import FrameError
 
 BYTE_ORDERS: Final = ("big", "little")
@@ -25,35 +26,24 @@ CHECK_LENGTH: Final = {
 
 @dataclass(frozen=True)
 class FramedConfig:
-    """The unit's data sheet.
+    """The unit's data sheet."""
 
-    Attributes:
-        channels: words per frame; 0 = the terminal speaks as a USB DAC-40.
-        bits: of a code.
-        header, terminator, opening, reply: bytes, hexadecimal; opening: taken once after power-up and ignored.
-        channel_order: channel (0-based) of each word; empty = 0, 1, 2, ...
-        word_bits: of a word, without gaps; 0 = bits rounded up to whole bytes.
-        byte_order: big or little, of the bits in a frame.
-        scale, offset: word = offset + scale * code.
-        checksum: a key of CHECK_LENGTH.
-        checksum_covers_header: whether it counts the header.
-        checksum_byte_order: big or little.
-    """
-
-    channels: int = 0
-    bits: int = 16
-    header: str = ""
-    terminator: str = ""
-    opening: str = ""
-    reply: str = ""
-    channel_order: tuple[int, ...] = ()
-    word_bits: int = 0
-    byte_order: str = "big"
-    scale: int = 1
-    offset: int = 0
-    checksum: str = "none"
-    checksum_covers_header: bool = True
-    checksum_byte_order: str = "big"
+    channels: int = parameter(whole(0, 0, 4096), "Words in a frame of the serial unit; 0 = it is a USB DAC-40.")
+    bits: int = parameter(whole(16, 1, 16), "Bits of a code of the serial unit.")
+    header: str = parameter(text(""), "Bytes before the words, hexadecimal.")
+    terminator: str = parameter(text(""), "Bytes after the check sum, hexadecimal.")
+    opening: str = parameter(text(""), "Bytes that may come before a frame and are ignored, hexadecimal.")
+    reply: str = parameter(text(""), "Answer to every frame, hexadecimal.")
+    channel_order: tuple[int, ...] = parameter(
+        wholes([], 0, 4095), "Channels, from 0, in the order of their words; empty = 0, 1, 2, ..."
+    )
+    word_bits: int = parameter(whole(0, 0, 32), "Bits of a word, without gaps; 0 = bits rounded up to whole bytes.")
+    byte_order: str = parameter(text("big", choices=BYTE_ORDERS), "Order of bytes and bits in a frame.")
+    scale: int = parameter(whole(1, -(2**31), 2**31), "word = offset + scale * code.")
+    offset: int = parameter(whole(0, -(2**31), 2**32), "word = offset + scale * code.")
+    checksum: str = parameter(text("none", choices=tuple(CHECK_LENGTH)), "Check sum.")
+    checksum_covers_header: bool = parameter(switch(True), "It counts the header.")
+    checksum_byte_order: str = parameter(text("big", choices=BYTE_ORDERS), "Of two bytes.")
 
 
 def check_value(kind: str, data: bytes) -> int:

@@ -5,21 +5,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_common.values import parameter, real
 from dm_simulation.mirror.zernike import Array
 
 
 @dataclass(frozen=True)
 class MonitorConfig:
-    """Limits in normalised signals; `tolerance` allows for the quantisation of the DAC.
+    """Limits in normalised signals; the largest values are recorded whatever is counted."""
 
-    A limit of 0 for `jump` or `neighbour_difference` switches that count off; the largest value is recorded anyway.
-    """
-
-    jump: float = 0.1
-    neighbour_difference: float = 1.0
-    signal_min: float = -1.0
-    signal_max: float = 1.0
-    tolerance: float = 0.002
+    jump: float = parameter(real(0.1, 0.0, 4.0), "Counted: change per frame above this; 0 = off.")
+    neighbour_difference: float = parameter(
+        real(1.0, 0.0, 4.0), "Counted: difference of neighbouring signals above this; 0 = off."
+    )
+    signal_min: float = parameter(real(-1.0, -10.0, 10.0), "Counted: signals below this.")
+    signal_max: float = parameter(real(1.0, -10.0, 10.0), "Counted: signals above this.")
+    tolerance: float = parameter(real(0.002, 0.0, 1.0), "Allowance for DAC steps.")
 
 
 @dataclass

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+from dm_common.values import parameter, text, whole
 from dm_simulation.electronics import frames
 from dm_simulation.electronics.drive_unit import DriveUnit
 from dm_simulation.electronics.event_loop import EventLoop
@@ -25,20 +26,22 @@ T = TypeVar("T")
 LOOPBACK = "127.0.0.1"
 #: Port value that leaves a service out; 0 lets the system choose one.
 OFF = -1
+PORT_TEXT = "on 127.0.0.1; 0 = any free port, -1 = not offered."
 DISCOVERY_QUESTION = b"Discovery: Who is out there?"
 DISCOVERY_ANSWER = b"EDAC40".ljust(17) + b"02-00-00-DA-C4-00\r\n"
 
 
 @dataclass(frozen=True)
 class PortsConfig:
-    """Where the units are to be found: loopback ports (0 = any free one, -1 = off), the path of a symbolic link to the
-    pseudo-terminal ("" = off), and what is spoken there (by default a USB DAC-40).
-    """
+    """Where the units are to be found, and what is spoken at the serial port (by default a USB DAC-40)."""
 
-    tcp_port: int = 1234
-    udp_port: int = 1234
-    discovery_port: int = 30303
-    pty_link: str = ""
+    tcp_port: int = parameter(whole(1234, -1, 65535), f"EDAC40 over TCP {PORT_TEXT}")
+    udp_port: int = parameter(whole(1234, -1, 65535), f"EDAC40 over UDP {PORT_TEXT}")
+    discovery_port: int = parameter(whole(30303, -1, 65535), f"EDAC40 discovery {PORT_TEXT}")
+    pty_link: str = parameter(
+        text(""),
+        "Path of a symbolic link to the pseudo-terminal of the USB DAC-40 or the framed unit; empty = not offered.",
+    )
     framed: FramedConfig = field(default_factory=FramedConfig)
 
 
@@ -122,7 +125,7 @@ class ElectronicsServer:
         if self._ports.discovery_port != OFF:
             self._bind_udp("discovery_port", wanted("discovery_port", self._ports.discovery_port), self._on_discovery)
         if self._ports.pty_link:
-            link = Path(self._ports.pty_link)
+            link = Path(self._ports.pty_link).expanduser()
             self._terminal.open(link)
             self.endpoints["pty"] = str(link)
 

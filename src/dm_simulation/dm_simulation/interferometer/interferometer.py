@@ -15,6 +15,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from dm_common.values import parameter, real, switch, whole
 from dm_simulation.mirror import zernike
 from dm_simulation.mirror.membrane import Membrane
 from dm_simulation.mirror.plate import Plate
@@ -27,53 +28,67 @@ VIBRATION_SPREAD = 0.8
 
 @dataclass(frozen=True)
 class InterferometerConfig:
-    """The instrument, SI units.
+    """The instrument: how maps differ from the surface."""
 
-    Attributes:
-        pixels: the camera has pixels x pixels, the circular field touching its edges.
-        field_diameter: diameter of the field, m (the working aperture of the mirror).
-        figure_rms: initial figure of the unpowered mirror inside the field, orders 2-12 over the plate, seeded.
-        pixel_noise: rms of white noise per pixel, m.
-        low_order_noise: rms over the field of all Zernike terms of orders 2-5 together, drawn anew for every map, m.
-        piston_spread, tilt_spread: standard deviations of piston and of the edge sag of each tilt, per map, m.
-        instrument_error: rms of what the instrument adds to every map, orders 2-12 over the field, seeded, m.
-        retrace: rms of what it adds for each m that the edge stands off by tilt, orders 2-5, seeded, for x and for y.
-        distortion: places at the edge of the field are seen further from its centre by this share, others by its cube.
-        vibration: median amplitude of ripples at twice the frequency of the fringes, which differs from map to map, m.
-        phase_steps: mean number of discs per map that stand a whole fringe off.
-        mask_diameter: of a mask on the mirror, beyond which nothing is seen, m; 0 = there is none.
-        specks: mean number of dropped single pixels per map.
-        blobs: number of dropped discs per map, of 3 to 16 pixels radius (scaled with the camera).
-        mount_angle, mount_mirrored, mount_x, mount_y, mount_scale: how the mirror stands in the field: its own frame is
-            mirrored left-right, turned anticlockwise (rad), enlarged (lateral scale of the instrument) and shifted (m).
-        flip_x, flip_y, rotate_deg: the camera turns the picture anticlockwise by rotate_deg (0, 90, 180, 270), then
-            mirrors it left-right (flip_x) and upside down (flip_y).
-    """
-
-    pixels: int = 944
-    field_diameter: float = 0.022
-    wavelength: float = WAVELENGTH
-    figure_rms: float = 40e-9
-    pixel_noise: float = 1e-9
-    low_order_noise: float = 0.3e-9
-    piston_spread: float = 200e-9
-    tilt_spread: float = 300e-9
-    instrument_error: float = 0.0
-    retrace: float = 0.0
-    distortion: float = 0.0
-    vibration: float = 0.0
-    phase_steps: float = 0.0
-    mask_diameter: float = 0.0
-    specks: int = 400
-    blobs: int = 6
-    mount_angle: float = 0.0
-    mount_mirrored: bool = False
-    mount_x: float = 0.0
-    mount_y: float = 0.0
-    mount_scale: float = 1.0
-    flip_x: bool = False
-    flip_y: bool = False
-    rotate_deg: int = 0
+    pixels: int = parameter(
+        whole(944, 32, 4096, "px"), "Pixels along each side of the camera; the circular field touches its edges."
+    )
+    field_diameter: float = parameter(
+        real(0.022, 1e-3, 1.0, "m"), "Diameter of the field of view (the working aperture of the mirror)."
+    )
+    wavelength: float = parameter(real(WAVELENGTH, 1e-7, 2e-5, "m"), "Wavelength.")
+    figure_rms: float = parameter(
+        real(40e-9, 0.0, 1e-5, "m"),
+        "Initial figure of the unpowered mirror, orders 2-12 over it, by the seed: rms inside the field.",
+    )
+    pixel_noise: float = parameter(real(1e-9, 0.0, 1e-6, "m"), "White noise per pixel, rms.")
+    low_order_noise: float = parameter(
+        real(0.3e-9, 0.0, 1e-6, "m"),
+        "Noise of all Zernike terms of orders 2-5 together, drawn anew for every map, rms over the field.",
+    )
+    piston_spread: float = parameter(real(200e-9, 0.0, 1e-4, "m"), "Standard deviation of piston between maps.")
+    tilt_spread: float = parameter(
+        real(300e-9, 0.0, 1e-4, "m"), "Standard deviation of the edge sag by each tilt between maps."
+    )
+    instrument_error: float = parameter(
+        real(0.0, 0.0, 1e-5, "m"),
+        "What the instrument adds to every map, rms, orders 2-12 over the field, by the seed; a map of it alone lies "
+        "in output_folder/reference/flat.datx.",
+    )
+    retrace: float = parameter(
+        real(0.0, 0.0, 0.1),
+        "What it adds for each m of edge sag by tilt, rms m, orders 2-5, by the seed, for x and for y.",
+    )
+    distortion: float = parameter(
+        real(0.0, -0.05, 0.05),
+        "Radial distortion, by the cube of the distance: what lies at the edge is seen further from the centre by this "
+        "share.",
+    )
+    vibration: float = parameter(
+        real(0.0, 0.0, 1e-7, "m"),
+        "Ripples at twice the frequency of the fringes, whose size differs from map to map: median amplitude.",
+    )
+    phase_steps: float = parameter(real(0.0, 0.0, 20.0), "Mean number of discs per map that stand a whole fringe off.")
+    mask_diameter: float = parameter(
+        real(0.0, 0.0, 1.0, "m"), "Of a mask on the mirror, beyond which nothing is seen; 0 = no mask."
+    )
+    specks: int = parameter(whole(400, 0, 1_000_000), "Mean number of dropped pixels per map.")
+    blobs: int = parameter(
+        whole(6, 0, 1000), "Dropped discs per map, of 3 to 16 pixels radius where the camera has 944."
+    )
+    mount_angle: float = parameter(
+        real(0.0, -7.0, 7.0, "rad"),
+        "How the mirror is mounted in the field of view: turned anticlockwise by this, after ...",
+    )
+    mount_mirrored: bool = parameter(switch(False), "... it was mirrored left-right.")
+    mount_x: float = parameter(real(0.0, -0.1, 0.1, "m"), "Its centre in the field, x.")
+    mount_y: float = parameter(real(0.0, -0.1, 0.1, "m"), "Its centre in the field, y.")
+    mount_scale: float = parameter(
+        real(1.0, 0.5, 2.0), "Lengths as the instrument sees them / true ones: error of its lateral scale."
+    )
+    flip_x: bool = parameter(switch(False), "Picture mirrored left-right, after turning.")
+    flip_y: bool = parameter(switch(False), "Picture mirrored upside down, after turning.")
+    rotate_deg: int = parameter(whole(0, 0, 270, "deg"), "Picture turned anticlockwise by 0, 90, 180 or 270.")
 
 
 class Interferometer:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import eval_jacobi
 
+from dm_common.values import parameter, real, whole
 from dm_simulation.mirror import zernike
 from dm_simulation.mirror.plate import actuator_positions
 from dm_simulation.mirror.zernike import Array
@@ -29,29 +30,20 @@ _ROUNDS, _SETTLED = 100, 1e-9
 
 @dataclass(frozen=True)
 class MembraneConfig:
-    """Geometry and state of the mirror, SI units.
+    """Geometry and state of the mirror."""
 
-    Attributes:
-        diameter: of the membrane inside its frame.
-        tension: of the membrane, N/m.
-        gap: from the electrodes to the flat membrane.
-        actuators, pitch, electrode_diameter: full rings of round electrodes on a hexagonal grid, numbered as stacks.
-        gain_spread: standard deviation of the relative pull of the electrodes (cut at three of them).
-        drift: deflection that the zero has gone after a long time.
-        drift_time: time in which it goes 63 % of that, s.
-        order: degree of the polynomials.
-    """
-
-    diameter: float = 0.015
-    tension: float = 60.0
-    gap: float = 100e-6
-    actuators: int = 37
-    pitch: float = 1.8e-3
-    electrode_diameter: float = 1.7e-3
-    gain_spread: float = 0.03
-    drift: float = 0.0
-    drift_time: float = 3600.0
-    order: int = 36
+    diameter: float = parameter(real(0.015, 1e-3, 1.0, "m"), "Diameter inside the frame.")
+    tension: float = parameter(real(60.0, 1e-3, 1e5, "N/m"), "Tension of the membrane.")
+    gap: float = parameter(real(100e-6, 1e-6, 1e-2, "m"), "From the electrodes to the flat membrane.")
+    actuators: int = parameter(
+        whole(37, 7, 1000), "Electrodes of the hexagonal pattern: full rings, numbered as stacks."
+    )
+    pitch: float = parameter(real(1.8e-3, 1e-4, 0.1, "m"), "Distance of neighbouring electrodes.")
+    electrode_diameter: float = parameter(real(1.7e-3, 1e-4, 0.1, "m"), "Diameter of an electrode.")
+    gain_spread: float = parameter(real(0.03, 0.0, 0.3), "Standard deviation of relative pulls, cut at three of them.")
+    drift: float = parameter(real(0.0, 0.0, 1e-5, "m"), "Deflection that the zero drifts by in a long time.")
+    drift_time: float = parameter(real(3600.0, 1.0, 1e7, "s"), "Time of 63 % of that drift.")
+    order: int = parameter(whole(36, 12, 60), "Degree of the polynomials of the solution.")
 
 
 class Membrane:

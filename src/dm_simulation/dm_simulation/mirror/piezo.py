@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dm_simulation.mirror.hysteresis import Hysteresis
+from dm_common.values import parameter, real, text, whole
+from dm_simulation.mirror.hysteresis import LAWS, Hysteresis
 from dm_simulation.mirror.zernike import Array
 
 #: Time constants of the part of a loop that lags behind fast moves, s, and how many of them a decade holds.
@@ -20,45 +21,36 @@ DRIFT_PERIODS_S = np.array([86400.0, 7 * 3600.0, 3600.0])
 
 @dataclass(frozen=True)
 class PiezoConfig:
-    """Properties of the stacks. Spreads are standard deviations between them, cut at three.
+    """Properties of the stacks. Spreads are standard deviations between them, cut at three."""
 
-    Attributes:
-        stroke: base displacement from signal -1 to +1, m.
-        gain_spread: of the relative gains.
-        law, hysteresis: see :class:`dm_simulation.mirror.hysteresis.Hysteresis`.
-        hysteresis_spread: of the relative openings of the loops.
-        creep: growth of a displacement step per decade of time, as a fraction of the step.
-        creep_spread: of the relative creep.
-        creep_fastest, creep_slowest, creep_per_decade: creep is that of first-order elements with time constants
-            between both, s, so many per decade. The sum of three follows log t to 1 % of the creep rate in between.
-        spectrum_spread: of the elements, common to all stacks, as a logarithm.
-        creep_position: relative change of creep from mid range to signal 1.
-        rate_dependence: share by which the loop widens with each decade of speed.
-        stiffening: share of half the stroke that is lost at signals -1 and +1, in squares.
-        drift: of the bases over a day, m.
-        swing: of the temperature about ROOM over a day, K.
-        warm_gain: relative change of all gains per K.
-        warm_base: standard deviation of what the bases go by per K, m.
-    """
-
-    stroke: float = 8e-6
-    gain_spread: float = 0.03
-    law: str = "prandtl_ishlinskii"
-    hysteresis: float = 0.10
-    hysteresis_spread: float = 0.0
-    creep: float = 0.01
-    creep_spread: float = 0.0
-    creep_fastest: float = 0.1
-    creep_slowest: float = 1e5
-    creep_per_decade: int = 3
-    spectrum_spread: float = 0.0
-    creep_position: float = 0.0
-    rate_dependence: float = 0.0
-    stiffening: float = 0.0
-    drift: float = 0.0
-    swing: float = 0.0
-    warm_gain: float = 0.0
-    warm_base: float = 0.0
+    stroke: float = parameter(
+        real(8e-6, 0.0, 1e-3, "m"), "Stroke of a stack, displacement of its base, from signal -1 to +1."
+    )
+    gain_spread: float = parameter(real(0.03, 0.0, 0.3), "Standard deviation of relative gains.")
+    law: str = parameter(
+        text("prandtl_ishlinskii", choices=LAWS), "Hysteresis law; drawn_* = each actuator its own, by the seed."
+    )
+    hysteresis: float = parameter(real(0.10, 0.0, 0.3), "Widest loop opening over the full stroke.")
+    hysteresis_spread: float = parameter(real(0.0, 0.0, 0.3), "Spread of relative loop openings.")
+    creep: float = parameter(real(0.01, 0.0, 0.1), "Creep of a step per decade of time, as a fraction of the step.")
+    creep_spread: float = parameter(real(0.0, 0.0, 0.3), "Spread of relative creep.")
+    creep_fastest: float = parameter(
+        real(0.1, 1e-3, 1e6, "s"), "Time constant of the fastest of the first-order elements of creep."
+    )
+    creep_slowest: float = parameter(real(1e5, 1e-3, 1e7, "s"), "Time constant of the slowest element of creep.")
+    creep_per_decade: int = parameter(
+        whole(3, 1, 10), "Elements per decade of time; the sum of three follows log t to 1 % of the creep rate."
+    )
+    spectrum_spread: float = parameter(real(0.0, 0.0, 1.0), "Spread of elements, common to all stacks, as a logarithm.")
+    creep_position: float = parameter(real(0.0, -0.5, 0.5), "Relative change of creep from mid range to signal 1.")
+    rate_dependence: float = parameter(real(0.0, 0.0, 0.1), "Widening of loops per decade of speed.")
+    stiffening: float = parameter(
+        real(0.0, 0.0, 0.2), "Share of half the stroke lost at signals -1 and +1, in squares."
+    )
+    drift: float = parameter(real(0.0, 0.0, 1e-7, "m"), "Drift of the bases over a day.")
+    swing: float = parameter(real(0.0, 0.0, 20.0, "K"), "Swing of the temperature over a day, about 20 degC.")
+    warm_gain: float = parameter(real(0.0, -0.01, 0.01, "1/K"), "Relative change of all gains per kelvin.")
+    warm_base: float = parameter(real(0.0, 0.0, 1e-7, "m/K"), "What bases go by per kelvin, standard deviation.")
 
 
 #: Stacks of which each has a law, a loop and a creep of its own.

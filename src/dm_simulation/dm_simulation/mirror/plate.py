@@ -10,31 +10,36 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import eval_jacobi
 
+from dm_common.values import parameter, real, reals, switch, whole
 from dm_simulation.mirror import zernike
 from dm_simulation.mirror.zernike import Array, Term
 
 
 @dataclass(frozen=True)
 class PlateConfig:
-    """Geometry and material of the mirror, SI units.
+    """Geometry and material of the mirror."""
 
-    Actuators: at `actuator_x`, `actuator_y` (m), or where these are empty `actuators` of them: 1 in the centre, then
-    rings of 6, 12, 18, ... on a true hexagonal grid, numbered sequentially in angle inside a ring, from `start_angle`
-    (rad, from the x axis), anticlockwise unless `clockwise`.
-    """
-
-    diameter: float = 0.030
-    thickness: float = 2.4e-3
-    youngs_modulus: float = 74.5e9
-    poisson_ratio: float = 0.17
-    spring_stiffness: float = 2e7
-    actuators: int = 37
-    pitch: float = 4.3e-3
-    start_angle: float = 0.0
-    clockwise: bool = False
-    order: int = 36
-    actuator_x: tuple[float, ...] = ()
-    actuator_y: tuple[float, ...] = ()
+    diameter: float = parameter(real(0.030, 1e-3, 1.0, "m"), "Diameter of the faceplate.")
+    thickness: float = parameter(real(2.4e-3, 1e-5, 0.1, "m"), "Thickness of the faceplate.")
+    youngs_modulus: float = parameter(real(74.5e9, 1e6, 1e13, "Pa"), "Young's modulus.")
+    poisson_ratio: float = parameter(real(0.17, 0.0, 0.49), "Poisson's ratio.")
+    spring_stiffness: float = parameter(real(2e7, 1.0, 1e12, "N/m"), "Stiffness of one stack.")
+    actuators: int = parameter(
+        whole(37, 7, 1000),
+        "Actuators of the hexagonal pattern: 1 in the centre, then rings of 6, 12, 18, ..., numbered in angle.",
+    )
+    pitch: float = parameter(real(4.3e-3, 1e-4, 0.1, "m"), "Distance of neighbouring actuators.")
+    start_angle: float = parameter(
+        real(0.0, -7.0, 7.0, "rad"), "Angle of actuator 2, and of the first in every other ring, from the x axis."
+    )
+    clockwise: bool = parameter(switch(False), "Whether actuators are numbered clockwise in their rings.")
+    order: int = parameter(whole(36, 12, 60), "Radial order of the Ritz solution.")
+    actuator_x: tuple[float, ...] = parameter(
+        reals([], -1.0, 1.0, "m"), "Actuator positions, x, in place of the hexagonal pattern."
+    )
+    actuator_y: tuple[float, ...] = parameter(
+        reals([], -1.0, 1.0, "m"), "Actuator positions, y, in place of the hexagonal pattern."
+    )
 
 
 def actuator_positions(
