@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dm_msgs.msg import FocusRequest
 
 from dm_common.errors import Refusal
 from dm_common.limits import Limits
 from dm_common.optics.zernike import basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
-from dm_controller.planning.target import FocusTarget, TargetError
+from dm_controller.planning.target import REQUEST, FocusTarget, TargetError
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
@@ -123,7 +124,7 @@ def test_nothing_is_reachable_with_terms_beyond_the_stroke(mirror: LinearMirror)
 )
 def test_impossible_requests_are_refused_by_name(arguments: dict[str, object], words: str) -> None:
     with pytest.raises(Refusal, match=words):
-        FocusTarget(**arguments)  # type: ignore[arg-type]
+        REQUEST.check(FocusRequest(**arguments))
 
 
 def test_a_sphere_smaller_than_the_aperture_is_refused() -> None:

@@ -80,7 +80,7 @@ class Conditioning:
         """A degauss begins; returns the number of the run."""
         self._number += 1
         report = monitor.latest
-        degausses = report.applied.degausses if report is not None else 0
+        degausses = report.degausses if report is not None else 0
         self.run = Run(self._number, steps, now, degausses, monitor.starts)
         return self._number
 
@@ -108,7 +108,7 @@ class Conditioning:
         run, report = self.run, monitor.latest
         if run is None or run.answered is None or report is None:
             return False
-        return report.applied.degausses > run.degausses
+        return report.degausses > run.degausses
 
     def failure(self, monitor: DriverMonitor, timeout: float, now: float) -> Refusal | None:
         """The reason why the degauss under way will not end as it should; None = it may."""

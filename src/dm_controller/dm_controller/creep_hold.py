@@ -10,15 +10,16 @@ state says nothing of where the shape stands.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from dm_msgs.msg import ActuatorState
 
 from dm_common import Floats
 from dm_common.hysteresis.observer import ActuatorEstimate
 from dm_controller.driver_monitor import same_signals
-from dm_controller.focus_types import CommandedShape, DriverReport, Moment, SendCommand
+from dm_controller.focus_types import CommandedShape, Moment, SendCommand
 
 #: Shortest time between two corrections unless configured otherwise, s. Creep follows the logarithm of time: it does as
 #: much from 0.05 to 0.5 s as from 1 to 10 s.
@@ -66,7 +67,7 @@ class CreepHold:
         if self.shape is not None and self.shape.held:
             self.shape.held, self.ended = False, reason
 
-    def driver_requested(self, requested: Floats, now: float) -> None:
+    def driver_requested(self, requested: Sequence[float] | Floats, now: float) -> None:
         """What the driver reports as its last request (N,): the hold ends when it is another's."""
         shape = self.shape
         if shape is None or same_signals(requested, shape.sent.command.signals):
@@ -75,19 +76,19 @@ class CreepHold:
             self.end("another command came")
 
     def command(
-        self, report: DriverReport | None, estimate: Callable[[float], ActuatorEstimate], now: Moment
+        self, report: ActuatorState | None, estimate: Callable[[float], ActuatorEstimate], now: Moment
     ) -> SendCommand | None:
         """What is due for the shape by the driver's last report; None = nothing yet.
 
         `estimate` gives the actuators at a time, s.
         """
         shape = self.shape
-        if shape is None or not shape.held or report is None or report.applied.moving:
+        if shape is None or not shape.held or report is None or report.moving:
             return None
         if report.holder not in ("", shape.sent.command.holder):
             return None  # goes on afterwards, if they leave the shape as it is
         signals = self.correction(estimate(now.time), now.time)
-        return None if signals is None else shape.send_on(signals, now, report.applied.turns)
+        return None if signals is None else shape.send_on(signals, now, report.turns)
 
     def correction(self, estimate: ActuatorEstimate, now: float) -> Floats | None:
         """The next command (N,) at `now` (s), the mirror being at rest in the state `estimate`; None = not yet."""

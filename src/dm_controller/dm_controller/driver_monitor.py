@@ -7,16 +7,17 @@ old here, by the steady clock, and a command that no report confirms is reported
 import math
 import statistics
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState
+from dm_msgs.msg import ActuatorState, FocusRequest
 
+from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
-from dm_controller.focus_types import CommandedShape, DriverReport, Floats, Order, Progress, PublishState
-from dm_controller.planning.target import Request
+from dm_common.messages import stamp_ns
+from dm_controller.focus_types import CommandedShape, Order, Progress, PublishState
 
 #: A message's constants are properties of its class, which take longer to look up.
 _ACTIVE = ActuatorState.STATE_ACTIVE
@@ -34,12 +35,12 @@ SAME_SIGNAL = 1e-9
 SUPERSEDED = Progress(failed=Refusal(ErrorCode.PREEMPTED, "another command took over"))
 
 
-def same_signals(one: Floats, other: Floats) -> bool:
-    """Whether two commands are the same one."""
-    return one.shape == other.shape and float(np.abs(one - other).max(initial=0.0)) <= SAME_SIGNAL
+def same_signals(one: Sequence[float] | Floats, other: Floats) -> bool:
+    """Whether two commands (N,) are the same one."""
+    return len(one) == len(other) and float(np.abs(np.asarray(one) - other).max(initial=0.0)) <= SAME_SIGNAL
 
 
-def _not_active(report: DriverReport) -> Refusal:
+def _not_active(report: ActuatorState) -> Refusal:
     """That the driver takes no commands, by the code that it answers them with itself."""
     reason = f": {report.message}" if report.message else ""
     if report.driver_state == ActuatorState.STATE_LINK_LOST:
@@ -65,7 +66,7 @@ class DriverMonitor:
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
         self.shape: CommandedShape | None = None
-        self.latest: DriverReport | None = None
+        self.latest: ActuatorState | None = None
         self.starts = 0
         self.open_until = -math.inf
         self.gone = ""
@@ -82,7 +83,7 @@ class DriverMonitor:
         self.gone = reason
         self._trust()  # a parameter may have changed, too
 
-    def observe(self, report: DriverReport, now: float) -> bool:
+    def observe(self, report: ActuatorState, now: float) -> bool:
         """Take the driver's next report; returns whether the latency is known from now on."""
         before, self.latest, self._heard = self.latest, report, now
         self.gone = ""  # who reports lives
@@ -93,9 +94,10 @@ class DriverMonitor:
             return False
         sent = self.shape.sent
         sent.confirmed = same_signals(report.requested, sent.command.signals)
-        seconds = 1e-9 * (report.stamp_ns - sent.command.stamp_ns)
+        written = stamp_ns(report.header.stamp)
+        seconds = 1e-9 * (written - sent.command.stamp_ns)
         # A driver that was active before the command was sent may have it on the way.
-        sent.lost |= anew and (report.driver_state != _ACTIVE or report.stamp_ns > sent.command.stamp_ns)
+        sent.lost |= anew and (report.driver_state != _ACTIVE or written > sent.command.stamp_ns)
         if not sent.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
             return False
         self._latencies.append(seconds)
@@ -132,7 +134,7 @@ class DriverMonitor:
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
         return None
 
-    def check(self, request: Request, now: float) -> None:
+    def check(self, request: FocusRequest, now: float) -> None:
         """Raise what `refusal` gives, or that somebody else holds the mirror and `request` does not take it over."""
         if (refusal := self.refusal(now)) is not None:
             raise refusal
@@ -181,12 +183,12 @@ class DriverMonitor:
         if silent := self.silent(now):
             return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent))
         gap = share = 0.0
-        if report is not None and report.requested.shape == report.applied.signals.shape == signals.shape:
-            gap = float(np.abs(report.applied.signals - signals).max())
+        if report is not None and len(report.requested) == len(report.applied) == len(signals):
+            gap = float(np.abs(np.asarray(report.applied) - signals).max())
             order.gap = max(order.gap, gap)
             share = 1.0 - gap / order.gap if order.gap else 1.0
             ours = any(same_signals(report.requested, own) for own in (signals, self.shape.sent.command.signals))
-            if ours and not report.applied.moving:
+            if ours and not report.moving:
                 return Progress(share=1.0, remaining=gap, stands=True)
             if order.taken and not ours:
                 return SUPERSEDED

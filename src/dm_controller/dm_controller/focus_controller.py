@@ -6,18 +6,20 @@ out the effects in the order given.
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
+import numpy as np
 from dm_msgs.msg import ActuatorState, FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
+from dm_common.messages import applied_from, stamp_ns
 from dm_controller.conditioning import Conditioning
 from dm_controller.creep_hold import CreepHold
 from dm_controller.driver_monitor import DriverMonitor
 from dm_controller.focus_types import (
     CommandedShape,
-    DriverReport,
     Effect,
     Log,
     Moment,
@@ -32,7 +34,7 @@ from dm_controller.focus_types import (
 from dm_controller.planning.active_calibration import NO_CALIBRATION, NO_TILT, ActiveCalibration, active_calibration
 from dm_controller.planning.choice import Degauss, PlanningContext, choose_move, unreachable
 from dm_controller.planning.planner import Move
-from dm_controller.planning.target import Request
+from dm_controller.planning.target import REQUEST, FocusTarget
 
 #: A message's constants are properties of its class, which take longer to look up.
 _ACTIVE, _CONDITIONED = ActuatorState.STATE_ACTIVE, FocusRequest.MODE_CONDITIONED
@@ -101,18 +103,16 @@ class FocusController:
         self.active, self.not_calibrated = None, refusal
         return [*self._degauss_ended(now, refusal), PublishCapabilities()]
 
-    def driver_report(self, report: DriverReport, now: Moment) -> list[Effect]:
+    def driver_report(self, report: ActuatorState, now: Moment) -> list[Effect]:
         """Take the driver's next report."""
         latency_learnt = self.monitor.observe(report, now.steady)
-        try:
-            self.observer.observe(report.applied)
-        except ValueError:
-            pass  # the observer says so as long as the history is unknown, and begins anew
+        with suppress(ValueError):  # the observer says so as long as the history is unknown, and begins anew
+            self.observer.observe(applied_from(report, now.time))
         if report.driver_state != _ACTIVE:
             self.hold.end("the driver is not active")
         elif self.hold.active:
             self.hold.driver_requested(report.requested, now.time)
-        self._at_rest = None if report.applied.moving else self.observer.estimate(now.time)
+        self._at_rest = None if report.moving else self.observer.estimate(now.time)
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
             self.active.planner.prepare(self._at_rest.state)
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
@@ -132,7 +132,7 @@ class FocusController:
 
     # --- requests ---
 
-    def request(self, request: Request, now: Moment, dry_run: bool = False) -> tuple[Order, list[Effect]]:
+    def request(self, request: FocusRequest, now: Moment, dry_run: bool = False) -> tuple[Order, list[Effect]]:
         """Judge a request and, unless it is refused or a dry run, send its command, or have the mirror degaussed first.
 
         The newest request wins.
@@ -140,7 +140,7 @@ class FocusController:
         self.requests += 1
         return self._attempt(Order(request, Outcome(request, now.ns), began=now.steady), now, dry_run)
 
-    def judge(self, request: Request, now: Moment, degaussed: int | None = None) -> Move:
+    def judge(self, request: FocusRequest, now: Moment, degaussed: int | None = None) -> Move:
         """The move that a request asks for, from the mirror as it is.
 
         Args:
@@ -150,10 +150,13 @@ class FocusController:
             Refusal: it cannot be carried out whatever the driver does: no calibration, too old, no such surface.
         """
         values, active = self._values, self.active
-        limit, age = values["request_age"], 1e-9 * (now.ns - request.stamp_ns)
-        if degaussed is None and limit and request.stamp_ns and not -limit <= age <= limit:
+        limit, stamp = values["request_age"], stamp_ns(request.header.stamp)
+        age = 1e-9 * (now.ns - stamp)
+        if degaussed is None and limit and stamp and not -limit <= age <= limit:
             raise Refusal(ErrorCode.STALE, f"header.stamp: the request is {age:.3f} s old; allowed: {limit:g} s")
-        target, settle, budget = request.target(), values["settle_time"], request.time_budget or values["time_budget"]
+        REQUEST.check(request)
+        target = FocusTarget(request.curvature, request.conic_constant, tuple(request.zernike))
+        settle, budget = values["settle_time"], request.time_budget or values["time_budget"]
         if active is None:
             raise self.not_calibrated
         estimate = self._at_rest or self.observer.estimate(now.time, active.planner.slew_rate)
@@ -292,6 +295,6 @@ class FocusController:
         self.hold.end("the move was cancelled")
         shape.kept = False
         effects: list[Effect] = [*self.monitor.settled("it was cancelled before the driver confirmed it")]
-        if report is not None and report.applied.signals.size:
-            effects.append(shape.send_on(report.applied.signals, now))
+        if report is not None and len(report.applied):
+            effects.append(shape.send_on(np.array(report.applied), now))
         return effects

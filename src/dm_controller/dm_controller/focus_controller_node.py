@@ -32,7 +32,7 @@ from dm_common.ros.parameters import frame_id
 from dm_common.ros.qos import GONE, LEASE_S
 from dm_controller.focus_actions import DegaussClient, FocusServices, MoveFocusAction
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
-from dm_controller.focus_messages import capabilities_message, driver_report_from, health, state_message
+from dm_controller.focus_messages import capabilities_message, health, state_message
 from dm_controller.focus_parameters import PARAMETERS
 from dm_controller.focus_types import (
     Effect,
@@ -46,7 +46,6 @@ from dm_controller.focus_types import (
 )
 from dm_controller.forecast import ForecastClient
 from dm_controller.loop_actions import LoopHost, serve_loops
-from dm_controller.planning.target import Request
 
 #: How often the estimate of the actuators is published while the mirror moves, s of wall time.
 ESTIMATE_PERIOD_S = 0.25
@@ -161,7 +160,7 @@ class FocusControllerNode(ManagedNode):
 
     def _on_actuator_state(self, message: ActuatorState) -> None:
         with self.controller() as (controller, now):
-            self._do(controller.driver_report(driver_report_from(message, now.time), now), now)
+            self._do(controller.driver_report(message, now), now)
 
     def _tick(self) -> None:
         with self.controller() as (controller, now):
@@ -237,9 +236,8 @@ class FocusControllerNode(ManagedNode):
 
     def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
         """Judge a request and, unless it is refused or a dry run, carry it out."""
-        request = Request.from_message(message)
         with self.controller() as (controller, now):
-            order, effects = controller.request(request, now, dry_run)
+            order, effects = controller.request(message, now, dry_run)
             self._do(effects, now)
         return order
 

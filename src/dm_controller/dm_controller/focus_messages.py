@@ -5,37 +5,20 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from dm_msgs.msg import ActuatorState, Calibration, Capabilities, FocusState, MirrorInfo
+from dm_msgs.msg import Calibration, Capabilities, FocusState, MirrorInfo
 
-from dm_common.messages import applied_from, doubles, stamp_ns, time_message
+from dm_common.messages import doubles, time_message
 from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import without_figures
 from dm_controller.driver_monitor import same_signals
 from dm_controller.focus_controller import FocusController
-from dm_controller.focus_types import DriverReport, Moment, Outcome
+from dm_controller.focus_types import Moment, Outcome
 from dm_controller.forecast import HysteresisShare
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
 
 #: What to do about an unknown history.
 CURE = "a degauss over the full range (action degauss, `./dm degauss`) makes it known"
-
-
-def driver_report_from(message: ActuatorState, heard: float) -> DriverReport:
-    """What a dm_msgs/ActuatorState reports, `heard` now (s)."""
-    applied = applied_from(message, heard)
-    assert applied.requested is not None
-    return DriverReport(
-        applied,
-        applied.requested,
-        stamp_ns(message.header.stamp),
-        message.driver_state,
-        message.sequence,
-        message.error_code,
-        message.message,
-        message.holder,
-        message.holding,
-    )
 
 
 def state_message(outcome: Outcome, values: Mapping[str, Any], share: HysteresisShare | None) -> FocusState:

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from dm_msgs.msg import FocusRequest
+
 from dm_common import Floats
 from dm_common.errors import Refusal
-from dm_common.hysteresis.observer import Applied
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.planner import Move, Planner
-from dm_controller.planning.target import Request
 
 
 class Moment(NamedTuple):
@@ -23,32 +23,6 @@ class Moment(NamedTuple):
     ns: int
     time: float
     steady: float
-
-
-@dataclass(frozen=True, eq=False)
-class DriverReport:
-    """What the driver says; fields as in dm_msgs/ActuatorState.
-
-    Attributes:
-        applied: what stands at the actuators, or is on its way; `requested` is given there, empty = nothing yet.
-        stamp_ns: of the last write.
-        driver_state: ActuatorState.STATE_ACTIVE or another of these.
-        sequence: of reports, rising while the driver runs.
-        error_code: why a command is not followed.
-        message: the same as a sentence.
-        holder: who holds the mirror; "" = nobody.
-        holding: since when, what for and how to end it, as a sentence.
-    """
-
-    applied: Applied
-    requested: Floats
-    stamp_ns: int
-    driver_state: int
-    sequence: int = 0
-    error_code: int = 0
-    message: str = ""
-    holder: str = ""
-    holding: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +41,7 @@ class Outcome:
         refusal: None = not refused.
     """
 
-    request: Request
+    request: FocusRequest
     stamp_ns: int
     active: ActiveCalibration | None = None
     move: Move | None = None
@@ -90,7 +64,7 @@ class Order:
         gap: largest distance from its shape seen, normalised.
     """
 
-    request: Request
+    request: FocusRequest
     outcome: Outcome
     pending: bool = False
     began: float = 0.0

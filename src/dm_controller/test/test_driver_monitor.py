@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dm_msgs.msg import ActuatorState
+from dm_msgs.msg import ActuatorState, FocusRequest
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.hysteresis.observer import Applied
+from dm_common.messages import doubles, time_message
 from dm_controller.driver_monitor import CONFIRM_S, DriverMonitor
-from dm_controller.focus_types import CommandedShape, DriverReport, Order, Outcome, SendCommand, Sent
+from dm_controller.focus_types import CommandedShape, Order, Outcome, SendCommand, Sent
 from dm_controller.planning.planner import Move
-from dm_controller.planning.target import FocusTarget, Request
+from dm_controller.planning.target import FocusTarget
 
 TIMEOUT = 2.0
 HERE, THERE = np.full(37, 0.1), np.full(37, 0.2)
@@ -21,10 +21,12 @@ HERE, THERE = np.full(37, 0.1), np.full(37, 0.2)
 BEGAN = 100.0
 
 
-def report(requested: np.ndarray = HERE, sequence: int = 1, **fields: Any) -> DriverReport:
+def report(requested: np.ndarray = HERE, sequence: int = 1, **fields: Any) -> ActuatorState:
     fields.setdefault("driver_state", ActuatorState.STATE_ACTIVE)
-    applied = Applied(0.0, requested, 0, None, 0, True, requested=requested)
-    return DriverReport(applied, requested, fields.pop("stamp_ns", 0), sequence=sequence, **fields)
+    stamp = time_message(fields.pop("stamp_ns", 0))
+    made = ActuatorState(requested=doubles(requested), applied=doubles(requested), sequence=sequence, **fields)
+    made.header.stamp = stamp
+    return made
 
 
 def command(driver: DriverMonitor, signals: np.ndarray, order: Order | None) -> None:
@@ -38,28 +40,28 @@ def command(driver: DriverMonitor, signals: np.ndarray, order: Order | None) -> 
 def monitor(timeout: float = TIMEOUT) -> DriverMonitor:
     made = DriverMonitor({"driver_timeout": timeout})
     made.observe(report(), BEGAN)
-    request = Request(curvature=0.01)
+    request = FocusRequest(curvature=0.01)
     command(made, THERE, Order(request, Outcome(request, 0)))
     return made
 
 
 def test_a_driver_that_never_reported_is_unavailable() -> None:
     with pytest.raises(Refusal, match="is the driver running"):
-        DriverMonitor({"driver_timeout": TIMEOUT}).check(Request(), BEGAN)
+        DriverMonitor({"driver_timeout": TIMEOUT}).check(FocusRequest(), BEGAN)
 
 
 @pytest.mark.parametrize(("timeout", "refused"), [(TIMEOUT, True), (0.0, False)])
 def test_reports_grow_old(timeout: float, refused: bool) -> None:
     driver = monitor(timeout)
-    driver.check(Request(), BEGAN + TIMEOUT)
+    driver.check(FocusRequest(), BEGAN + TIMEOUT)
     later = BEGAN + TIMEOUT + 0.1
     assert bool(driver.silent(later)) == bool(driver.stopped(later)) == refused
     if refused:
         with pytest.raises(Refusal, match=r"has not reported for 2.1 s \(driver_timeout 2 s\)") as caught:
-            driver.check(Request(), later)
+            driver.check(FocusRequest(), later)
         assert caught.value.error_code == ErrorCode.DRIVER_UNAVAILABLE
     else:
-        driver.check(Request(), later)
+        driver.check(FocusRequest(), later)
 
 
 def test_a_command_that_is_confirmed_is_not_told_of() -> None:
@@ -78,7 +80,7 @@ def test_a_command_that_is_confirmed_is_not_told_of() -> None:
         (None, ErrorCode.DRIVER_UNAVAILABLE, "has not reported"),
     ],
 )
-def test_a_command_that_is_not_confirmed_is_told_of_once(last: DriverReport | None, code: int, text: str) -> None:
+def test_a_command_that_is_not_confirmed_is_told_of_once(last: ActuatorState | None, code: int, text: str) -> None:
     driver = monitor()
     assert driver.untaken(BEGAN) is None
     later = BEGAN + TIMEOUT + 0.1
@@ -150,4 +152,4 @@ def test_who_reports_after_a_lease_lapsed_is_not_dead() -> None:
     driver.observe(report(), BEGAN + 1.0)
     assert driver.silent(BEGAN + 1.5) == ""
     assert driver.age(BEGAN + 1.5) == 0.5
-    driver.check(Request(), BEGAN + 1.5)
+    driver.check(FocusRequest(), BEGAN + 1.5)

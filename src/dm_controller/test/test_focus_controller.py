@@ -21,17 +21,16 @@ from dm_msgs.msg import (
     Recipe,
     RecipeBook,
 )
+from std_msgs.msg import Header
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.hysteresis.creep_record import CreepRecord
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_common.hysteresis.observer import Applied
 from dm_common.messages import doubles, time_message
 from dm_common.optics.zernike import basis
 from dm_controller.focus_controller import FocusController
 from dm_controller.focus_messages import capabilities_message, health
 from dm_controller.focus_types import (
-    DriverReport,
     Effect,
     Log,
     Moment,
@@ -43,7 +42,6 @@ from dm_controller.focus_types import (
     StartDegauss,
 )
 from dm_controller.loop_actions import LoopHost
-from dm_controller.planning.target import Request
 
 ACTUATORS, POINTS, RADIUS = 37, 300, 11e-3
 #: Of the actuators, in aperture radii.
@@ -135,7 +133,7 @@ class Bench:
         self.time = 1000.0
         self.signals, self.requested = np.zeros(ACTUATORS), np.zeros(0)
         self.turns = self.degausses = self.sequence = 0
-        self.turned_at: np.ndarray | None = None
+        self.turned_at = np.zeros(0)
         self.history_known, self.obeys = False, True
         self.state = ActuatorState.STATE_ACTIVE
         self.holder = ""
@@ -175,37 +173,33 @@ class Bench:
 
     def report(self, moving: bool = False, message: str = "") -> None:
         self.sequence += 1
-        applied = Applied(
-            self.time,
-            self.signals,
-            self.turns,
-            self.turned_at,
-            self.degausses,
-            self.history_known,
-            moving,
-            self.requested,
-        )
-        report = DriverReport(
-            applied,
-            self.requested,
-            self.now.ns,
-            self.state,
-            self.sequence,
+        report = ActuatorState(
+            driver_state=self.state,
+            sequence=self.sequence,
+            applied=doubles(self.signals),
+            requested=doubles(self.requested),
+            turns=self.turns,
+            turned_at=doubles(self.turned_at),
+            degausses=self.degausses,
+            history_known=self.history_known,
+            moving=moving,
             message=message,
             holder=self.holder,
             holding=f"{self.holder} holds it",
         )
+        report.header.stamp = time_message(self.now.ns)
         self.do(self.controller.driver_report(report, self.now))
 
     def degauss(self) -> None:
         """The driver has degaussed, and says so."""
         self.signals = self.requested = np.zeros(ACTUATORS)
-        self.turns, self.degausses, self.turned_at, self.history_known = self.turns + 1, self.degausses + 1, None, True
+        self.turns, self.degausses, self.history_known = self.turns + 1, self.degausses + 1, True
+        self.turned_at = np.zeros(0)
         self.mirror = LAW.degaussed(self.mirror, self.time)
         self.report()
 
     def ask(self, curvature: float = 0.01, dry_run: bool = False, **fields: Any) -> Order:
-        order, effects = self.controller.request(Request(curvature, **fields), self.now, dry_run)
+        order, effects = self.controller.request(FocusRequest(curvature=curvature, **fields), self.now, dry_run)
         self.do(effects)
         return order
 
@@ -247,7 +241,7 @@ def test_it_needs_no_ros() -> None:
 
 
 def test_a_request_becomes_a_command_and_then_a_state(bench: Bench) -> None:
-    order, effects = bench.controller.request(Request(0.01), bench.now)
+    order, effects = bench.controller.request(FocusRequest(curvature=0.01), bench.now)
     assert [type(effect) for effect in effects] == [SendCommand]  # the state follows the driver's confirmation
     bench.do(effects)
     assert bench.outcomes == [order.outcome]
@@ -318,7 +312,7 @@ def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None
         ({"curvature": 9.0}, ErrorCode.UNREACHABLE, "reachable:"),
         ({"mode": "7"}, ErrorCode.UNKNOWN_NAME, "mode = '7': must be one of empty, auto, direct, conditioned"),
         ({"time_budget": -1.0}, ErrorCode.OUT_OF_RANGE, "time_budget = -1.0: must be"),
-        ({"stamp_ns": 1}, ErrorCode.STALE, "header.stamp"),
+        ({"header": Header(stamp=time_message(1))}, ErrorCode.STALE, "header.stamp"),
         ({"mode": CONDITIONED}, ErrorCode.NOT_SUPPORTED, "no recipes"),
     ],
 )

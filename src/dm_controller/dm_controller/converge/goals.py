@@ -10,7 +10,7 @@ from dm_common.optics.zernike import TERMS
 from dm_common.recipes import RecipeError, shape_text
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import SAME_SHAPE
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import TARGET, FocusTarget
 
 
 class UnreachableError(RecipeError):
@@ -29,7 +29,7 @@ def recipe_targets(
         error_max: largest coefficient error, m, that the model may leave.
 
     Raises:
-        Refusal: `zernike` is of another length.
+        Refusal: `zernike` is of another length, or a number is not finite.
         RecipeError: a shape asked for twice, naming it.
         UnreachableError: one out of reach.
         TargetError: no such surface exists over the aperture.
@@ -44,6 +44,8 @@ def recipe_targets(
         FocusTarget(curvature, conic_constant, tuple(added) if any(added) else ())
         for curvature, added in sorted(zip(map(float, curvatures), each, strict=True))
     ]
+    for target in targets:
+        TARGET.check(target)
     radius = loop.mirror.model.aperture_radius
     for one, other in pairwise(targets):
         if one.deviation(other, radius) <= SAME_SHAPE:

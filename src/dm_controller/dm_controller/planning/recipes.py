@@ -18,7 +18,7 @@ from dm_common import Floats
 from dm_common.optics.zernike import PISTON_TILT
 from dm_common.recipes import RecipeBook, RecipeError, shape_text, terms_text
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import TARGET, FocusTarget
 
 #: Surfaces whose coefficients differ less are the same shape, m.
 SAME_SHAPE = 3e-12
@@ -83,6 +83,7 @@ class Corrections:
 
     Raises:
         RecipeError: there are none.
+        Refusal: one is of no shape, naming its field.
 
     Attributes:
         amplitude: m, bound of the largest coefficient that a correction makes where no recipe is near.
@@ -93,6 +94,8 @@ class Corrections:
             raise RecipeError("there are no recipes; build them on the bench with `./dm recipes`")
         self._mirror, self._recipes = planner.mirror, (recipes := book.recipes)
         shapes = [FocusTarget(recipe.curvature, recipe.conic_constant, recipe.zernike) for recipe in recipes]
+        for shape in shapes:
+            TARGET.check(shape)
         self._surfaces = np.array([self._surface(shape) for shape in shapes])
         self._own = np.array([planner.mirror.command(shape)[0] for shape in shapes])
         self._corrections = np.array([recipe.effective for recipe in recipes]) - self._own

@@ -10,7 +10,6 @@ from dm_msgs.msg import FocusRequest
 from numpy.typing import NDArray
 
 from dm_common.errors import ErrorCode, Refusal
-from dm_common.messages import stamp_ns
 from dm_common.optics.conic import conic_coefficients, conic_sag
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_common.values import Fields, real, reals, text
@@ -24,14 +23,16 @@ class TargetError(Refusal):
 
 
 MODES = (FocusRequest.MODE_AUTO, FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED)
-#: What the fields of a target, and those of a request beside them, may be.
-TARGET = Fields({"curvature": real(0.0), "conic_constant": real(0.0), "zernike": reals([], sizes=(0, len(TERMS)))})
+_TARGET = {"curvature": real(0.0), "conic_constant": real(0.0), "zernike": reals([], sizes=(0, len(TERMS)))}
+#: What fields may be that a target is made of: those of a request, and those that it has itself.
 REQUEST = Fields(
     {
         "mode": text("", choices=("", *MODES)),
         "time_budget": real(0.0, 0.0, 1e9, "s", zero="as configured"),
+        **_TARGET,
     }
 )
+TARGET = Fields(_TARGET)
 
 
 @dataclass(frozen=True)
@@ -43,16 +44,12 @@ class FocusTarget:
         conic_constant: 0 = sphere, -1 = paraboloid (Eq. 2 in [1]).
         zernike: added sag [m], Born & Wolf terms in the order of [1] over the working aperture; empty = none.
 
-    Raises:
-        Refusal: NOT_FINITE, or INVALID_LENGTH of `zernike`.
+    Whoever takes these from elsewhere holds them against `TARGET` or `REQUEST` first.
     """
 
     curvature: float
     conic_constant: float = 0.0
     zernike: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        TARGET.check(self)
 
     def check_aperture(self, radius: float) -> None:
         """Raise TargetError when a conic of this curvature does not reach the edge of the aperture."""
@@ -106,46 +103,3 @@ class FocusTarget:
     def with_curvature(self, curvature: float) -> FocusTarget:
         """The same target at another curvature."""
         return FocusTarget(curvature, self.conic_constant, self.zernike)
-
-
-@dataclass(frozen=True)
-class Request:
-    """A wanted surface and the way to it; fields as in dm_msgs/FocusRequest.
-
-    Attributes:
-        curvature: 1/m.
-        conic_constant: 0 = sphere.
-        zernike: m, added sag, Born & Wolf; empty = none.
-        mode: one of MODES; "" = AUTO.
-        time_budget: s that AUTO may take; 0 = as configured.
-        stamp_ns: when it was made; 0 = now.
-        holder: who asks, where somebody holds the mirror; "" = nobody in particular.
-        take_over: even if somebody else holds it.
-    """
-
-    curvature: float = 0.0
-    conic_constant: float = 0.0
-    zernike: tuple[float, ...] = ()
-    mode: str = FocusRequest.MODE_AUTO
-    time_budget: float = 0.0
-    stamp_ns: int = 0
-    holder: str = ""
-    take_over: bool = False
-
-    def target(self) -> FocusTarget:
-        """The wanted surface. Raises Refusal naming a field that may not be as it is."""
-        REQUEST.check(self)
-        return FocusTarget(self.curvature, self.conic_constant, self.zernike)
-
-    @classmethod
-    def from_message(cls, message: FocusRequest) -> Request:
-        return cls(
-            message.curvature,
-            message.conic_constant,
-            tuple(message.zernike),
-            message.mode,
-            message.time_budget,
-            stamp_ns(message.header.stamp),
-            message.holder,
-            message.take_over,
-        )
