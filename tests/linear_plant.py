@@ -65,7 +65,7 @@ class LinearPlant:
         self.position = np.clip(self.position, signals - self.backlash, signals + self.backlash)
         return signals
 
-    def settle(self) -> bool:
+    def settle(self, dwell: float = 0.0, share: float = 1.0) -> bool:
         self.time += 0.5
         return True
 

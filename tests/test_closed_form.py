@@ -12,7 +12,7 @@ from dm_common.optics.zernike import TERMS
 from dm_controller.planning.fast_path import ClosedForm
 from dm_controller.planning.mirror_model import CalibratedMirror, Plan
 from dm_controller.planning.planner import Planner
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import FocusTarget, Shape
 from linear_mirror import RADIUS, LinearMirror, hexagon, make_mirror
 from perfect_calibration import perfect_model
 
@@ -31,7 +31,7 @@ def solved(mirror: CalibratedMirror, target: FocusTarget) -> Plan:
     coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
     sag = target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
     tilt = np.array(target.zernike[1:3] or (0.0, 0.0)) - target.curvature * model.aperture_radius * mirror.axis
-    return mirror.predict(target, mirror.solve(mirror.rows(coefficients, sag, tilt)))
+    return mirror.predict(target, mirror.solve(mirror.rows(Shape(coefficients, sag), tilt)))
 
 
 @pytest.mark.parametrize("curvature", [-0.05, 0.0, 0.02])

@@ -10,9 +10,9 @@ import pytest
 from dm_common.limits import Limits
 from dm_common.names import UnknownNameError
 from dm_common.optics.zernike import PISTON_TILT
-from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
+from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel, target_shape
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Shape, Solver, rms_sag, target_shape
+from dm_controller.solvers.base import Shape, Solver, rms_sag
 from dm_controller.solvers.least_squares import AZWreg, IterativeLearning, PseudoInverse
 from dm_controller.solvers.registry import DEFAULT
 from dm_simulation.mirror.plate import Plate
@@ -99,7 +99,7 @@ def test_the_pseudo_inverse_says_by_how_much_it_was_cut(model: InfluenceModel) -
 
 def test_the_pseudo_inverse_is_the_shortest_of_all_solutions(model: InfluenceModel) -> None:
     wanted = target_shape(FocusTarget(0.03), model)
-    change = (wanted - Shape(model.zernike_offset, model.sag_offset)).coefficients[PISTON_TILT:]
+    change = (wanted - model.offset).coefficients[PISTON_TILT:]
     shortest = np.linalg.lstsq(model.influence_zernike[PISTON_TILT:], change)[0]
     np.testing.assert_allclose(solver_of("pseudo_inverse", model).solve(wanted).signals, shortest, atol=1e-9)
 
@@ -149,7 +149,7 @@ def test_a_smaller_beta_learns_faster(mirror: LinearMirror, model: InfluenceMode
 
 def test_theta_is_sparse_and_its_patterns_make_the_change(model: InfluenceModel) -> None:
     solver = SparseSampling(model, limits())
-    change = target_shape(FocusTarget(0.02), model) - Shape(model.zernike_offset, model.sag_offset)
+    change = target_shape(FocusTarget(0.02), model) - model.offset
     theta = solver.theta(np.zeros(37), change)
     # A vertex of the linear programme has no more non-zero unknowns than equations.
     assert np.count_nonzero(np.abs(theta) > 1e-9 * np.abs(theta).max()) <= len(model.zernike_offset) - PISTON_TILT

@@ -27,9 +27,9 @@ from dm_calibration.procedure.procedure import Progress
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
-from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel, target_shape
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Solver, target_shape
+from dm_controller.solvers.base import Solver
 from dm_controller.solvers.least_squares import PseudoInverse
 from dm_tools.verify import SurfaceError, surface_error
 from studies.comparison.simulated_bench import Floats, SimulatedBench, SimulationConfig, influence_model, plan_steps

@@ -33,9 +33,9 @@ from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.converge.closed_loop import Creep, LoopOptions, converge
-from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel, response, target_shape
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag
 from studies.comparison.simulated_bench import SimulatedBench, influence_model
 from studies.paper.hysteresis_control import HysteresisControl
 from studies.paper.regressions import fit_of
@@ -291,7 +291,7 @@ def fitting_limit(samples: Samples, target: FocusTarget) -> tuple[float, float]:
     wanted = target_shape(target, solver.model)
     signals = solver.solve(wanted).signals
     model = solver.model
-    left = Shape(model.influence_zernike @ signals, model.influence_sag @ signals) + solver.offset - wanted
+    left = response(model, signals) + solver.offset - wanted
     return rms_sag(left, model), left.max_zernike
 
 

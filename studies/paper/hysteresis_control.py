@@ -14,7 +14,7 @@ import numpy as np
 
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.hysteresis.observer import HysteresisTracker
-from dm_controller.planning.mirror_model import CalibratedMirror
+from dm_controller.planning.mirror_model import CalibratedMirror, response
 from dm_controller.planning.planner import HysteresisFigures, Planner
 from dm_controller.solvers.base import MISS, Floats, Shape, Solver, measured_shape
 from studies.comparison.simulated_bench import SimulatedBench
@@ -90,7 +90,7 @@ class HysteresisControl:
             taken = self._bench.measure(f"converge {number + 1}")
             reached = self._effective()
             moved = np.zeros_like(reached) if before is None else reached - before
-            change = Shape(model.influence_zernike @ moved, model.influence_sag @ moved)
+            change = response(model, moved)
             error = estimate.update(measured_shape(taken.coefficients, taken.sag, model) - wanted, change)
             before = reached
             effective = self._solver.correct(reached, error).signals

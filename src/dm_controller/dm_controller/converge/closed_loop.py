@@ -19,18 +19,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.creep_record import rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.measurement import Measurement
+from dm_common.measurement import Bench
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
-from dm_controller.planning.mirror_model import InfluenceModel
+from dm_controller.planning.mirror_model import InfluenceModel, response, target_shape
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, response, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, Solver, measured_shape, rms_sag
 
 #: Bounds of the factor on a correction that the watched response may ask for.
 SCALE_MIN, SCALE_MAX = 0.6, 1.5
@@ -41,19 +40,6 @@ DAMPING_MIN = 0.1
 #: The best command is written again at the end when the last was so much worse. Nearer ones are the same but for noise,
 #: and going back costs hysteresis.
 RESTORE_RATIO = 1.5
-
-
-class Plant(Protocol):
-    """What the loop drives; `dm_common.measurement.Bench` is one."""
-
-    def apply(self, signals: Floats) -> Floats:
-        """Command `signals` (N,), wait until they stand, return what was written (N,)."""
-
-    def settle(self) -> bool:
-        """Wait the settle time; False when cancelled meanwhile."""
-
-    def measure(self, label: str) -> Measurement:
-        """Take one map."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +167,7 @@ def response_ratio(asked: Shape, seen: Shape) -> float:
 def converge(
     solver: Solver,
     target: FocusTarget,
-    plant: Plant,
+    plant: Bench,
     options: LoopOptions | None = None,
     *,
     start: Floats | None = None,

@@ -10,32 +10,25 @@ re-measures them. In the end each recipe rests on its neighbours' maps too.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from dm_common.errors import Cancelled
 from dm_common.hysteresis.model import HysteresisState
+from dm_common.measurement import Bench
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, shape_text
-from dm_controller.converge.closed_loop import Plant
 from dm_controller.converge.defects import Defects, mean_of
 from dm_controller.converge.goals import UnreachableError
+from dm_controller.planning.mirror_model import response, target_shape
 from dm_controller.planning.planner import Planner
 from dm_controller.planning.recipes import Corrections
 from dm_controller.planning.target import FocusTarget
-from dm_controller.solvers.base import Floats, Shape, measured_shape, response, rms_sag, target_shape
+from dm_controller.solvers.base import Floats, Shape, measured_shape, rms_sag
 
 #: Effective signals that limits deny count from here on.
 MISS_IGNORED = 1e-3
 #: Maps of a round go on until their mean is as sure as this share of the tolerance, but fewer do not tell their noise.
 SURE_SHARE, MAPS_MIN = 0.2, 3
-
-
-class ConditionedPlant(Plant, Protocol):
-    """What is driven."""
-
-    def degauss(self) -> None:
-        """Wipe the hysteresis over the full range and end at mid range."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +105,7 @@ class RecipeBuilder:
     def __init__(
         self,
         loop: Planner,
-        plant: ConditionedPlant,
+        plant: Bench,
         now: Callable[[], float],
         options: BuildOptions | None = None,
         *,
@@ -125,7 +118,6 @@ class RecipeBuilder:
         self._on_step, self._cancelled = on_step, cancelled
         limits, model = loop.mirror.limits, loop.mirror.model
         self._middle = limits.middle
-        self._offset = Shape(model.zernike_offset, model.sag_offset)
         actuators = model.influence_zernike.shape[1]
         self.state = state if state is not None else loop.law.demagnetised(actuators, now(), self._middle)
         self.maps = 0
@@ -180,12 +172,14 @@ class RecipeBuilder:
 
     def _solve(self, target: FocusTarget, near: Floats | None) -> Floats:
         """(N,) effective signals for `target` on a mirror with the defect at `near` (N,); None = without any."""
-        mirror, wanted = self._loop.mirror, target_shape(target, self._loop.mirror.model) - self._offset
+        mirror = self._loop.mirror
+        wanted = target_shape(target, mirror.model) - mirror.model.offset
         change = wanted if near is None else wanted - self._defects.at(near)
-        return mirror.solve(mirror.rows(change.coefficients, change.sag))
+        return mirror.solve(mirror.rows(change))
 
     def _predicted(self, effective: Floats) -> Shape:
-        return self._offset + response(self._loop.mirror.model, effective)
+        model = self._loop.mirror.model
+        return model.offset + response(model, effective)
 
     def _go(self, target: FocusTarget, aim: Floats) -> tuple[Floats, Floats]:
         """Condition the mirror and move it to the effective signals `aim`.

@@ -24,7 +24,7 @@ from dm_common.limits import Limits
 from dm_common.optics.conic import disc_coefficients
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
 from dm_controller.planning.mirror_model import CalibratedMirror
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import FocusTarget, Shape
 
 #: Error of an effective signal from which a piece is not used: a third of a DAC step. Preisach laws stay a hundred
 #: times below, the tables of Duhem operators reach half of it.
@@ -78,9 +78,10 @@ class ClosedForm:
         tilt = np.zeros((2, coefficients.shape[1]))
         tilt[:, 1] = -2 / self._radius * mirror.axis  # by the slope of the sphere, whose amplitude is c r^2 / 2
         tilt[:, 1 + ORDERS + 1 : 1 + ORDERS + PISTON_TILT] = np.eye(2)
-        signals = mirror.unlimited(coefficients, sag, tilt)
+        signals = mirror.unlimited(Shape(coefficients, sag), tilt)
+        errors = (model.influence_zernike @ signals - coefficients)[PISTON_TILT:]
         self._signals = len(signals)
-        self._all_terms = np.ascontiguousarray(np.vstack([signals, mirror.coefficient_errors(signals, coefficients)]))
+        self._all_terms = np.ascontiguousarray(np.vstack([signals, errors]))
         self._conic_only = np.ascontiguousarray(self._all_terms[:, : 1 + ORDERS])
 
     def find(self, target: FocusTarget) -> tuple[Floats, float] | None:

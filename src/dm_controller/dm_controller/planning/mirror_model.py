@@ -12,7 +12,7 @@ from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
 from dm_common.limits import Limits
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis, curvature_of_defocus, tilt_influence
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import FocusTarget, Shape
 
 #: How much more a coefficient counts than the sag beyond the terms. Large enough to act as an equality while the limits
 #: permit one (coefficients match to 1e-4 of the rest), small enough to stay well conditioned when they do not.
@@ -71,6 +71,26 @@ class InfluenceModel:
                 raise ValueError(f"calibration: {name} holds values that are not finite")
         if not self.aperture_radius > 0:
             raise ValueError(f"calibration: aperture_radius = {self.aperture_radius:g}: must be positive")
+
+    @property
+    def offset(self) -> Shape:
+        """The surface at zero signals."""
+        return Shape(self.zernike_offset, self.sag_offset)
+
+
+def response(model: InfluenceModel, change: Floats) -> Shape:
+    """What a change of effective signals (N,) does to the surface, as the model says."""
+    return Shape(model.influence_zernike @ change, model.influence_sag @ change)
+
+
+def target_shape(target: FocusTarget, model: InfluenceModel) -> Shape:
+    """The wanted surface over the aperture of `model`.
+
+    Raises:
+        TargetError: no such surface exists over the aperture.
+    """
+    radius = model.aperture_radius
+    return Shape(target.coefficients(radius), target.sag(model.sample_x, model.sample_y, radius))
 
 
 @dataclass(frozen=True)
@@ -156,7 +176,7 @@ class CalibratedMirror:
             places = np.array([model.actuator_x, model.actuator_y]) / model.aperture_radius
             tilt = tilt_influence(model.influence_zernike[1:PISTON_TILT], places, response)
             self.tilt = tilt if np.abs(tilt).max() > LEAST_TILT * response.max() else None
-        self.matrix = self.rows(model.influence_zernike, model.influence_sag, self.tilt)
+        self.matrix = self.rows(Shape(model.influence_zernike, model.influence_sag), self.tilt)
         self.ridge = (RIDGE_SHARE * float(np.median(response))) ** 2
         self._programme = BoundedProgramme(self.matrix, limits, ridge=self.ridge)
         self._range_cached = lru_cache(maxsize=64)(self._find_range)
@@ -167,24 +187,23 @@ class CalibratedMirror:
         result: Floats = weighted - removed @ (removed.T @ weighted)
         return result
 
-    def rows(self, coefficients: Floats, sag: Floats, tilt: Floats | None = None) -> Floats:
+    def rows(self, shape: Shape, tilt: Floats | None = None) -> Floats:
         """What the programme sees of a surface: weighted coefficients beyond tilt over weighted sag beyond the terms.
 
         Where tilt is held, two rows above them are the wanted one, whatever tilt was measured.
 
         Args:
-            coefficients: (K,) m, or (K, N), a surface in each column.
-            sag: (P,) or (P, N) m.
+            shape: the surface, or one in each column.
             tilt: (2,) or (2, N) m, wanted; None = as it is at zero signals.
 
         Returns:
             (R,) or (R, N); R = K - 3 + P, and 2 more where tilt is held.
         """
-        weighted = self._coefficient_rows @ coefficients[PISTON_TILT:]
+        weighted = self._coefficient_rows @ shape.coefficients[PISTON_TILT:]
         kept = np.zeros((0 if self.tilt is None else 2, *weighted.shape[1:]))
         if tilt is not None and self.tilt is not None:
             kept = TILT_WEIGHT * tilt
-        return np.concatenate([kept, weighted, self._reduce(sag, self._terms)])
+        return np.concatenate([kept, weighted, self._reduce(shape.sag, self._terms)])
 
     def solve(self, rows: Floats) -> Floats:
         """The signals (N,) inside the limits whose `matrix @ signals` comes nearest to `rows`.
@@ -208,13 +227,13 @@ class CalibratedMirror:
         Raises:
             TargetError: no such surface exists over the aperture.
         """
-        coefficients, sag = self._wanted(target)
-        signals = self.solve(self.rows(coefficients, sag, self._wanted_tilt(target)))
-        return signals, float(np.abs(self.coefficient_errors(signals, coefficients)).max())
+        wanted, tilt = self.wanted(target)
+        signals = self.solve(self.rows(wanted, tilt))
+        return signals, (response(self.model, signals) - wanted).max_zernike
 
-    def unlimited(self, coefficients: Floats, sag: Floats, tilt: Floats) -> Floats:
-        """Commands (N, M) for `rows` of coefficients (K, M), sag (P, M) and tilt (2, M), m, without any limit."""
-        return self._programme.unlimited(self.rows(coefficients, sag, tilt))
+    def unlimited(self, shape: Shape, tilt: Floats) -> Floats:
+        """Commands (N, M) for `rows` of a surface in each of M columns and of tilt (2, M), m, without any limit."""
+        return self._programme.unlimited(self.rows(shape, tilt))
 
     def predict(self, target: FocusTarget, signals: Floats) -> Plan:
         """What `signals` (N,) are expected to do when `target` is wanted.
@@ -223,44 +242,28 @@ class CalibratedMirror:
             TargetError: no such surface exists over the aperture.
         """
         model = self.model
-        coefficients, sag = self._wanted(target)
-        rms = float(np.linalg.norm(self._reduce(model.influence_sag @ signals - sag, self._tilt_free)))
-        largest = float(np.abs(self.coefficient_errors(signals, coefficients)).max())
+        error = response(model, signals) - self.wanted(target)[0]
+        rms = float(np.linalg.norm(self._reduce(error.sag, self._tilt_free)))
         lower, upper = rms_bounds(rms, model.held_out_rms)
         return Plan(
             signals=signals,
             rms=rms,
             rms_lower=lower,
             rms_upper=upper,
-            max_zernike=largest,
-            max_zernike_upper=largest + model.held_out_max_zernike,
+            max_zernike=error.max_zernike,
+            max_zernike_upper=error.max_zernike + model.held_out_max_zernike,
             saturated=self.limits.at_limit(signals),
         )
 
-    def wanted_rows(self, target: FocusTarget) -> Floats:
-        """(R,) `rows` of `target` less those at zero signals.
+    def wanted(self, target: FocusTarget) -> tuple[Shape, Floats]:
+        """The surface of `target` less that at zero signals; and its own tilt less its sphere's on the axis, (2,) m.
 
         Raises:
             TargetError: no such surface exists over the aperture.
         """
-        return self.rows(*self._wanted(target), self._wanted_tilt(target))
-
-    def _wanted(self, target: FocusTarget) -> tuple[Floats, Floats]:
-        """Coefficients (K,) and sag (P,) of `target` less those at zero signals, m."""
         model = self.model
-        coefficients = target.coefficients(model.aperture_radius) - model.zernike_offset
-        return coefficients, target.sag(model.sample_x, model.sample_y, model.aperture_radius) - model.sag_offset
-
-    def _wanted_tilt(self, target: FocusTarget) -> Floats:
-        """Tilt (2,) of `target`, m: its own, less the slope that its sphere has on the axis."""
         own = np.array(target.zernike[1:PISTON_TILT]) if target.zernike else np.zeros(2)
-        tilt: Floats = own - target.curvature * self.model.aperture_radius * self.axis
-        return tilt
-
-    def coefficient_errors(self, signals: Floats, coefficients: Floats) -> Floats:
-        """Coefficient errors beyond tilt, m: (K - 3,) of signals (N,), or columns of each."""
-        errors: Floats = self.model.influence_zernike[PISTON_TILT:] @ signals - coefficients[PISTON_TILT:]
-        return errors
+        return target_shape(target, model) - model.offset, own - target.curvature * model.aperture_radius * self.axis
 
     def reachable_range(self, target: FocusTarget, tolerance: float) -> tuple[float, float]:
         """Smallest and largest curvature [1/m] with the target's conic constant and added terms that the limits permit.

@@ -192,7 +192,7 @@ class Planner:
         inverted = invert(self.law, at, aim, limits.low, limits.high, ahead)
         if np.abs(inverted.missed).max() <= MISSED_MAX and limits.allow_neighbours(inverted.signals):
             return inverted.signals, None
-        wanted = self.mirror.matrix @ aim if target is None else self.mirror.wanted_rows(target)
+        wanted = self.mirror.matrix @ aim if target is None else self.mirror.rows(*self.mirror.wanted(target))
         nearest = self._constrained.solve(at, wanted, ahead, inverted.signals)
         return nearest.signals, aim - nearest.effective
 

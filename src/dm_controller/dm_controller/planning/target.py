@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from dm_msgs.msg import FocusRequest
-from numpy.typing import NDArray
 
+from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.optics.conic import conic_coefficients, conic_sag
 from dm_common.optics.zernike import PISTON_TILT, TERMS, basis
@@ -33,6 +33,33 @@ REQUEST = Fields(
     }
 )
 TARGET = Fields(_TARGET)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A surface, or a difference of two, as calibrations describe it.
+
+    Attributes:
+        coefficients: (K,) Born & Wolf, m.
+        sag: (P,) at the calibration's sampling points, m, finite.
+    """
+
+    coefficients: Floats
+    sag: Floats
+
+    def __add__(self, other: Shape) -> Shape:
+        return Shape(self.coefficients + other.coefficients, self.sag + other.sag)
+
+    def __sub__(self, other: Shape) -> Shape:
+        return Shape(self.coefficients - other.coefficients, self.sag - other.sag)
+
+    def __neg__(self) -> Shape:
+        return Shape(-self.coefficients, -self.sag)
+
+    @property
+    def max_zernike(self) -> float:
+        """Largest coefficient beyond tilt, m."""
+        return float(np.abs(self.coefficients[PISTON_TILT:]).max())
 
 
 @dataclass(frozen=True)
@@ -61,7 +88,7 @@ class FocusTarget:
                 f"(1 + conic_constant) (curvature x radius)^2 = {reach:g} must be below 1"
             )
 
-    def coefficients(self, radius: float) -> NDArray[np.float64]:
+    def coefficients(self, radius: float) -> Floats:
         """(21,) Born & Wolf coefficients of the sag over an aperture of `radius` [m]."""
         self.check_aperture(radius)
         result = np.array(conic_coefficients(self.curvature, self.conic_constant, radius), dtype=float)
@@ -69,10 +96,10 @@ class FocusTarget:
             result += self.zernike
         return result
 
-    def sag(self, x: NDArray[np.float64], y: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    def sag(self, x: Floats, y: Floats, radius: float) -> Floats:
         """Sag [m] at points of the unit disc of an aperture of `radius` [m]."""
         self.check_aperture(radius)
-        result: NDArray[np.float64] = conic_sag(x * radius, y * radius, self.curvature, self.conic_constant)
+        result: Floats = conic_sag(x * radius, y * radius, self.curvature, self.conic_constant)
         if self.zernike:
             result = result + basis(x, y) @ np.asarray(self.zernike)
         return result

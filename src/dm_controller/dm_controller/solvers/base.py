@@ -19,37 +19,10 @@ from dm_common.optics.piston_tilt import remove_piston_tilt
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, basis
 from dm_controller.planning.mirror_model import InfluenceModel
-from dm_controller.planning.target import FocusTarget
+from dm_controller.planning.target import Shape
 
 #: Share by which an actuator may miss a move: hysteresis of such piezos ([1], section 1: about 10 %).
 MISS = 0.10
-
-
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """A surface, or a difference of two, as calibrations describe it.
-
-    Attributes:
-        coefficients: (K,) Born & Wolf, m.
-        sag: (P,) at the calibration's sampling points, m, finite.
-    """
-
-    coefficients: Floats
-    sag: Floats
-
-    def __add__(self, other: Shape) -> Shape:
-        return Shape(self.coefficients + other.coefficients, self.sag + other.sag)
-
-    def __sub__(self, other: Shape) -> Shape:
-        return Shape(self.coefficients - other.coefficients, self.sag - other.sag)
-
-    def __neg__(self) -> Shape:
-        return Shape(-self.coefficients, -self.sag)
-
-    @property
-    def max_zernike(self) -> float:
-        """Largest coefficient beyond tilt, m."""
-        return float(np.abs(self.coefficients[PISTON_TILT:]).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +42,6 @@ class Command:
 def points_of(model: InfluenceModel) -> SamplePoints:
     """The sampling points of a model."""
     return SamplePoints(model.sample_x, model.sample_y, model.sample_weight)
-
-
-def response(model: InfluenceModel, change: Floats) -> Shape:
-    """What a change of effective signals (N,) does to the surface, as the model says."""
-    return Shape(model.influence_zernike @ change, model.influence_sag @ change)
-
-
-def target_shape(target: FocusTarget, model: InfluenceModel) -> Shape:
-    """The wanted surface over the aperture of `model`.
-
-    Raises:
-        TargetError: no such surface exists over the aperture.
-    """
-    radius = model.aperture_radius
-    return Shape(target.coefficients(radius), target.sag(model.sample_x, model.sample_y, radius))
 
 
 def measured_shape(coefficients: Floats, sag: Floats, model: InfluenceModel) -> Shape:
@@ -124,7 +82,7 @@ class Solver(ABC):
         """
         self.model = model
         self.limits = limits
-        self.offset = Shape(model.zernike_offset, model.sag_offset)
+        self.offset = model.offset
 
     def solve(self, wanted: Shape) -> Command:
         """Signals for a surface, without measuring (open loop).

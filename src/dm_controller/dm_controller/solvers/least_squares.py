@@ -142,11 +142,11 @@ class Bounded(Solver):
     def _signals(self, start: Floats, change: Shape) -> Floats:
         # The programme bounds the signals themselves, so a change is asked for as the surface it leads to.
         mirror = self._mirror
-        return mirror.solve(mirror.matrix @ start + mirror.rows(change.coefficients, change.sag))
+        return mirror.solve(mirror.matrix @ start + mirror.rows(change))
 
     def correct(self, signals: Floats, error: Shape) -> Command:
         """As in the base class, with moves priced by what the actuators miss of them."""
         self._check(error)
         self._check_signals(signals)
-        wanted = self._mirror.matrix @ signals - self._mirror.rows(error.coefficients, error.sag)
+        wanted = self._mirror.matrix @ signals - self._mirror.rows(error)
         return self.limited(self._correction.solve(np.concatenate([wanted, self._miss @ signals])))
