@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,11 +13,11 @@ from dm_msgs.srv import StoreRecipes
 from rclpy.node import Node
 
 from dm_common import Floats
-from dm_common.errors import MeasurementError
+from dm_common.errors import EXPECTED, ErrorCode, MeasurementError, error_code
 from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
-from dm_common.ros.worker import WorkerActionServer, WorkerGoal
+from dm_common.ros.worker import WorkerActionServer, WorkerGoal, wait_for_clock
 from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
@@ -26,6 +25,14 @@ from dm_controller.planning.target import FocusTarget
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
     from dm_controller.focus_controller_node import FocusControllerNode
+
+#: What requests are told while a goal of an action runs.
+BUSY = {
+    "converge": "a closed loop (action converge) is running",
+    "build_recipes": "recipes are being built (action build_recipes)",
+}
+#: How a goal ends, by its ErrorCode; "abort" with any other.
+OUTCOMES: dict[int, str] = {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "canceled"}
 
 
 class LoopHost:
@@ -69,45 +76,70 @@ class LoopBench(BenchServices):
         values: its parameters, LOOP_PARAMETERS among them.
 
     Attributes:
+        parameters: as given.
         host: what the node knows and can do.
     """
 
     def __init__(self, node: Node, values: Mapping[str, Any], host: LoopHost) -> None:
         super().__init__(node, loop_times(values))
-        self.host, self._parameters = host, values
+        self.host, self.parameters = host, values
         self._goal = threading.Lock()
         self._needed: qos.Liveliness | None = None
 
-    @contextmanager
-    def reserved(
-        self, handle: WorkerGoal, feedback: Any, asked: Any, text: str, needed: qos.Liveliness | None = None
-    ) -> Iterator[None]:
-        """Keep the bench for one goal: its cancellation ends waits, and its feedback says what is waited for.
+    def run(
+        self,
+        name: str,
+        handle: WorkerGoal,
+        feedback: Any,
+        asked: Any,
+        body: Callable[[], tuple[int, str]],
+        needed: qos.Liveliness | None = None,
+    ) -> tuple[str, int, str]:
+        """Outcome, ErrorCode and sentence of a goal of the action `name`, which has the bench for itself.
+
+        Its cancellation ends waits, and its feedback says what is waited for.
 
         Args:
             asked: says who asks, see `BenchServices.held`.
-            text: the answer to requests of others meanwhile.
+            body: carries the goal out.
             needed: a node that the goal needs besides driver and interferometer.
-
-        Raises:
-            Refusal: another goal has it, or somebody else holds the mirror.
         """
         busy = "a closed loop or a run of recipes is under way; cancel it first, or take the mirror over"
-        timeout = self._parameters["converge.driver_timeout"]
-        self.hold.wait_for(lambda: self._goal.acquire(blocking=False), asked, busy, timeout)
+        timeout = self.parameters["converge.driver_timeout"]
         try:
-            self._values, self._needed = loop_times(self._parameters), needed
-            self.settle_time = self._values["settle_time"]
-            self.cancelled = lambda: bool(handle.is_cancel_requested)
-            self.publish_waits(handle, feedback)
-            with self.held(asked, f"{text}; cancel it to end it"):
-                yield
-        finally:
-            self._goal.release()
+            self.hold.wait_for(lambda: self._goal.acquire(blocking=False), asked, busy, timeout)
+            try:
+                self._values, self._needed = loop_times(self.parameters), needed
+                self.settle_time = self._values["settle_time"]
+                self.cancelled = lambda: bool(handle.is_cancel_requested)
+                self.publish_waits(handle, feedback)
+                with self.held(asked, f"{BUSY[name]}; cancel it to end it"):
+                    code, text = body()
+            finally:
+                self._goal.release()
+        except EXPECTED as error:
+            code, text = error_code(error), str(error)
+        except TimeoutError as error:
+            code, text = ErrorCode.TIMEOUT, str(error)
+        # One line per severity: rclpy ties a severity to the line that logs.
+        if code == ErrorCode.OK:
+            self._node.get_logger().info(f"{name}: {text}")
+        else:
+            self._node.get_logger().warning(f"{name}: {text}")
+        return OUTCOMES.get(code, "abort"), code, text
 
     def _missing(self) -> str:
         needed = self._needed
         return super()._missing() or (needed.text if needed is not None and needed.missing() else "")
+
+    def check_ready(self) -> None:
+        """As of the driver, and wait until ROS time runs. Raises TimeoutError where it does not."""
+        super().check_ready()
+        wait_for_clock(self._node.get_clock())
+
+    def now(self) -> float:
+        """ROS time, s."""
+        return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def applied(self) -> Floats | None:
         """(N,) signals at which the driver says that the mirror stands; None = it does not say."""
@@ -116,11 +148,11 @@ class LoopBench(BenchServices):
 
     def degauss(self) -> None:
         """The condition that recipes begin with: the driver's own number of steps may be another."""
-        self._run_degauss(int(self._parameters["recipes.degauss_steps"]))
+        self._run_degauss(int(self.parameters["recipes.degauss_steps"]))
 
     def measure(self, label: str) -> Measurement:
         """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""
-        left = int(self._parameters["converge.measure_retries"])
+        left = int(self.parameters["converge.measure_retries"])
         while True:
             try:
                 return super().measure(label)
@@ -145,12 +177,12 @@ def serve_loops(node: Node, values: Mapping[str, Any], host: LoopHost) -> tuple[
     def converge(handle: WorkerGoal) -> tuple[str, Any]:
         from dm_controller.converge.converge_run import ConvergeRun
 
-        return ConvergeRun(node, values, bench).run(handle)
+        return ConvergeRun(bench).run(handle)
 
     def build_recipes(handle: WorkerGoal) -> tuple[str, Any]:
         from dm_controller.converge.recipe_run import RecipeRun
 
-        return RecipeRun(node, values, bench, store, calibration).run(handle)
+        return RecipeRun(bench, store, calibration).run(handle)
 
     return (
         WorkerActionServer(node, Converge, "converge", converge, fields=CONVERGE),

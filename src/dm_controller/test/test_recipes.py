@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -250,9 +250,9 @@ def test_recipes_whose_answer_was_lost_are_stored_again(monkeypatch: pytest.Monk
     monkeypatch.setattr(recipe_run.time, "sleep", lambda _duration: None)
     said: list[str] = []
     alive: Any = SimpleNamespace(wait_for_return=lambda _stop: None, since_now=lambda _served: lambda: "")
-    bench: Any = SimpleNamespace(waiting=said.append)
+    bench: Any = SimpleNamespace(waiting=said.append, parameters={})
     store: Any = SimpleNamespace(service_is_ready=lambda: True)
-    run = recipe_run.RecipeRun(cast(Any, None), {}, bench, store, alive)
+    run = recipe_run.RecipeRun(bench, store, alive)
     handle: Any = SimpleNamespace(is_cancel_requested=False)
     assert run._stored(handle, StoreRecipes.Request()) == (ErrorCode.OK, "stored")
     assert said == ["waiting: no answer within 10 s"]

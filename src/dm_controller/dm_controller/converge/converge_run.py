@@ -5,37 +5,30 @@ The host judges the request as for an open-loop move and knows calibration and m
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from dm_msgs.action import Converge
-from rclpy.node import Node
 
-from dm_common.errors import Cancelled, ErrorCode, Refusal
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles
-from dm_common.ros.worker import WorkerGoal, wait_for_clock
+from dm_common.ros.worker import WorkerGoal
 from dm_common.values import without_figures
 from dm_controller.converge.closed_loop import Creep, LoopOptions, LoopResult, LoopStep, StoppedLoop, converge
-from dm_controller.converge.goals import ending
 from dm_controller.loop_actions import LoopBench
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.registry import make_solver
-
-#: What requests are told meanwhile.
-BUSY = "a closed loop (action converge) is running"
 
 
 class ConvergeRun:
     """Carries out one goal; blocks, in the worker thread of the action.
 
     Args:
-        node: the hosting node.
-        values: its parameters, LOOP_PARAMETERS among them.
         bench: its host judges requests and knows the calibration in use.
     """
 
-    def __init__(self, node: Node, values: Mapping[str, Any], bench: LoopBench) -> None:
-        self._node, self._values, self._bench = node, values, bench
+    def __init__(self, bench: LoopBench) -> None:
+        self._values, self._bench = bench.parameters, bench
 
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
@@ -48,18 +41,13 @@ class ConvergeRun:
             feedback.step, feedback.residual_rms, feedback.max_zernike = step.map, step.rms, step.max_zernike
             handle.publish_feedback(feedback)
 
-        try:
-            with self._bench.reserved(handle, feedback, handle.request.request, BUSY):
-                outcome, error_code, message = self._judge(self._loop(handle.request, report))
-        except Exception as error:
-            outcome, error_code, message = ending(error)
-            if isinstance(error, Cancelled):
-                message = str(StoppedLoop(tuple(steps)))
-        # One line per severity: rclpy ties a severity to the line that logs.
-        if outcome == "succeed":
-            self._node.get_logger().info(f"converge: {message}")
-        else:
-            self._node.get_logger().warning(f"converge: {message}")
+        def body() -> tuple[int, str]:
+            return self._judge(self._loop(handle.request, report))
+
+        asked = handle.request.request
+        outcome, error_code, message = self._bench.run("converge", handle, feedback, asked, body)
+        if outcome == "canceled":
+            message = str(StoppedLoop(tuple(steps)))
         return outcome, _result(steps, error_code, message)
 
     def _loop(self, goal: Any, report: Callable[[LoopStep], None]) -> LoopResult:
@@ -68,24 +56,22 @@ class ConvergeRun:
         target = bench.host.target(goal.request)
         solver = self._solver(goal.method)
         bench.check_ready()
-        clock = self._node.get_clock()
-        wait_for_clock(clock)
-        bench.settle_time = float(self._values["converge.settle_time"])
-        creep = self._creep(lambda: clock.now().nanoseconds * 1e-9)
         try:
-            return converge(solver, target, bench, options, creep=creep, on_step=report, cancelled=bench.cancelled)
+            return converge(
+                solver, target, bench, options, creep=self._creep(), on_step=report, cancelled=bench.cancelled
+            )
         except Refusal as error:
             raise Refusal(error.error_code, f"{error}; the mirror holds the last command") from error
 
-    def _creep(self, now: Callable[[], float]) -> Creep | None:
+    def _creep(self) -> Creep | None:
         """By the law in use and what is known of the actuators; without a law of creep, by the configured rate."""
         bench, law = self._bench, self._bench.host.active_calibration().planner.law
         if law.creep_rate:
             state = bench.host.hysteresis()
-            return Creep(law, state, now) if state is not None else None
+            return Creep(law, state, bench.now) if state is not None else None
         # A mirror that is not known to stand somewhere gives no move to foresee creep from.
         applied = bench.applied()
-        return None if applied is None else Creep.of_rate(self._values["converge.creep"], applied, now)
+        return None if applied is None else Creep.of_rate(self._values["converge.creep"], applied, bench.now)
 
     def _options(self, goal: Any) -> LoopOptions:
         """What the goal asks for, 0 = configured."""
@@ -98,17 +84,17 @@ class ConvergeRun:
         weights = active.calibration.region_weights
         return make_solver(method, active.mirror.model, active.mirror.limits, weights if len(weights) else None)
 
-    def _judge(self, outcome: LoopResult) -> tuple[str, int, str]:
+    def _judge(self, outcome: LoopResult) -> tuple[int, str]:
         best = outcome.best
         figures = (
             f"{best.max_zernike * 1e9:.2f} nm largest coefficient error, {best.rms * 1e9:.1f} nm rms sag after "
             f"{outcome.maps} maps"
         )
         if outcome.converged:
-            return "succeed", ErrorCode.OK, figures
+            return ErrorCode.OK, figures
         limited = "; actuators stand at their limits" if best.overflow > 0.0 else ""
         restored = "; the best command was written again" if outcome.restored else ""
-        return "abort", ErrorCode.NOT_CONVERGED, f"not within the tolerance: {figures}{limited}{restored}"
+        return ErrorCode.NOT_CONVERGED, f"not within the tolerance: {figures}{limited}{restored}"
 
 
 def _result(steps: list[LoopStep], error_code: int, message: str) -> Converge.Result:

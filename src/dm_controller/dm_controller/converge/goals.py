@@ -1,11 +1,11 @@
-"""Goals of `converge` and `build_recipes`: what is checked before anything moves, and how they end."""
+"""Goals of `build_recipes`: what is checked before anything moves."""
 
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
-from dm_common.errors import EXPECTED, Cancelled, ErrorCode, Refusal, error_code
+from dm_common.errors import ErrorCode, Refusal
 from dm_common.optics.zernike import TERMS
 from dm_common.recipes import RecipeError, shape_text
 from dm_controller.planning.planner import Planner
@@ -55,14 +55,3 @@ def recipe_targets(
         if left > error_max:
             raise UnreachableError(target.denied(left, error_max, loop.mirror.reachable_range(target, error_max)))
     return targets
-
-
-def ending(error: Exception) -> tuple[str, int, str]:
-    """Outcome of the action, ErrorCode and sentence of a goal that `error` ended. A defect is raised again."""
-    if isinstance(error, Cancelled):
-        return "canceled", ErrorCode.CANCELED, str(error)
-    if isinstance(error, EXPECTED):
-        return "abort", error_code(error), str(error)
-    if isinstance(error, TimeoutError):
-        return "abort", ErrorCode.TIMEOUT, str(error)
-    raise error

@@ -6,14 +6,12 @@ The mirror goes back to mid range.
 
 import math
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from dm_msgs.action import BuildRecipes
 from dm_msgs.srv import StoreRecipes
 from rclpy.client import Client
-from rclpy.node import Node
 
 from dm_common.errors import EXPECTED, Cancelled, ErrorCode, error_code
 from dm_common.hysteresis.creep_record import rested
@@ -22,15 +20,13 @@ from dm_common.messages import recipe_book_message
 from dm_common.recipes import shape_text
 from dm_common.ros.clients import ServiceCallError, call
 from dm_common.ros.qos import Liveliness
-from dm_common.ros.worker import WorkerGoal, wait_for_clock
+from dm_common.ros.worker import WorkerGoal
 from dm_common.values import without_figures
-from dm_controller.converge.goals import ending, recipe_targets
+from dm_controller.converge.goals import recipe_targets
 from dm_controller.converge.recipe_building import BuildOptions, BuildStep, RecipeBuilder, recipe_book
 from dm_controller.loop_actions import LoopBench
 from dm_controller.planning.target import FocusTarget
 
-#: What requests are told meanwhile.
-BUSY = "recipes are being built (action build_recipes)"
 #: Longest wait for an answer of the calibration node that stores recipes, and for one that does, s.
 STORE_TIMEOUT_S = 10.0
 RETURN_S = 120.0
@@ -40,40 +36,32 @@ class RecipeRun:
     """Carries out one goal; blocks, in the worker thread of the action.
 
     Args:
-        node: the hosting node.
-        values: its parameters, LOOP_PARAMETERS and REACHABLE_TOLERANCE among them.
-        bench: its host knows the calibration in use and the actuators' hysteresis.
+        bench: its host knows the calibration in use and the actuators' hysteresis; REACHABLE_TOLERANCE is among its
+            parameters.
         store: client of the service `store_recipes`.
         calibration: tells whether the node that serves it is alive.
     """
 
-    def __init__(
-        self, node: Node, values: Mapping[str, Any], bench: LoopBench, store: Client, calibration: Liveliness
-    ) -> None:
-        self._node, self._values, self._bench, self._store = node, values, bench, store
-        self._calibration = calibration
+    def __init__(self, bench: LoopBench, store: Client, calibration: Liveliness) -> None:
+        self._values, self._bench, self._store, self._calibration = bench.parameters, bench, store, calibration
 
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
         feedback = without_figures(BuildRecipes.Feedback())
+        result = BuildRecipes.Result(residual_rms=math.nan, max_zernike=math.nan)
 
-        try:
-            with self._bench.reserved(handle, feedback, handle.request, BUSY, self._calibration):
-                outcome, result = self._build_and_store(handle, feedback)
-        except Exception as error:
-            outcome, error_code, message = ending(error)
-            result = BuildRecipes.Result(
-                error_code=error_code, message=message, residual_rms=math.nan, max_zernike=math.nan
-            )
-        # One line per severity: rclpy ties a severity to the line that logs.
-        if outcome == "succeed":
-            self._node.get_logger().info(f"build_recipes: {result.message}")
-        else:
-            self._node.get_logger().warning(f"build_recipes: {result.message}")
+        def body() -> tuple[int, str]:
+            return self._build_and_store(handle, feedback, result)
+
+        outcome, result.error_code, result.message = self._bench.run(
+            "build_recipes", handle, feedback, handle.request, body, self._calibration
+        )
         return outcome, result
 
-    def _build_and_store(self, handle: WorkerGoal, feedback: BuildRecipes.Feedback) -> tuple[str, BuildRecipes.Result]:
-        """Build and store.
+    def _build_and_store(
+        self, handle: WorkerGoal, feedback: BuildRecipes.Feedback, result: BuildRecipes.Result
+    ) -> tuple[int, str]:
+        """Build and store; fills the figures of `result`, and returns an ErrorCode and a sentence.
 
         Raises:
             Refusal, ValueError: refused before anything moved.
@@ -86,12 +74,6 @@ class RecipeRun:
         steps = self._values["recipes.degauss_steps"]
         active.recipes.check_condition(steps)
         bench.check_ready()
-        clock = self._node.get_clock()
-        wait_for_clock(clock)
-        bench.settle_time = options.settle_time
-
-        def now() -> float:
-            return float(clock.now().nanoseconds * 1e-9)
 
         def report(step: BuildStep) -> None:
             feedback.step, feedback.curvature, feedback.recipes = builder.maps, step.curvature, step.recipes
@@ -101,20 +83,19 @@ class RecipeRun:
         builder = RecipeBuilder(
             planner,
             bench,
-            now,
+            bench.now,
             options,
-            state=bench.host.hysteresis() or self._guess(planner.law, now(), active.middle),
+            state=bench.host.hysteresis() or self._guess(planner.law, bench.now(), active.middle),
             on_step=report,
             cancelled=bench.cancelled,
         )
         code, text = self._build(builder, targets)
-        recipes = builder.recipes
-        result = BuildRecipes.Result(maps=builder.maps, residual_rms=math.nan, max_zernike=math.nan)
+        recipes, result.maps = builder.recipes, builder.maps
         rest = bench.rest(np.full(calibration.actuators, active.middle))
         if recipes:
             result.residual_rms = max(recipe.rms for recipe in recipes)
             result.max_zernike = max(recipe.max_zernike for recipe in recipes)
-            book = recipe_book(recipes, planner, steps, clock.now().nanoseconds, active.recipes)
+            book = recipe_book(recipes, planner, steps, round(1e9 * bench.now()), active.recipes)
             result.interpolation_error = book.interpolation_error
             request = StoreRecipes.Request(calibration_id=calibration.id, recipes=recipe_book_message(book))
             stored, reason = self._stored(handle, request)
@@ -134,9 +115,7 @@ class RecipeRun:
             if result.recipes
             else "no recipe was stored"
         )
-        result.error_code, result.message = code, "; ".join(filter(None, (text, figures, rest)))
-        outcomes: dict[int, str] = {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "canceled"}
-        return outcomes.get(code, "abort"), result
+        return code, "; ".join(filter(None, (text, figures, rest)))
 
     def _build(self, builder: RecipeBuilder, targets: list[FocusTarget]) -> tuple[int, str]:
         """Build all; those that are whole stay when the next fails. Returns an ErrorCode and a sentence."""
