@@ -18,7 +18,6 @@ from dm_common.errors import Refusal
 from dm_common.ros.domains import own_domain
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.worker import WorkerActionServer
-from dm_tools.console import console_node
 from dm_tools.console.console_node import ConsoleNode
 
 pytestmark = pytest.mark.processes
@@ -72,7 +71,7 @@ def test_a_goal_whose_answer_was_lost_is_seen_and_can_be_cancelled(
 
     async def scene() -> BackgroundExecutor:
         # By then the node must have been found, and its answer not have come.
-        monkeypatch.setattr(console_node, "ANSWER_S", 3.0)
+        monkeypatch.setattr(side._connection, "_timeout_s", 3.0)
         with pytest.raises(Refusal, match="no answer to the goal"):
             await side.run("calibrate", Calibrate.Goal(), lambda _feedback: None)
         monkeypatch.undo()

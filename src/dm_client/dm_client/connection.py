@@ -3,7 +3,8 @@
 import itertools
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import rclpy
@@ -13,7 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
-from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, call
+from dm_common.ros.clients import ServiceCallError, ThreadedActionClient, call, run_goal
 from dm_common.ros.executor import BackgroundExecutor
 from dm_common.ros.qos import Liveliness
 
@@ -147,26 +148,10 @@ class Connection:
 
     def call(self, name: str, request: Any, timeout_s: float | None = None) -> Any:
         """Call the service `name`; raise DeformableMirrorError when it refuses or does not answer."""
-        gone = self._since_now(name)
-        try:
+        with self._answered(name) as gone:
             timeout_s = self._timeout_s if timeout_s is None else timeout_s
-            return checked(call(self.clients[name], request, timeout_s, lambda: bool(gone())))
-        except ServiceCallError as error:
-            self._check(name, gone)
-            raise DeformableMirrorError(ErrorCode.TIMEOUT, str(error)) from error
-
-    def _since_now(self, name: str) -> Callable[[], str]:
-        """What became of the node that serves `name` since this call, see `Liveliness.since_now`."""
-        if name not in self._servers:
-            return lambda: ""
-        self._servers[name].wait_for_return()
-        return self._servers[name].since_now()
-
-    def _check(self, name: str, gone: Callable[[], str]) -> None:
-        """Raise DeformableMirrorError when the node that serves `name` is `gone`."""
-        if text := gone():
-            code = UNAVAILABLE.get(self._servers[name].name, ErrorCode.TIMEOUT)
-            raise DeformableMirrorError(code, f"{name}: {text}")
+            response = call(self.clients[name], request, timeout_s, lambda: bool(gone()))
+        return checked(response)
 
     def run_action(
         self,
@@ -174,42 +159,37 @@ class Connection:
         goal: Any,
         on_feedback: Callable[[Any], None],
         timeout_s: float,
-        enough: Callable[[], bool] = lambda: False,
+        stop: Callable[[], bool] = lambda: False,
+        identity: Any = None,
     ) -> Any:
         """Run a goal of the action `name` to its end; raise DeformableMirrorError when it is refused or fails.
 
-        Once `enough()` it is cancelled as after `timeout_s`.
-
-        Ctrl-C cancels it first, so that the mirror is left safe.
+        Ctrl-C and `stop` cancel it, so that the mirror is left safe; `identity`: see `run_goal`.
         """
-        client, gone = self.clients[name], self._since_now(name)
-        self._check(name, gone)
-        if not self.wait(client.server_is_ready):
-            raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no such action; is its node running?")
-        accepted = client.send_goal_async(goal, feedback_callback=lambda message: on_feedback(message.feedback))
-        finished = None
-        try:
-            self.wait(lambda: accepted.done() or gone())
-            if not accepted.done():
-                self._check(name, gone)
-                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: no answer to the goal")
-            if not accepted.result().accepted:
-                raise DeformableMirrorError(ErrorCode.BUSY, f"{name}: refused, another goal is running")
-            finished = accepted.result().get_result_async()
-            self.wait(lambda: finished.done() or gone() or enough(), timeout_s)
-            if not finished.done():
-                self._check(name, gone)
-                raise DeformableMirrorError(ErrorCode.TIMEOUT, f"{name}: not finished within {timeout_s:g} s")
-        except BaseException:
-            if not gone():
-                self._cancel(accepted, finished)
-            raise
-        return checked(finished.result().result)
+        with self._answered(name) as gone:
+            result = run_goal(
+                self.clients[name],
+                goal,
+                timeout_s,
+                answer_s=self._timeout_s,
+                on_feedback=on_feedback,
+                stop=stop,
+                gone=gone,
+                identity=identity,
+            )
+        return checked(result)
 
-    def _cancel(self, accepted: Any, finished: Any) -> None:
-        """Cancel a goal that may not be accepted yet, and wait for its end."""
-        if not self.wait(accepted.done) or not accepted.result().accepted:
-            return
-        handle = accepted.result()
-        handle.cancel_goal_async()
-        self.wait((finished or handle.get_result_async()).done, 20.0)
+    @contextmanager
+    def _answered(self, name: str) -> Iterator[Callable[[], str]]:
+        """Raise DeformableMirrorError where no answer of `name` comes; gives what became of its node since now."""
+        server = self._servers.get(name)
+        if server is not None:
+            server.wait_for_return()
+        gone = server.since_now() if server is not None else lambda: ""
+        try:
+            yield gone
+        except ServiceCallError as error:
+            code, text = error.error_code, str(error)
+            if server is not None and (lost := gone()):
+                code, text = UNAVAILABLE.get(server.name, ErrorCode.TIMEOUT), f"{name}: {lost}"
+            raise DeformableMirrorError(code, text) from error

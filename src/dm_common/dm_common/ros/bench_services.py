@@ -132,9 +132,11 @@ class BenchServices:
 
     def _run_degauss(self, steps: int) -> None:
         """A degauss of so many half-swings, 0 = as configured in the driver. Raises as `degauss`."""
-        goal = Degauss.Goal(steps=steps, holder=self.hold.holder)
+        goal, timeout = Degauss.Goal(steps=steps, holder=self.hold.holder), self._values["degauss_timeout"]
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
-            result = run_goal(self._degauss, goal, self._values["degauss_timeout"], stop, self._driver.since_now())
+            result = run_goal(self._degauss, goal, timeout, stop=stop, gone=self._driver.since_now())
+            if result.error_code != ErrorCode.OK and stop():
+                raise ServiceCallError("degauss: cancelled")
         self._check("degauss", result)
 
     def apply(self, signals: Floats) -> Floats:

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from dm_msgs.srv import HoldMirror
@@ -23,7 +23,15 @@ CANCEL_S = 20.0
 
 
 class ServiceCallError(Exception):
-    """A service did not answer: not there, too slow, or the wait was cancelled."""
+    """A service or action did not answer: not there, too slow, or the wait was cancelled.
+
+    Attributes:
+        error_code: of those who ask for others; TIMEOUT unless the reason is another.
+    """
+
+    def __init__(self, message: str, error_code: int = ErrorCode.TIMEOUT) -> None:
+        super().__init__(message)
+        self.error_code = error_code
 
 
 def call(client: Client, request: Any, timeout_s: float, cancelled: Callable[[], object] = lambda: False) -> Any:
@@ -84,51 +92,61 @@ def run_goal(
     client: ActionClient,
     goal: Any,
     timeout_s: float,
-    cancelled: Callable[[], bool] = lambda: False,
+    *,
+    answer_s: float | None = None,
+    on_feedback: Callable[[Any], None] = lambda feedback: None,
+    stop: Callable[[], bool] = lambda: False,
     gone: Callable[[], object] = lambda: False,
+    identity: Any = None,
 ) -> Any:
-    """Run a goal from a worker thread and wait for its result; a goal that is given up is cancelled first.
+    """Run a goal from a worker thread and return its result; one that is given up, be it by Ctrl-C, is cancelled first.
 
     Args:
         client: of the action.
         goal: to send.
-        timeout_s: longest wait for the server, its answer and the end.
-        cancelled: gives the goal up.
-        gone: whether the server is known to be gone; then nobody waits for the end of a goal that is given up.
+        timeout_s: longest wait for the end.
+        answer_s: longest wait for the server, and for an answer of it; None = `timeout_s`.
+        on_feedback: called by the executor.
+        stop: cancels the goal; its result is waited for and returned all the same.
+        gone: whether the server is known to be gone; then nobody waits for it.
+        identity: of the goal, a unique_identifier_msgs/UUID; None = any.
 
     Never call this from an executor callback: it would wait for itself.
 
     Raises:
-        ServiceCallError: no server or no end within `timeout_s`, the goal was refused, or `cancelled()` became true.
+        ServiceCallError: no server, no answer or no end in time, the goal was refused, or `stop()` before it began.
     """
     name = client._action_name
-    deadline = time.monotonic() + timeout_s
+    answer_s = timeout_s if answer_s is None else answer_s
 
-    def wait(condition: Callable[[], bool], missing: str) -> None:
+    def wait(condition: Callable[[], bool], seconds: float, missing: str, hint: str = "") -> None:
+        deadline = time.monotonic() + seconds
         while not condition():
-            if cancelled():
-                raise ServiceCallError(f"{name}: cancelled")
-            if time.monotonic() > deadline:
-                raise ServiceCallError(f"{name}: {missing} within {timeout_s:g} s")
-            time.sleep(0.01)
+            if gone() or time.monotonic() > deadline:
+                raise ServiceCallError(f"{name}: {missing} within {seconds:g} s{hint}")
+            time.sleep(0.005)
 
-    wait(client.server_is_ready, "no such action")
-    accepted = client.send_goal_async(goal)
-    finished = None
+    wait(lambda: stop() or client.server_is_ready(), answer_s, "no such action", "; is its node running?")
+    if stop() or gone():
+        raise ServiceCallError(f"{name}: cancelled before it began; nothing has changed", ErrorCode.CANCELED)
+    accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
     try:
-        wait(accepted.done, "no answer to the goal")
+        wait(accepted.done, answer_s, "no answer to the goal")
         if not accepted.result().accepted:
-            raise ServiceCallError(f"{name}: refused, another goal is running")
+            raise ServiceCallError(f"{name}: refused, another goal is running", ErrorCode.BUSY)
         finished = accepted.result().get_result_async()
-        wait(finished.done, "not finished")
-    except ServiceCallError:
-        if accepted.done() and accepted.result().accepted:
+        wait(lambda: finished.done() or stop(), timeout_s, "not finished")
+        if not finished.done():
             accepted.result().cancel_goal_async()
-            end = time.monotonic() + CANCEL_S
-            while finished is not None and not (finished.done() or gone()) and time.monotonic() < end:
-                time.sleep(0.01)
+            wait(finished.done, timeout_s, "not finished")
+        return finished.result().result
+    except BaseException:
+        with suppress(ServiceCallError):
+            wait(accepted.done, answer_s, "no answer to the goal")
+            if accepted.result().accepted:
+                accepted.result().cancel_goal_async()
+                wait(accepted.result().get_result_async().done, CANCEL_S, "not finished")
         raise
-    return finished.result().result
 
 
 class MirrorHolder:

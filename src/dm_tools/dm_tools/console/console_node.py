@@ -1,7 +1,7 @@
 """The ROS side of the console: one node on a thread of its own, the latest messages, and calls as coroutines."""
 
 import asyncio
-import contextlib
+import threading
 import time
 import uuid
 from collections import deque
@@ -14,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from dm_msgs.msg import ActuatorEstimate, SurfaceMapInfo, ZernikeCoefficients
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.task import Future
 from sensor_msgs.msg import Image
 
 from dm_client import client
@@ -86,8 +85,7 @@ class ConsoleNode:
         self._heard: dict[str, float] = {}
         self._diagnostics: dict[str, DiagnosticStatus] = {}
         self._bench_time = 0.0
-        self._goals: dict[str, Any] = {}
-        self._beginning: dict[str, bool] = {}  # goals that are not accepted yet; True = to be cancelled
+        self._stops: dict[str, threading.Event] = {}  # of the goals that run; once set they are cancelled
         self.observer = StateObserver()
         self._connection = Connection("dm_console", namespace, domain, TOPICS, INTERFACES, self._take)
         self.node = self._connection.node
@@ -160,49 +158,24 @@ class ConsoleNode:
         Raises:
             Refusal: the goal was refused, ended with an error or was cancelled, with the node's sentence.
         """
-        action = self._connection.clients[name]
         identity = INTERFACES[name].Impl.SendGoalService.Request().goal_id
         identity.uuid = list(uuid.uuid4().bytes)
-        if name in self.watched:
-            self.watched[name].own(identity)
-        self._beginning[name] = False
+        watched, stop = self.watched.get(name), threading.Event()
+        if watched is not None:
+            watched.own(identity)
+        self._stops[name] = stop
         try:
-            handle = self._goals[name] = await self._begin(name, goal, on_feedback, identity)
-            finished = handle.get_result_async()
-            if self._beginning.pop(name):
-                await self.cancel(name)
-            if not await _until(finished.done, timeout_s, lambda: not action.server_is_ready()):
-                with contextlib.suppress(Refusal):
-                    await self.cancel(name)
-                raise Refusal(
-                    ErrorCode.TIMEOUT, f"{name}: no result: its node has gone, or it took longer than {timeout_s:g} s"
-                )
-        except Refusal:
-            if name in self.watched:  # it may run all the same: then it must be seen, and be cancelled from here
-                self.watched[name].disown(identity)
+            return await asyncio.to_thread(
+                self._connection.run_action, name, goal, on_feedback, timeout_s, stop.is_set, identity
+            )
+        except DeformableMirrorError as error:
+            if error.response is not None:
+                raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
+            if watched is not None:  # it may run all the same: then it must be seen, and be cancelled from here
+                watched.disown(identity)
             raise
         finally:
-            self._beginning.pop(name, None)
-            self._goals.pop(name, None)
-        result = finished.result().result
-        if result.error_code != 0:
-            raise Refusal(result.error_code, f"{result.message} (error {result.error_code})")
-        return result
-
-    async def _begin(self, name: str, goal: Any, on_feedback: Callable[[Any], None], identity: Any) -> Any:
-        """The handle of a goal that was accepted."""
-        action = self._connection.clients[name]
-        if not await _until(action.server_is_ready, ANSWER_S):
-            raise Refusal(ErrorCode.TIMEOUT, f"{name}: no such action within {ANSWER_S:g} s; is its node running?")
-        if self._beginning[name]:
-            raise Refusal(ErrorCode.CANCELED, f"{name}: cancelled before it began; nothing has changed")
-        accepted = action.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
-        if not await _until(accepted.done, ANSWER_S):
-            raise Refusal(ErrorCode.TIMEOUT, f"{name}: no answer to the goal within {ANSWER_S:g} s")
-        handle = accepted.result()
-        if not handle.accepted:
-            raise Refusal(ErrorCode.BUSY, f"{name}: refused, another goal is running")
-        return handle
+            self._stops.pop(name, None)
 
     @property
     def external_action(self) -> str:
@@ -215,30 +188,15 @@ class ConsoleNode:
         Raises:
             Refusal: no answer, or the node does not know the goal.
         """
-        handle = self._goals.get(name)
-        if handle is None and name in self._beginning:
-            self._beginning[name] = True  # whoever begins it cancels it as soon as it is accepted
-            return
-        if handle is not None:
-            asked: Future | None = handle.cancel_goal_async()
-        else:
-            asked = self.watched[name].cancel() if name in self.watched else None
+        own, watched = self._stops.get(name), self.watched.get(name)
+        if own is not None:
+            own.set()
+        # While one from here is about to begin, that of somebody else goes on.
+        asked = None if watched is None or (own is not None and watched.running) else watched.cancel()
         if asked is None:
             return
-        if not await _until(asked.done, ANSWER_S):
+        if not await asyncio.to_thread(self._connection.wait, asked.done, ANSWER_S):
             raise Refusal(ErrorCode.TIMEOUT, f"{name}: no answer to the cancellation within {ANSWER_S:g} s")
         code, codes = asked.result().return_code, CancelGoal.Response
         if code not in (codes.ERROR_NONE, codes.ERROR_GOAL_TERMINATED):
             raise Refusal(ErrorCode.NOT_SUPPORTED, f"{name}: its node does not cancel the goal (code {code})")
-
-
-async def _until(condition: Callable[[], Any], timeout_s: float, lost: Callable[[], bool] = lambda: False) -> bool:
-    """Wait until `condition()` is true; False when it was not in time, or `lost()` was true too long."""
-    deadline, lost_since = time.monotonic() + timeout_s, float("inf")
-    while not condition():
-        now = time.monotonic()
-        lost_since = min(lost_since, now) if lost() else float("inf")
-        if now > deadline or now - lost_since > SILENCE_S:
-            return False
-        await asyncio.sleep(0.02)
-    return True
