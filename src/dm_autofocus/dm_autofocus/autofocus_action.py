@@ -55,7 +55,7 @@ class AutofocusAction(ProbeAction):
         if goal_handle.request.track:
             self._track(goal_handle, config, plan[1], peak, result)
         known = math.isfinite(peak.error)
-        error = abs(self._optics.dioptre_for(peak.curvature + peak.error) - result.dioptre) if known else math.nan
+        error = abs(self._optics().dioptre_for(peak.curvature + peak.error) - result.dioptre) if known else math.nan
         result.message = f"sharpest at {peak.curvature:+.4f} 1/m, {_distance_text(result.dioptre, error)}{remarks}"
         if peak.at_limit:
             result.message += "; at the end of the range: the object may lie beyond it"
@@ -205,7 +205,7 @@ class AutofocusAction(ProbeAction):
 
     def _fill(self, result: Any, peak: Peak) -> None:
         result.curvature, result.power, result.at_limit = peak.curvature, 2 * peak.curvature, peak.at_limit
-        result.dioptre = self._optics.dioptre_for(peak.curvature)
+        result.dioptre = self._optics().dioptre_for(peak.curvature)
         result.distance = distance_of(result.dioptre)
         result.sharpness = peak.sharpness
 

@@ -57,7 +57,7 @@ class FocusStackAction(ProbeAction):
             places = stack.in_focus(self._values["search.least_contrast"])
         except ValueError as error:
             raise Refusal(ErrorCode.UNREACHABLE, f"the mirror reaches too little of the range: {error}") from error
-        depth = stack.enlarge(self._optics.distances_for(places).astype(np.float32))
+        depth = stack.enlarge(self._optics().distances_for(places).astype(np.float32))
         seen = depth[depth > 0]
         if not seen.size:
             fault = exposure_fault(grey(image))

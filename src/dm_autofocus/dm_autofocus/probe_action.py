@@ -81,13 +81,9 @@ class ProbeAction(ABC):
         self._name = name
         self._probe = probe
         self._values = values
-        self._optics_now = optics
+        self._optics = optics
         self._publish = publish
         self._server = WorkerActionServer(node, action_type, name, self._run, exclusive="preempt", fields=fields)
-
-    @property
-    def _optics(self) -> FocusOptics:
-        return self._optics_now()
 
     @abstractmethod
     def _plan(self, goal: Any) -> Any:
