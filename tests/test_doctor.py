@@ -51,10 +51,24 @@ def test_the_shipped_benches_are_well(name: str) -> None:
         doctor_bench.required_parameters,
         doctor_bench.own_values,
         doctor_bench.parameters,
+        doctor_bench.aperture_fits,
     ):
         assert check(config) is None
     for node in NODES:
         assert doctor_bench.node_configuration(config, node) is None
+
+
+NOBODY = "~nobody-of-that-name/x"
+PATHS = [
+    ("virtual_bench", "electronics.pty_link"),
+    ("virtual_bench", "output_folder"),
+    ("pdm_driver", "electronics.serial_port"),
+    ("pdm_driver", "state_folder"),
+    ("interferometer", "watch_folder"),
+    ("interferometer", "reference_surface"),
+    ("calibration", "calibration_folder"),
+    ("focus_controller", "state_folder"),
+]
 
 
 @pytest.mark.parametrize(
@@ -66,6 +80,10 @@ def test_the_shipped_benches_are_well(name: str) -> None:
         ("pdm_driver", "electronics.kind", "edac41", "electronics.kind = 'edac41': must be one of edac40_tcp"),
         ("interferometer", "trigger_command", "run", "trigger_command = 'run': must be a str"),
         ("calibration", "settle_time", True, "settle_time = True: must be float"),
+        *(
+            (node, name, NOBODY, f"{name} = '{NOBODY}': must be a path; there is no home folder")
+            for node, name in PATHS
+        ),
     ],
 )
 def test_wrong_parameters_are_named(node: str, name: str, value: Any, words: str) -> None:
@@ -88,7 +106,6 @@ FLAT.write_bytes(encode_dat(np.zeros((8, 8)), 1e-4, 632.8e-9, 0))
 #: Values that contradict each other: node, what differs from the shipped bench, words of the reason.
 CONTRADICTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("interferometer", {"watch_folder": ""}, "trigger_command needs watch_folder"),
-    ("interferometer", {"watch_folder": "~nobody-of-that-name/maps"}, "watch_folder = '~nobody"),
     ("interferometer", {"trigger_command": ["", "x"]}, "must name a program"),
     (
         "interferometer",
@@ -218,7 +235,7 @@ def test_wrong_values_are_named_and_nothing_is_tried_with_them(wrong: str, tmp_p
     """The rest of the file is gone through all the same."""
     changes: dict[str, dict[str, Any]] = {
         "pdm_driver": {"electronics.kind": "edac40_udp", "electronics.discovery_port": wrong},
-        "interferometer": {"watch_folder": str(tmp_path), "trigger_command": wrong},
+        "interferometer": {"watch_folder": str(tmp_path), "trigger_command": wrong, "aperture.radius": 0.11},
         "calibration": {"calibration_folder": str(tmp_path), "updates.stale_after": wrong},
     }
     config = {node: values for node, values in bench(changes).items() if node != "virtual_bench"}
@@ -229,6 +246,8 @@ def test_wrong_values_are_named_and_nothing_is_tried_with_them(wrong: str, tmp_p
     for name in ("electronics.discovery_port", "trigger_command", "updates.stale_after"):
         assert name in named.problem
     assert "electronics at 127.0.0.1" not in found
+    aperture = found["aperture of the maps"]
+    assert aperture is not None and "the mirror has a radius of 0.015 m" in aperture.problem
     calibration = found["calibration"]
     assert calibration is not None and "no calibration of the mirror" in calibration.problem
 

@@ -14,7 +14,7 @@ from dm_common.values import from_values
 
 PARAMETERS = (
     AUTOSTART,
-    Parameter("calibration_folder", text("~/.ros/dm_calibrations"), "Folder of the calibration files."),
+    Parameter("calibration_folder", text("~/.ros/dm_calibrations", path=True), "Folder of the calibration files."),
     Parameter(
         "load_on_start",
         text(""),

@@ -23,7 +23,9 @@ PARAMETERS = (
         text(""),
         "Mirror surface frame (x right, y up); empty = mirror, behind the namespace where there is one.",
     ),
-    Parameter("watch_folder", text(""), "Folder in which the instrument saves its maps; empty = watch nothing."),
+    Parameter(
+        "watch_folder", text("", path=True), "Folder in which the instrument saves its maps; empty = watch nothing."
+    ),
     Parameter(
         "file_pattern",
         texts(["*.dat", "*.datx", "*.asc", "*.xyz", "*.fits", "*.h5", "*.4D"]),
@@ -82,7 +84,7 @@ PARAMETERS = (
     ),
     Parameter(
         "reference_surface",
-        text(""),
+        text("", path=True),
         "Map file of the instrument's own error, as it shows it (before orientation.*), which is subtracted from every "
         "map; empty = nothing is.",
     ),
@@ -95,7 +97,7 @@ def configure(values: Mapping[str, Any]) -> tuple[AcquisitionSettings, SurfaceMa
     """What maps are taken by, and the reference surface; None = there is none.
 
     Raises:
-        ValueError: values that contradict each other, a folder of an unknown user, or no map to refer to.
+        ValueError: values that contradict each other, or no map to refer to.
     """
     topic = values["zernike_topic"]
     others = ("watch_folder", "trigger_command", "reference_surface", "retrace", "distortion")
@@ -137,15 +139,11 @@ def acquisition_settings(values: Mapping[str, Any]) -> AcquisitionSettings:
     """What maps are taken by.
 
     Raises:
-        ValueError: values that contradict each other, or a folder of an unknown user.
+        ValueError: values that contradict each other.
     """
     folder = values["watch_folder"]
-    try:
-        watched = Path(folder).expanduser() if folder else None
-    except RuntimeError as error:
-        raise ValueError(f"watch_folder = {folder!r}: {error}") from error
     return AcquisitionSettings(
-        folder=watched,
+        folder=Path(folder).expanduser() if folder else None,
         patterns=values["file_pattern"],
         stable_time=values["stable_time"],
         trigger_command=list(values["trigger_command"]),

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -29,6 +30,7 @@ class Value:
         low, high: allowed range of numbers (of each element for arrays), inclusive.
         unit: SI unit, "" when it has none.
         choices: allowed strings.
+        path: whether a string is a path, in which ~ must stand for a home folder.
         zero: what 0 stands for, be it outside the range; "" = nothing in particular.
         infinite: whether infinity is a value like others; NaN never is.
         sizes: numbers of elements that an array may have.
@@ -40,6 +42,7 @@ class Value:
     high: float = math.inf
     unit: str = ""
     choices: tuple[str, ...] = ()
+    path: bool = False
     zero: str = ""
     infinite: bool = False
     sizes: Sequence[int] = range(100_001)
@@ -70,7 +73,7 @@ class Value:
 
         Raises:
             Refusal: NOT_FINITE, OUT_OF_RANGE (numbers), INVALID_LENGTH (arrays and texts),
-                UNKNOWN_NAME (choices).
+                UNKNOWN_NAME (choices, users in paths).
         """
         if self.many:
             self._check_array(name, given)
@@ -115,6 +118,12 @@ class Value:
             raise Refusal(ErrorCode.INVALID_LENGTH, text)
         if self.choices and given not in self.choices:
             raise Refusal(ErrorCode.UNKNOWN_NAME, f"{name} = {given!r}: must be {self.allowed()}")
+        if self.path:
+            try:
+                Path(given).expanduser()
+            except RuntimeError as error:
+                text = f"{name} = {given!r}: must be a path; there is no home folder {Path(given).parts[0]}"
+                raise Refusal(ErrorCode.UNKNOWN_NAME, text) from error
 
 
 real, whole, text, switch = (partial(Value, kind) for kind in (float, int, str, bool))

@@ -93,7 +93,7 @@ PARAMETERS: Final = (
     ),
     Parameter(
         "state_folder",
-        text("~/.ros/focus_controller"),
+        text("~/.ros/focus_controller", path=True),
         "folder that keeps what the actuators of each mirror have crept to, for the next start; empty = keep nothing",
     ),
     live(

@@ -83,7 +83,7 @@ PARAMETERS: Final = (
     Parameter("limits.watchdog", real(0.0, 0.0, 1e6, "s"), "Without a command for this long: safe shape; 0 = never."),
     Parameter(
         "state_folder",
-        text("~/.ros/dm_driver"),
+        text("~/.ros/dm_driver", path=True),
         "Folder that keeps what was last sent to each unit: a driver that was killed goes on from there in steps. "
         "Empty = keep nothing.",
     ),

@@ -99,7 +99,7 @@ class PdmDriverNode(ManagedNode):
         path = record_path(self._values["state_folder"], configuration.kind, place, self._values["mirror.serial"])
         try:
             return LastShape(path, actuators)
-        except (OSError, RuntimeError) as error:  # RuntimeError: ~name of an unknown user
+        except OSError as error:
             self.get_logger().warning(f"state_folder = {self._values['state_folder']!r} cannot be used: {error}")
             return LastShape(None, actuators)
 

@@ -46,7 +46,7 @@ PARAMETERS = (
     Parameter("trigger.port", whole(BenchConfig.trigger_port, -1, 65535), f"Trigger {PORT_TEXT}"),
     Parameter(
         "output_folder",
-        text(str(Path(tempfile.gettempdir()) / "virtual_bench")),
+        text(str(Path(tempfile.gettempdir()) / "virtual_bench"), path=True),
         "Folder of maps without a given path.",
     ),
     *parameters_of("output_", FilesConfig),

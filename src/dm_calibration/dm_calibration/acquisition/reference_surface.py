@@ -26,7 +26,7 @@ def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float
     """
     try:
         reference = read_map(Path(path).expanduser(), xyz_unit=xyz_unit or None)
-    except (MapFileError, RuntimeError) as error:
+    except MapFileError as error:
         raise ValueError(f"reference_surface: {error}") from error
     if wavelength and abs(reference.wavelength - wavelength) > tolerance:
         raise ValueError(

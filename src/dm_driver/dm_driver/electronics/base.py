@@ -55,7 +55,9 @@ class ElectronicsSettings:
         whole(0, 0, 65535),
         "EDAC40 over UDP: port of the discovery (30303 on real units) to check the link with; 0 = not checked.",
     )
-    serial_port: str = parameter(text(""), "USB DAC-40, framed_serial: device file, for example /dev/ttyUSB0.")
+    serial_port: str = parameter(
+        text("", path=True), "USB DAC-40, framed_serial: device file, for example /dev/ttyUSB0."
+    )
     timeout_s: float = 1.0
     frame: FrameFormat = field(default_factory=FrameFormat)
     doubt: int = 0

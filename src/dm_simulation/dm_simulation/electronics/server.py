@@ -39,7 +39,7 @@ class PortsConfig:
     udp_port: int = parameter(whole(1234, -1, 65535), f"EDAC40 over UDP {PORT_TEXT}")
     discovery_port: int = parameter(whole(30303, -1, 65535), f"EDAC40 discovery {PORT_TEXT}")
     pty_link: str = parameter(
-        text(""),
+        text("", path=True),
         "Path of a symbolic link to the pseudo-terminal of the USB DAC-40 or the framed unit; empty = not offered.",
     )
     framed: FramedConfig = field(default_factory=FramedConfig)

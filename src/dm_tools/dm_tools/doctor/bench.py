@@ -40,6 +40,7 @@ def bench_checks(file: Path) -> Iterator[Check]:
             yield f"configuration of {node.name}", partial(node_configuration, config, node)
     # Wrong values are reported already: what is tried goes by the others.
     sound = {node: _sound(node, values) for node, values in config.items()}
+    yield "aperture of the maps", lambda: aperture_fits(sound)
     driver = sound.get("pdm_driver", {})
     if "virtual_bench" in config:
         yield "ports of the virtual bench", lambda: taken_ports(sound["virtual_bench"])
@@ -70,12 +71,7 @@ def _sound(node: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _folder_of(config: Config, node: str, name: str) -> Path | None:
     text = config.get(node, {}).get(name, "")
-    if not text:
-        return None
-    try:
-        return Path(text).expanduser()
-    except RuntimeError:  # an unknown user
-        return Path(text)
+    return Path(text).expanduser() if text else None
 
 
 @cache
@@ -139,6 +135,16 @@ def node_configuration(config: Config, node: SuiteNode) -> Finding | None:
     except ValueError as error:
         return Finding(str(error), f"correct the value; {node.name} refuses to configure with it")
     return None
+
+
+def aperture_fits(config: Config) -> Finding | None:
+    """Whether the aperture that is configured for maps lies on the mirror."""
+    from dm_calibration.acquisition.ingest import too_large
+
+    radius = effective("interferometer", config.get("interferometer", {}))["aperture.radius"]
+    diameter = effective("pdm_driver", config.get("pdm_driver", {}))["mirror.full_aperture_diameter"]
+    problem = too_large(radius, 0.5 * diameter)
+    return Finding(problem, "correct it, or mirror.full_aperture_diameter of pdm_driver") if problem else None
 
 
 def _electronics(driver: Mapping[str, Any]) -> Iterator[Check]:
