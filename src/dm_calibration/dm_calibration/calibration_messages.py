@@ -32,9 +32,12 @@ _LAW = ("play_radius", "play_weight", "creep_time", "creep_spectrum", "lag_spect
 
 
 def driver_facts(message: MirrorInfo) -> dict[str, Any]:
-    """What maps depend on beside the mirror itself: wiring, electronics and volts."""
-    same = taken(message, "wiring", "electronics", "volts_min", "volts_max", "slew_rate_max")
-    return same | {"channels": list(message.channels)}
+    """What maps depend on beside the mirror itself: wiring, electronics and volts, None where these are not known."""
+    same = taken(message, "wiring", "electronics", "slew_rate_max")
+    volts = {
+        name: None if math.isnan(value) else value for name, value in taken(message, "volts_min", "volts_max").items()
+    }
+    return same | volts | {"channels": list(message.channels)}
 
 
 def calibration_message(

@@ -32,6 +32,7 @@ class DriverConfiguration:
         safe_shape: (N,) legal signals.
         settings: how the electronics are reached.
         kind: name of the back end.
+        knows_volts: whether the volts of `output` are volts, see :class:`DriveElectronics`.
     """
 
     x: NDArray[np.float64]
@@ -41,6 +42,7 @@ class DriverConfiguration:
     safe_shape: Shape
     settings: ElectronicsSettings
     kind: str
+    knows_volts: bool
 
     def make_electronics(self) -> DriveElectronics:
         """Return a new back end, not yet opened."""
@@ -115,6 +117,7 @@ def build_configuration(values: Mapping[str, Any]) -> DriverConfiguration:
         safe_shape=safe_shape,
         settings=replace(settings, doubt=doubt),
         kind=kind,
+        knows_volts=back_end.knows_volts,
     )
 
 

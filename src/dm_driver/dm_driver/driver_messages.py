@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -71,7 +72,8 @@ def state_message(
     if state.requested is not None and state.applied is not None and state.volts is not None:
         message.requested = doubles(state.requested)
         message.applied = doubles(state.applied)
-        message.volts = doubles(state.volts)
+        if configuration.knows_volts:
+            message.volts = doubles(state.volts)
         if state.turned_at is not None:
             message.turned_at = doubles(state.turned_at)
         limits = configuration.limiter.limits
@@ -89,7 +91,7 @@ def mirror_info_message(
     values: Mapping[str, Any], configuration: DriverConfiguration, frame_id: str, now: Any
 ) -> MirrorInfo:
     """Geometry and limits, for calibration and control. `now` is a time message."""
-    limits = configuration.limiter.limits
+    limits, scale = configuration.limiter.limits, configuration.output.scale
     message = MirrorInfo(
         name=values["mirror.name"],
         serial=values["mirror.serial"],
@@ -104,8 +106,8 @@ def mirror_info_message(
         signal_max=limits.high,
         neighbour_difference_max=limits.neighbour_difference,
         slew_rate_max=limits.slew_rate,
-        volts_min=configuration.output.scale.volts_min,
-        volts_max=configuration.output.scale.volts_max,
+        volts_min=scale.volts_min if configuration.knows_volts else math.nan,
+        volts_max=scale.volts_max if configuration.knows_volts else math.nan,
         safe_signals=doubles(configuration.safe_shape),
         wiring=values["mirror.wiring"],
         channels=array.array("i", configuration.output.channels.astype(np.int32).tobytes()),

@@ -88,6 +88,8 @@ class DriveElectronics(ABC):
     #: Frames per `limits.step` of a ramp: more than one where a frame may be lost without a trace, so that the next one
     #: is no larger step.
     frames_per_step: int = 1
+    #: Whether `volts.*` are volts at the actuators; False where the unit takes other numbers.
+    knows_volts: bool = True
 
     def __init__(self, settings: ElectronicsSettings) -> None:
         name, meaning = self.needs

@@ -22,6 +22,7 @@ class MicroscopeMirror(DriveElectronics):
     """
 
     max_code = 0xFFFF
+    knows_volts = False
     needs = ("address", "the URI of the mirror on the device server, such as PYRO:Mirao52e@127.0.0.1:8000")
 
     def __init__(self, settings: ElectronicsSettings) -> None:
