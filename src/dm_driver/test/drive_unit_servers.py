@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import tty
 from collections.abc import Callable
@@ -314,43 +317,61 @@ class FramedSerialUnit(UsbDac40Unit):
                 os.write(self._master, b"\x06")
 
 
+#: What the device server of python-microscope is to serve; it prints every pattern that the mirror takes.
+DEVICES = """
+from microscope.device_server import device
+from microscope.simulators import SimulatedDeformableMirror
+
+class Mirror(SimulatedDeformableMirror):
+    def _do_apply_pattern(self, pattern):
+        super()._do_apply_pattern(pattern)
+        print("pattern", *self.get_current_pattern(), flush=True)
+
+DEVICES = [device(Mirror, "127.0.0.1", {port}, conf={{"n_actuators": 40}})]
+"""
+
+
 class MicroscopeUnit(DriveUnit):
-    """The simulated mirror of python-microscope, published as its device server does it."""
+    """The simulated mirror of python-microscope behind its device server, the program that people start."""
 
     kind = "microscope"
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
         super().__init__()
-        import Pyro4
-        from microscope.simulators import SimulatedDeformableMirror
-
-        unit = self
-
-        class Mirror(SimulatedDeformableMirror):
-            def _do_apply_pattern(self, pattern: np.ndarray) -> None:
-                super()._do_apply_pattern(pattern)
-                assert pattern.min() >= 0.0 and pattern.max() <= 1.0
-                unit.frames.append(dict(enumerate(np.rint(0xFFFF * self.get_current_pattern()).astype(int).tolist())))
-
-        Pyro4.config.REQUIRE_EXPOSE, Pyro4.config.SERVERTYPE = False, "multiplex"  # which closes the links it has
-        Pyro4.config.SERIALIZERS_ACCEPTED.add("pickle")
-        self._mirror, self._port, self._daemon = Mirror(n_actuators=40), 0, Pyro4.Daemon
+        self._folder, self._port = folder, 0
 
     @property
     def settings(self) -> dict[str, object]:
         return {"address": f"PYRO:Mirror@127.0.0.1:{self._port}", "channels": 40}
 
     def _open(self) -> None:
-        self._server = self._daemon("127.0.0.1", self._port)
-        self._port = self._server.sock.getsockname()[1]
-        self._server.register(self._mirror, "Mirror", force=True)
+        devices = self._folder / "devices.py"
+        devices.write_text(DEVICES.format(port=self._port))
+        self._server = subprocess.Popen(
+            [sys.executable, "-m", "microscope.device_server", devices],
+            cwd=self._folder,  # for its logs
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,  # it serves each device from a process of its own
+        )
+        assert self._server.stdout is not None
+        self._lines = iter(self._server.stdout)
+        serving = next(line for line in self._lines if "Serving PYRO:Mirror@" in line)
+        self._port = int(serving.rpartition(":")[2])
 
     def _serve(self) -> None:
-        self._server.requestLoop(lambda: not self._stop.is_set())
+        for line in self._lines:
+            if line.startswith("pattern "):
+                pattern = np.array(line.split()[1:], dtype=float)
+                assert pattern.min() >= 0.0 and pattern.max() <= 1.0
+                self.frames.append(dict(enumerate(np.rint(0xFFFF * pattern).astype(int).tolist())))
 
-    def _close(self) -> None:
-        self._server.unregister("Mirror")
-        self._server.close()
+    def unplug(self) -> None:
+        if self._thread is not None:
+            os.killpg(self._server.pid, signal.SIGKILL)  # which ends `_serve`
+            self._server.wait()
+        super().unplug()
 
 
 UNITS: dict[str, Callable[[Path], DriveUnit]] = {
@@ -358,5 +379,5 @@ UNITS: dict[str, Callable[[Path], DriveUnit]] = {
     "edac40_udp": lambda folder: Edac40UdpUnit(),
     "usb_dac40": UsbDac40Unit,
     "framed_serial": FramedSerialUnit,
-    "microscope": lambda folder: MicroscopeUnit(),
+    "microscope": MicroscopeUnit,
 }

@@ -19,7 +19,13 @@ CHANNELS = 40
 MICROSCOPE_MISSING = "no microscope; run it with: ./dm exec python -m pip install -r requirements/test-oracles.txt"
 
 
-@pytest.fixture(params=sorted(BACK_ENDS))
+#: By name; the device server of python-microscope is a program of its own.
+KINDS = [
+    pytest.param(kind, marks=pytest.mark.processes) if kind == "microscope" else kind for kind in sorted(BACK_ENDS)
+]
+
+
+@pytest.fixture(params=KINDS)
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[DriveUnit]:
     if request.param == "microscope":
         pytest.importorskip("microscope", reason=MICROSCOPE_MISSING)
