@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -10,7 +11,19 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError, declare, frame_id, real, reals, text, whole
+from dm_common.ros.parameters import (
+    REQUIRED,
+    Parameter,
+    ParameterError,
+    declare,
+    frame_id,
+    parameters_of,
+    real,
+    reals,
+    text,
+    whole,
+)
+from dm_common.values import from_values, live_parameter, parameter
 from ros_fixtures import Observer
 
 TABLE = (
@@ -20,6 +33,26 @@ TABLE = (
     Parameter("kind", text("a", choices=("a", "b")), "which kind"),
     Parameter("positions", reals([], -1.0, 1.0, "m"), "where"),
 )
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A lamp."""
+
+    power: float = live_parameter(real(2.0, 0.0, 9.0, "W"), "how bright")
+    places: tuple[float, ...] = parameter(reals([], -1.0, 1.0, "m"), "where")
+    number: int = 7
+
+
+def test_fields_of_a_dataclass_are_parameters_and_are_made_of_their_values() -> None:
+    table = [*parameters_of("lamp.", Lamp(power=3.0))]
+    assert [(each.name, each.default, each.live) for each in table] == [
+        ("lamp.power", 3.0, True),
+        ("lamp.places", [], False),
+    ]
+    assert from_values(Lamp, {"lamp.power": 4.0, "lamp.places": [0.5], "seed": 1}, "lamp.", number=8) == Lamp(
+        4.0, (0.5,), 8
+    )
 
 
 def node_with(observer: Observer, name: str, **values: Any) -> Node:

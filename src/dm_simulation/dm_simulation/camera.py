@@ -93,8 +93,7 @@ class SceneCamera:
         metres = (np.arange(count) - (count - 1) / 2) * pitch
         self._field = metres / (pupil_diameter / 2)
         squares = np.add.outer(metres**2, metres**2)
-        self._inside = squares <= (pupil_diameter / 2) ** 2
-        self._aperture = self._inside.astype(np.float32)
+        self._aperture = (squares <= (pupil_diameter / 2) ** 2).astype(np.float32)
         self._half_square = (squares / 2).astype(np.float32)
         self._textures = [fft.rfft2(part) for part in self._scene(scene_rng)]
         self._last: tuple[Array, Array, NDArray[np.float32]] | None = None  # defocus, surface and its image

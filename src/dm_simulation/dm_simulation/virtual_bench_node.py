@@ -11,7 +11,8 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -76,18 +77,16 @@ class VirtualBenchNode(Node):
         WorkerService(self, Trigger, "~/trigger", self._trigger)
         WorkerService(self, SetBool, "~/power", self._power)
         Diagnostics(self, f"virtual {values['mirror.name']}", self._check)
-        self._ticker: threading.Thread | None = None
+        self._threads: list[threading.Thread] = []
         if self._fast_clock is not None:
             # Reliable, depth 1: matches the best-effort subscriptions of all time sources and any stricter one.
             self._clock_publisher = self.create_publisher(Clock, "/clock", QoSProfile(depth=1))
-            self._ticker = threading.Thread(target=self._tick, args=(values["clock.period"],), daemon=True)
-            self._ticker.start()
+            self._start(self._tick, values["clock.period"])
         if isinstance(self.bench.actuators, PiezoActuators):
             self._temperature_publisher = self.create_publisher(Temperature, "temperature", qos_profile_sensor_data)
             # By the wall clock: the time of this node is the bench's, or somebody else's that may stand still.
             steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
             self.create_timer(max(READING_S / (speed or 1.0), 0.01), self._read_temperature, clock=steady)
-        self._camera_thread: threading.Thread | None = None
         if self.bench.camera is not None:
             # Reliable: viewers that ask for that get images too. Depth 1: what nobody fetched in time is dropped.
             self._image_publisher = self.create_publisher(Image, "image_raw", qos.MAP)
@@ -96,14 +95,17 @@ class VirtualBenchNode(Node):
             k = camera_matrix(self.bench.config.camera)
             self._camera_info = CameraInfo(distortion_model="plumb_bob", d=[0.0] * 5, r=np.eye(3).ravel(), k=k)
             self._camera_info.p = np.pad(np.reshape(k, (3, 3)), [(0, 0), (0, 1)]).ravel()
-            self._camera_thread = threading.Thread(target=self._film, args=(1 / values["camera.rate"],), daemon=True)
-            self._camera_thread.start()
+            self._start(self._film, 1 / values["camera.rate"])
         places = ", ".join(f"{name} {place}" for name, place in self.bench.endpoints.items())
         law = f"{values['piezo.law']} {100 * values['piezo.hysteresis']:g} %, creep {100 * values['piezo.creep']:g} %"
         if self.bench.config.membrane is not None:
             law = "membrane"
         pace = f"{speed:g} times as fast as real time" if speed > 0 else "in real time"
         self.get_logger().info(f"virtual bench: {places}; seed {values['seed']}, {law}; {pace}")
+
+    def _start(self, work: Callable[[float], None], period: float) -> None:
+        self._threads.append(threading.Thread(target=work, args=(period,), daemon=True))
+        self._threads[-1].start()
 
     def _check_change(self, changes: Mapping[str, Any]) -> None:
         if self.bench.camera is not None and "camera.distances" in changes:
@@ -176,17 +178,10 @@ class VirtualBenchNode(Node):
         bench, record, electronics = self.bench, self.bench.monitor.record, self.bench.electronics
         values = {
             "plugged": electronics.plugged,
-            "frames": record.frames,
             "malformed_frames": electronics.malformed_count,
             "settings_frames": bench.unit.settings_frames,
             "violations": record.violations,
-            "jumps": record.jumps,
-            "neighbour_violations": record.neighbour_violations,
-            "range_violations": record.range_violations,
-            "largest_jump": f"{record.largest_jump:.5f}",
-            "largest_neighbour_difference": f"{record.largest_neighbour_difference:.5f}",
-            "lowest_signal": f"{record.lowest_signal:.5f}",
-            "highest_signal": f"{record.highest_signal:.5f}",
+            **{name: f"{each:.5f}" if isinstance(each, float) else each for name, each in asdict(record).items()},
             "maps_written": bench.maps_written,
             **bench.endpoints,
         }
@@ -209,10 +204,8 @@ class VirtualBenchNode(Node):
                 break
             time.sleep(0.02)
         self._stop.set()
-        if self._ticker is not None:
-            self._ticker.join(2)
-        if self._camera_thread is not None:
-            self._camera_thread.join(2)
+        for thread in self._threads:
+            thread.join(2)
         self.bench.close()
 
 

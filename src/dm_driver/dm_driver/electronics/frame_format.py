@@ -57,7 +57,7 @@ class FrameFormat:
         whole(0, 0, MOST_WORD_BITS),
         "Bits of a word on the wire, no gaps between words; 0 = framed_serial.bits rounded up to whole bytes.",
     )
-    byte_order: str = parameter(
+    byte_order: Literal["big", "little"] = parameter(
         text("big", choices=BYTE_ORDERS),
         "big: words begin with their most significant bit; little: with their least significant byte and bit.",
     )
@@ -67,7 +67,9 @@ class FrameFormat:
     )
     checksum: str = parameter(text("none", choices=tuple(CHECK_SUMS)), "Check sum.")
     checksum_covers_header: bool = parameter(switch(True), "The check sum counts the header.")
-    checksum_byte_order: str = parameter(text("big", choices=BYTE_ORDERS), "Of check sums of two bytes.")
+    checksum_byte_order: Literal["big", "little"] = parameter(
+        text("big", choices=BYTE_ORDERS), "Of check sums of two bytes."
+    )
     opening: str = parameter(text(""), "Bytes sent once after opening, hexadecimal.")
     reply: str = parameter(
         text(""),
@@ -153,12 +155,8 @@ class FrameFormat:
             places = places[::-1]
         # A shift keeps the sign, so that negative words come out in two's complement.
         bits = (words[:, None] >> places & 1).astype(np.uint8)
-        payload = np.packbits(bits, bitorder=_order(self.byte_order)).tobytes()
+        payload = np.packbits(bits, bitorder=self.byte_order).tobytes()
         header, terminator = self._ends
         check = CHECK_SUMS[self.checksum]
         value = check.of(header + payload if self.checksum_covers_header else payload)
-        return header + payload + value.to_bytes(check.length, _order(self.checksum_byte_order)) + terminator
-
-
-def _order(name: str) -> Literal["big", "little"]:
-    return "big" if name == "big" else "little"
+        return header + payload + value.to_bytes(check.length, self.checksum_byte_order) + terminator

@@ -1,7 +1,7 @@
 """A serial drive unit of one's own: its frames as its data sheet gives them, and the decoder of what arrives."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +38,14 @@ class FramedConfig:
         wholes([], 0, 4095), "Channels, from 0, in the order of their words; empty = 0, 1, 2, ..."
     )
     word_bits: int = parameter(whole(0, 0, 32), "Bits of a word, without gaps; 0 = bits rounded up to whole bytes.")
-    byte_order: str = parameter(text("big", choices=BYTE_ORDERS), "Order of bytes and bits in a frame.")
+    byte_order: Literal["big", "little"] = parameter(
+        text("big", choices=BYTE_ORDERS), "Order of bytes and bits in a frame."
+    )
     scale: int = parameter(whole(1, -(2**31), 2**31), "word = offset + scale * code.")
     offset: int = parameter(whole(0, -(2**31), 2**32), "word = offset + scale * code.")
     checksum: str = parameter(text("none", choices=tuple(CHECK_LENGTH)), "Check sum.")
     checksum_covers_header: bool = parameter(switch(True), "It counts the header.")
-    checksum_byte_order: str = parameter(text("big", choices=BYTE_ORDERS), "Of two bytes.")
+    checksum_byte_order: Literal["big", "little"] = parameter(text("big", choices=BYTE_ORDERS), "Of two bytes.")
 
 
 def check_value(kind: str, data: bytes) -> int:
@@ -123,14 +125,14 @@ class FramedDecoder:
         payload = frame[begin : begin + self._payload]
         after = begin + self._payload
         check, end = frame[after : after + self._check], frame[after + self._check :]
-        got = int.from_bytes(check, "big" if config.checksum_byte_order == "big" else "little")
+        got = int.from_bytes(check, config.checksum_byte_order)
         expected = check_value(config.checksum, self._header + payload if config.checksum_covers_header else payload)
         if got != expected:
             raise FrameError(f"check sum {got:#x}, computed {expected:#x}")
         if end != self._terminator:
             raise FrameError(f"ends in {end.hex(' ')}, not {self._terminator.hex(' ')}")
         # The whole payload as one number: word k lies k widths from its beginning.
-        number = int.from_bytes(payload, "big" if config.byte_order == "big" else "little")
+        number = int.from_bytes(payload, config.byte_order)
         spare = 8 * len(payload) - config.channels * self._width
         outputs = np.empty(config.channels)
         full = 2**config.bits - 1
