@@ -197,7 +197,11 @@ def test_the_sharpest_focus_is_found_and_told_as_distance(scene: FilmedScene, ob
 def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer: Observer) -> None:
     lens, camera = defocused_camera.LENS, defocused_camera.DefocusedCamera(defocused_camera.clouds(), 0.0173)
     scene.aperture(lens.aperture_radius)
-    scene.render = lambda curvature: camera.expose(curvature).astype(np.uint8)
+
+    def sharp(curvature: float) -> np.ndarray:
+        return camera.expose(curvature).astype(np.uint8)
+
+    scene.render = sharp
     scene.history_known = True
 
     def known() -> bool:
@@ -230,6 +234,13 @@ def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer:
     )
     known()
     time.sleep(0.3)
+    scene.requests.clear()
+    blank = np.full((defocused_camera.SIDE, defocused_camera.SIDE), 100, np.uint8)
+    scene.render = lambda curvature: sharp(curvature) if len(scene.requests) < 4 else blank
+    lost = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+    assert lost.error_code == ErrorCode.NOT_CONVERGED
+    assert re.search(rf"was swept: .*; check the focal length, {fits:.0f} px \(optics.focal_length_px", lost.message)
+    scene.render = sharp
     handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
     wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
     tracked = len(scene.states)

@@ -98,21 +98,24 @@ class AutofocusAction(ProbeAction):
             raise Refusal(
                 ErrorCode.NOT_CONVERGED,
                 "the sharpness does not change with focus: no texture in the region of interest, or no object inside "
-                f"the range{fault and '; '}{fault}; the mirror is back where it was",
+                f"the range{fault and '; '}{fault}; the mirror is back where it was{self._remarks(search)}",
             )
         self._go(goal_handle, search.current.step.curvature)
         return search.current.peak, search.current.config, self._remarks(search)
 
     def _remarks(self, search: FocusSearch) -> str:
-        """What the user should know of how the focus was found."""
+        """What the user should know of how the focus was found, or why it was not."""
         swept = f"; the range was swept: {search.reason}" if search.reason else ""
+        given = given_focal_length(self._values, self._probe.camera_info)
+        where = "(optics.focal_length_px, or fx of camera_info)"
+        if search.current.peak is None:
+            return swept + (f"; check the focal length, {given:.0f} px {where}" if search.unexplained else "")
         scale = search.fitting_scale()
         if scale == 1:
             return swept
-        given = given_focal_length(self._values, self._probe.camera_info)
         return swept + (
             f"; by their blur the images would fit a focal length of {scale * given:.0f} px, {given:.0f} px is given "
-            "(optics.focal_length_px, or fx of camera_info)"
+            f"{where}"
         )
 
     def _model(self, config: SearchConfig, region: Region) -> DefocusModel | str:

@@ -22,10 +22,11 @@ class FocusSearch:
     Attributes:
         current: what searches now: its `step`, `phase`, `done`, `peak` and `config` are those of the search.
         reason: why the range is swept; "" = it is not.
+        unexplained: whether it is because the model did not find the focus.
     """
 
     def __init__(self, config: SearchConfig, model: DefocusModel | str, start: float) -> None:
-        self.reason = ""
+        self.reason, self.unexplained = "", False
         self._before = 0
         self._model = model
         self._seen: list[tuple[float, NDArray, float]] = []  # place, powers and sharpness of each image
@@ -93,4 +94,5 @@ class FocusSearch:
 
     def _sweep_after_all(self) -> None:
         if isinstance(self.current, DepthFromDefocus) and self.current.gave_up:
+            self.unexplained = True
             self.sweep(self.current.gave_up, 0.0)
