@@ -63,6 +63,7 @@ class FilmedScene:
         self.history_known = False
         self.render: Callable[[float], np.ndarray] | None = None  # a curvature's image, instead of the plane's
         self.stamped = True
+        self.encoding = "mono8"
         self.texture = 100 + 40 * np.random.default_rng(5).standard_normal((48, 64))
         self._lock = threading.Lock()
         self._noise = np.random.default_rng(6)
@@ -161,11 +162,12 @@ class FilmedScene:
             self._compressed.publish(small)
             return
         height, width = pixels.shape
-        message = Image(height=height, width=width, encoding="mono8", step=width)
+        message = Image(height=height, width=width, encoding=self.encoding, step=width)
         message.header.frame_id = "camera"
         if self.stamped:
             message.header.stamp = exposed
-        message.data = array.array("B", pixels.tobytes())
+        colours = bytes(height * width // 2) if self.encoding == "nv21" else b""
+        message.data = array.array("B", pixels.tobytes() + colours)
         self._image.publish(message)
 
 
@@ -269,13 +271,14 @@ def test_a_focus_stack_gives_a_sharp_image_and_its_distances(
         return np.hstack([left[:, :side], right[:, side:]]).astype(np.uint8)
 
     scene.aperture(lens.aperture_radius)
-    scene.render = render
+    scene.render, scene.encoding = render, "nv21"
     infos = observer.record(CameraInfo, "focus_stack/camera_info", qos.LATCHED)
     scene.request.publish(FocusRequest(curvature=0.004))
     wait_until(lambda: scene.states[-1].curvature == 0.004, what="the focus that was there before")
     with CameraFocusClient(domain=domain) as client:
         result, image, depth = client.focus_stack()
         assert image.shape == (2 * side, 2 * side, 1) and depth.shape == (2 * side, 2 * side)
+        assert client.messages["focus_stack/image"].encoding == "mono8", "without its colours"
         for distance, columns in ((7.0, np.s_[12 : side - 12]), (20.0, np.s_[side + 12 : -12])):
             seen = depth[12:-12, columns]
             assert np.isfinite(seen).mean() > 0.9

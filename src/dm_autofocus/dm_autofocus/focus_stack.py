@@ -46,6 +46,8 @@ class ImageStack:
         Raises:
             ValueError: it is of another size than those before.
         """
+        if pixels.shape[2:] == (2,):
+            self._cell += self._cell % 2  # of YUV 4:2:2, whose pixels share their colours in twos
         sharpness = local_tenengrad(grey, self._cell)
         if not self.positions:
             self._side = self._cell * (len(pixels) // len(grey))

@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from dm_autofocus.autofocus_parameters import tolerance_of
 from dm_autofocus.focus_stack import FEWEST, ImageStack
-from dm_autofocus.images import exposure_fault, grey, pixels_of
+from dm_autofocus.images import PLANAR, exposure_fault, grey, pixels_of
 from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
 from dm_autofocus.sharpness import WHOLE
@@ -99,7 +99,7 @@ class FocusStackAction(ProbeAction):
         self._info.publish(camera_info_for(last, self._probe.camera_info, self._values["optics.focal_length_px"]))
         native = sys.byteorder == "big"
         for publisher, values, encoding, big in (
-            (self._image, pixels, last.encoding, last.is_bigendian),
+            (self._image, pixels, "mono8" if last.encoding in PLANAR else last.encoding, last.is_bigendian),
             (self._depth, depth, "32FC1", native),
         ):
             message = Image(header=last.header, height=last.height, width=last.width, encoding=encoding)

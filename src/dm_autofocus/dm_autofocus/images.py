@@ -26,6 +26,8 @@ class _Layout:
     green: tuple[int, int] | None = None
 
 
+#: Planes: the luminance of all pixels, then the colours, which are not taken.
+PLANAR = ("nv21", "nv24")
 #: Of colours the green one is taken: it has most of the luminance, and in a Bayer sensor half of the pixels. Of YUV the
 #: luminance.
 ENCODINGS: dict[str, _Layout] = {
@@ -47,6 +49,7 @@ ENCODINGS: dict[str, _Layout] = {
     },
     **{name: _Layout("u1", 2, 1) for name in ("uyvy", "yuv422")},
     **{name: _Layout("u1", 2, 0) for name in ("yuyv", "yuv422_yuy2")},
+    **{name: _Layout("u1") for name in PLANAR},
 }
 #: Share of the pixels that have the largest value from which on its exposure is called wrong.
 CLIPPED = 0.2
@@ -90,6 +93,8 @@ def decompressed(data: bytes, image_format: str) -> tuple[NDArray, str]:
 
 def pixels_of(message: Any) -> NDArray:
     """The pixels (height, width, channels) of a `sensor_msgs/Image`, its own numbers in its own order of bytes.
+
+    Of planes the first.
 
     Args:
         message: anything with height, width, encoding, is_bigendian, step (bytes per row) and data.

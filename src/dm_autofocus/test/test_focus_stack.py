@@ -74,6 +74,15 @@ def test_a_bayer_image_has_cells_of_twice_the_pixels() -> None:
     assert stack.enlarge(np.arange(12).reshape(4, 3)).shape == (31, 20)
 
 
+def test_pixels_that_share_their_colours_come_from_one_image() -> None:
+    """Of YUV 4:2:2, one of two neighbours has U, the other V."""
+    stack, rng = ImageStack(cell=3), np.random.default_rng(1)
+    for number in range(5):
+        stack.add(0.0, rng.random((12, 12)), np.full((12, 12, 2), number))
+    assert len(np.unique(stack.image)) > 1
+    np.testing.assert_array_equal(stack.image[:, 0::2], stack.image[:, 1::2])
+
+
 def test_too_few_images_and_other_sizes_are_refused() -> None:
     stack = ImageStack(cell=4)
     stack.add(0.0, np.zeros((8, 8)), np.zeros((8, 8)))

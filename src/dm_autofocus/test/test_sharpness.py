@@ -144,7 +144,7 @@ def test_compressed_images_give_their_pixels(kind: str, file: str, image_format:
                 decompressed(broken, image_format)
 
 
-@pytest.mark.parametrize("encoding", ["nv21", "64FC1", "jpeg", ""])
+@pytest.mark.parametrize("encoding", ["nv12", "64FC1", "jpeg", ""])
 def test_an_unknown_encoding_is_named(encoding: str) -> None:
     with pytest.raises(ImageError, match=f"'{encoding}': must be one of mono8"):
         grey(message(np.zeros((4, 4), "u1"), encoding))
