@@ -72,7 +72,8 @@ class CameraFocusClient(DeformableMirrorClient):
         """Search the sharpest focus in a region of the image and stand there.
 
         Args:
-            region: left, top, width, height as shares 0..1 of the image; empty = as configured.
+            region: left, top, width, height as shares 0..1 of the image (`sharpness.region_of` makes them of pixels);
+                empty = as configured.
             curvature_range: search only here [1/m]; (0, 0) = the whole reachable range.
             on_feedback: called after each image that counted.
             timeout_s: longest time the search may take.

@@ -7,6 +7,7 @@ finer detail and to noise.
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -38,6 +39,25 @@ def check_region(region: Sequence[float]) -> Region:
             f"and the region inside it"
         )
     return left, top, width, height
+
+
+def region_of(roi: Any, width: int, height: int) -> Region:
+    """The region of a `sensor_msgs/RegionOfInterest` in an image of so many pixels; all zeros = the whole image.
+
+    Raises:
+        ValueError: it is not inside the image.
+    """
+    if not (roi.x_offset or roi.y_offset or roi.width or roi.height):
+        return WHOLE
+    right, below = roi.x_offset + roi.width, roi.y_offset + roi.height
+    if not (0 <= roi.x_offset < right <= width and 0 <= roi.y_offset < below <= height):
+        raise ValueError(
+            f"x_offset, y_offset, width, height = {roi.x_offset}, {roi.y_offset}, {roi.width}, {roi.height}: must lie "
+            f"in an image of {width} x {height} px"
+        )
+    # Of a share that was rounded down, `cut` would take the pixel before it.
+    left, top = math.nextafter(roi.x_offset / width, 1), math.nextafter(roi.y_offset / height, 1)
+    return left, top, roi.width / width, roi.height / height
 
 
 def cut(image: NDArray, region: Region = WHOLE) -> NDArray:

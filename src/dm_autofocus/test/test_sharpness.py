@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from dm_autofocus.images import ImageError, decompressed, exposure_fault, grey
-from dm_autofocus.sharpness import METRICS, check_region, cut, local_tenengrad, tenengrad
+from dm_autofocus.sharpness import METRICS, WHOLE, check_region, cut, local_tenengrad, region_of, tenengrad
 
 
 def texture(seed: int = 0, shape: tuple[int, int] = (64, 80)) -> np.ndarray:
@@ -62,6 +62,24 @@ def test_a_region_outside_the_image_is_refused(region: tuple[float, ...]) -> Non
 def test_a_region_of_a_pixel_is_refused() -> None:
     with pytest.raises(ValueError, match="px of an image"):
         cut(texture(), (0.0, 0.0, 0.01, 0.01))
+
+
+@given(st.data())
+def test_a_region_in_pixels_is_these_pixels(data: st.DataObject) -> None:
+    """In the image, and refused beyond it; all zeros are the whole image, as in ROS."""
+    sides, offsets, sizes = [], [], []
+    for _axis in range(2):
+        sides.append(data.draw(st.integers(3, 4000)))
+        offsets.append(data.draw(st.integers(0, sides[-1] - 3)))
+        sizes.append(data.draw(st.integers(3, sides[-1] - offsets[-1])))
+    roi = SimpleNamespace(x_offset=offsets[1], y_offset=offsets[0], width=sizes[1], height=sizes[0])
+    region = check_region(region_of(roi, sides[1], sides[0]))
+    for axis, numbers in enumerate(np.ogrid[: sides[0], : sides[1]]):
+        part = cut(np.broadcast_to(numbers, sides), region)
+        assert (part.shape, part[0, 0]) == (tuple(sizes), offsets[axis])
+    with pytest.raises(ValueError, match=f"height = {offsets[1]}, .* image of {offsets[1] + sizes[1] - 1} x "):
+        region_of(roi, offsets[1] + sizes[1] - 1, sides[0])
+    assert region_of(SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0), 640, 480) == WHOLE
 
 
 def test_missing_values_do_not_spoil_the_figure() -> None:
