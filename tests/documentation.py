@@ -167,6 +167,7 @@ PARSED = {
     "./dm report PDM30-37_virtual-1_20261121T112233Z --store ~/.ros/dm_bench/calibrations": "an example of an id",
     "./dm report path/to/calibration.h5 --out reports --json figures.json": "an example of a path",
     "./dm replay runs/monday": "in its own time; run with --rate 10",
+    "./dm replay runs/monday --topics image_raw,camera_info,focus_state": "test_autofocus_node.py plays such images",
     "./dm replay runs/monday --recalibrate": "needs a recorded calibration; test_recording.py runs it",
     "./dm replay runs/theirs --recalibrate --config my_bench.yaml": "needs such a recording; test_recording.py runs it",
     "./dm compare --plant preisach --seed 5 --json runs/compare.json": _LONG + "test_compare.py runs its parts",

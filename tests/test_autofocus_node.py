@@ -35,6 +35,9 @@ from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
 from dm_client import DeformableMirrorError
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerService
+from dm_tools.recording.bag_reader import BagReader
+from dm_tools.recording.player import play
+from dm_tools.recording.recorder import Recorder
 from documentation import unexplained
 from support import NodeProcess, Observer, wait_until
 
@@ -306,6 +309,34 @@ def test_compressed_images_are_taken_as_they_come(start: Start, observer: Observ
         found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
         assert found.error_code == ErrorCode.OK, found.message
         assert found.curvature == pytest.approx(0.0173, abs=0.0012)
+
+
+def test_a_recorded_search_shows_the_same_sharpness_again(
+    start: Start, observer: Observer, domain: int, tmp_path: Path
+) -> None:
+    with FilmedScene(observer, object_curvature=0.0173) as played:
+        process = start("dm_autofocus", "autofocus", PARAMETERS)
+        played.until_known(observer)
+        with Recorder(tmp_path / "bag", domain=domain) as recorder:
+            wait_until(lambda: recorder.counts.get("/image_raw"), what="the recorder")
+            played.info.publish(CameraInfo(k=[58e3, *8 * [0.0]]))
+            found = observer.run_goal(Autofocus, "autofocus", Autofocus.Goal()).result
+        assert found.error_code == ErrorCode.OK, found.message
+        process.stop()
+
+    def seen() -> dict[tuple[int, int], float]:
+        return {(state.header.stamp.sec, state.header.stamp.nanosec): state.sharpness for state in played.states}
+
+    recorded = seen()
+    played.states.clear()
+    start("dm_autofocus", "autofocus", {**PARAMETERS, "optics.rest_distance": 0.0, "monitor_rate": 100.0})
+    observer.call(GetFocusRange, "get_focus_range")
+    bag = BagReader(tmp_path / "bag")
+    counts = play(bag, ["/image_raw", "/camera_info", "/focus_state"], domain=domain)
+    assert counts["/image_raw"] >= found.images and counts["/camera_info"] == 1
+    again = {stamp: sharpness for stamp, sharpness in seen().items() if stamp in recorded}
+    assert len(again) >= 5 and again == {stamp: recorded[stamp] for stamp in again}
+    assert played.states[-1].dioptre == pytest.approx(2 * played.states[-1].curvature), "by other optics"
 
 
 def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer) -> None:
