@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Time
 from dm_msgs.action import Autofocus, FocusStack
 from dm_msgs.msg import ActuatorState, AutofocusState, Capabilities, ErrorCode, FocusRequest, FocusState
 from dm_msgs.srv import GetFocusRange, HoldMirror, SetFocus, SetFocusDistance
@@ -68,6 +69,8 @@ class FilmedScene:
         self.stamped = True
         self.encoding = "mono8"
         self.texture = 100 + 40 * np.random.default_rng(5).standard_normal((48, 64))
+        self._frames: list[Time] = []
+        self._stood: list[int] = []  # first image after each move
         self._lock = threading.Lock()
         self._noise = np.random.default_rng(6)
         self._curvature = 0.0
@@ -110,6 +113,12 @@ class FilmedScene:
         wait_until(lambda: self.states, what="the first figure of an image")
         wait_until(lambda: observer.call(GetFocusRange, "get_focus_range").error_code == ErrorCode.OK, what="the range")
 
+    def passed_over(self) -> list[int]:
+        """How many images of the standing mirror came before each that counted."""
+        counted = [state for state in self.states if state.phase != AutofocusState.PHASE_IDLE]
+        numbers = [self._frames.index(state.header.stamp) for state in counted]
+        return [number - max(first for first in self._stood if first <= number) for number in numbers]
+
     def __exit__(self, *_exception: object) -> None:
         self._stop.set()
         self._camera.join()
@@ -149,6 +158,8 @@ class FilmedScene:
                     report = ActuatorState(driver_state=ActuatorState.STATE_ACTIVE, requested=self._pending.signals)
                     report.header.stamp, self._pending = exposed, None
                     self._driver.publish(report)
+                    self._stood.append(len(self._frames))
+                self._frames.append(exposed)
             if self.render is not None:
                 self._publish_image(self.render(self._curvature), exposed)
                 continue
@@ -222,6 +233,7 @@ def test_a_known_camera_and_mirror_take_few_images(scene: FilmedScene, observer:
     assert found.error_code == ErrorCode.OK, found.message
     assert found.curvature == pytest.approx(0.0173, abs=depth_of_focus(lens.aperture_radius) / 2)
     assert found.images <= 10 and len(scene.requests) <= found.images + 1, "nothing is passed without an image"
+    assert min(scene.passed_over()) == 0, "the first image of the mirror that stands counts"
 
     scene.aperture(lens.aperture_radius, 500e-9)  # every move errs by as much
     time.sleep(0.3)
