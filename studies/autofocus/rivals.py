@@ -87,7 +87,7 @@ def fibonacci_search(task: Task) -> Search:
 
 
 def contrast_rules(task: Task) -> Search:
-    """Rules as in libcamera's contrast autofocus (rpi `af.cpp`), without its phase detection.
+    """Rules as in libcamera's contrast autofocus (rpi `af.cpp` [35]), without its phase detection.
 
     Scan in coarse steps from where the lens stands until the contrast has fallen to three quarters of its largest; turn
     round when the first image was not below that yet; then scan back over the peak in steps a quarter as large. The
