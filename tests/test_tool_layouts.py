@@ -21,6 +21,7 @@ from sensor_msgs.msg import Image
 from dm_common.ros import qos
 from dm_common.ros.parameters import frame_id
 from dm_tools.console import console_node
+from dm_tools.security.interfaces import interfaces
 
 CONFIG = Path(__file__).resolve().parents[1] / "src" / "dm_bringup" / "config"
 #: What layouts may show: the console's topics, and the focus, of which it shows what `actuator_state` says.
@@ -157,7 +158,7 @@ def test_rqt_opens_plugins_that_exist() -> None:
 def test_rviz_shows_the_map() -> None:
     """With what the interferometer offers: one that asks for more gets no map, and RViz only counts none."""
     manager = yaml.safe_load((CONFIG / "bench.rviz").read_text())["Visualization Manager"]
-    (display,) = manager["Displays"]
+    display, *_stack = manager["Displays"]
     topic = display["Topic"]
     assert display["Class"] == "rviz_default_plugins/Image" and display["Enabled"] and display["Normalize Range"]
     assert topic["Value"] in TOPICS and TOPICS[topic["Value"]][0] is Image
@@ -166,3 +167,19 @@ def test_rviz_shows_the_map() -> None:
     assert words[topic["Durability Policy"]] == qos.MAP.durability and topic["Depth"] == qos.MAP.depth
     node: Any = SimpleNamespace(get_namespace=lambda: "/")
     assert manager["Global Options"]["Fixed Frame"] == frame_id(node, "")
+
+
+def test_rviz_shows_a_focus_stack() -> None:
+    """Its latched topics, and the points that depth_image_proc makes of them, once somebody switches them on."""
+    manager = yaml.safe_load((CONFIG / "bench.rviz").read_text())["Visualization Manager"]
+    *images, points = manager["Displays"][1:]
+    (autofocus,) = (node for node in interfaces() if node.name == "autofocus")
+    for display in images:
+        topic = display["Topic"]
+        assert display["Class"] == "rviz_default_plugins/Image" and display["Enabled"]
+        assert topic["Value"] in autofocus.publish
+        assert (topic["Reliability Policy"], topic["Durability Policy"]) == ("Reliable", "Transient Local")
+    assert [display["Topic"]["Value"] for display in images] == ["focus_stack/image", "focus_stack/depth"]
+    assert not images[1]["Normalize Range"], "to infinity, all would be black"
+    assert points["Class"] == "rviz_default_plugins/PointCloud2" and points["Topic"]["Value"] == "points"
+    assert not points["Enabled"], "without the node, and in the frame of the mirror, it would be an error"
