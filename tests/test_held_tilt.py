@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from described_mirror import mirror_info_of
 from dm_autofocus.boresight import STEP, BoresightError, find_boresight
 from dm_autofocus.optics import depth_of_focus
+from dm_calibration.calibration_messages import calibration_message
 from dm_common.optics.zernike import TERMS, basis
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel
 from dm_controller.planning.target import FocusTarget
 from dm_simulation.camera import CameraConfig, SceneCamera
+from dm_tools import boresight
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig, influence_model
 
 pytestmark = pytest.mark.slow
@@ -30,6 +34,7 @@ class Calibrated(NamedTuple):
 
     bench: SimulatedBench
     model: InfluenceModel
+    message: Any
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +42,12 @@ def calibrated() -> Calibrated:
     bench = SimulatedBench(SimulationConfig(seed=4, law="preisach", pixels=118))
     calibration = bench.calibrate()
     model = influence_model(calibration.fit, calibration.aperture_radius)
-    return Calibrated(bench, replace(model, actuator_x=calibration.actuator_x, actuator_y=calibration.actuator_y))
+    model = replace(model, actuator_x=calibration.actuator_x, actuator_y=calibration.actuator_y)
+    return Calibrated(bench, model, calibration_message(calibration, None, "mirror", 10e-9))
 
 
 def test_the_picture_stands_still_while_the_focus_changes(calibrated: Calibrated) -> None:
-    bench, model = calibrated
+    bench, model, _message = calibrated
     rows, columns = np.nonzero(np.isfinite(bench.true_map()))
     aperture = bench.aperture
     x, y = (columns - aperture.centre_x_px) / aperture.radius_px, (aperture.centre_y_px - rows) / aperture.radius_px
@@ -72,7 +78,7 @@ class Eccentric:
     DIAMETER, AXIS = 20e-3, np.array([0.5e-3, -0.3e-3])
 
     def __init__(self, calibrated: Calibrated, axis: tuple[float, ...] = (0.0, 0.0), hold_tilt: bool = True) -> None:
-        self._bench, model = calibrated
+        self._bench, model, _message = calibrated
         self.mirror = CalibratedMirror(model, self._bench.limits, hold_tilt, axis)
         self._radius = model.aperture_radius
         seeds = (np.random.default_rng(seed) for seed in (3, 4))
@@ -118,3 +124,23 @@ def test_a_camera_that_looks_beside_the_middle_finds_its_axis(calibrated: Calibr
     free = Eccentric(calibrated, hold_tilt=False)
     with pytest.raises(BoresightError, match="does the calibration not know where the actuators are"):
         find_boresight(free.see, 0.0, step)
+
+
+def test_what_a_picture_that_stands_still_costs(calibrated: Calibrated, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`dm calibrate --boresight` says it: hardly any range, and no residual."""
+    bench, model, message = calibrated
+    client = SimpleNamespace(
+        capabilities=SimpleNamespace(curvature_min=-RANGE, curvature_max=RANGE),
+        mirror_info=mirror_info_of(bench.mirror),
+        latest=lambda _topic: message,
+    )
+    monkeypatch.setattr(boresight, "get_parameter", lambda *_of: 20e-9)
+    cost = boresight.price(client, Eccentric.AXIS)
+    for name, hold in (("held", True), ("free", False)):
+        mirror = CalibratedMirror(model, bench.limits, hold, tuple(Eccentric.AXIS))
+        reach = mirror.reachable_range(FocusTarget(0.0), 20e-9)
+        assert (cost[name]["curvature_min"], cost[name]["curvature_max"]) == pytest.approx(reach, rel=1e-6)
+    spans = {name: figures["curvature_max"] - figures["curvature_min"] for name, figures in cost.items()}
+    assert 0.98 < spans["held"] / spans["free"] <= 1
+    residuals = {name: figures["residual_rms_nm"] for name, figures in cost.items()}
+    assert residuals["free"] <= residuals["held"] < residuals["free"] + 0.5
