@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from studies.autofocus.photographs import Plate
 from studies.autofocus.rivals import RIVALS, Task
 from studies.autofocus.scenes import PHOTOGRAPH, RANGE, TEXTURES, SceneCamera, draw_scene
 from studies.autofocus.trials import OURS, figures_of, run_drawn, run_scene
@@ -52,3 +53,9 @@ def test_a_photograph_is_focused_like_what_is_drawn() -> None:
     figures = figures_of([trial for scene in scenes for trial in run_drawn(scene, (OURS,))])
     assert figures.images[0] <= 10 and figures.found == 1
     assert figures.within_one >= 0.8 and figures.gross == 0
+
+
+def test_a_photograph_is_focused_through_the_true_surface_of_a_calibrated_mirror() -> None:
+    plate = Plate(820)
+    images, errors = np.array([plate.search(number) for number in range(4)]).T
+    assert np.median(images) <= 12 and errors.max() <= 0.5

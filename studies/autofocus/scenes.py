@@ -237,15 +237,20 @@ def _texture(kind: str, contrast: float, size: int, rng: np.random.Generator) ->
         waves = waves if waves.any() else np.array([size // (FINER * 8), 0])
         grey = np.tanh(rng.uniform(0.5, 5) * np.sin(2 * np.pi * (waves[0] * x + waves[1] * y) / size))
     elif kind == PHOTOGRAPH:
-        from matplotlib import image as images
-        from matplotlib.cbook import get_sample_data
-
-        photograph = images.imread(get_sample_data("grace_hopper.jpg", asfileobj=False)).astype(float).mean(2)
-        down, right = (rng.integers(0, side - size + 1) for side in photograph.shape)
-        grey = photograph[down : down + size, right : right + size][:: rng.choice((1, -1)), :: rng.choice((1, -1))]
+        grey = part_of_photograph(size, rng)
     else:
         side = FINER * rng.integers(6, 20)
         grey = rng.random((size // side + 1, size // side + 1)).repeat(side, 0).repeat(side, 1)[:size, :size]
         grey = grey + 0.3 * ((x % side < FINER) | (y % side < FINER))
     grey = (grey - grey.mean()) / grey.std()
     return 1 + min(contrast, -1 / float(grey.min())) * grey
+
+
+def part_of_photograph(size: int, rng: np.random.Generator) -> Floats:
+    """Grey levels (size, size) from anywhere in the photograph that Matplotlib ships, mirrored or not."""
+    from matplotlib import image as images
+    from matplotlib.cbook import get_sample_data
+
+    photograph = images.imread(get_sample_data("grace_hopper.jpg", asfileobj=False)).astype(float).mean(2)
+    down, right = (rng.integers(0, side - size + 1) for side in photograph.shape)
+    return photograph[down : down + size, right : right + size][:: rng.choice((1, -1)), :: rng.choice((1, -1))]
