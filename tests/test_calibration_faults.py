@@ -341,8 +341,8 @@ def test_of_two_goals_one_calibrates(
     process = node()
     _, first = observer.send_goal(Calibrate, "calibrate", pokes(settle_time=0.5))
     wait_until(lambda: len(bench.measured) >= 2, PATIENCE_S)
-    second, _ = observer.send_goal(Calibrate, "calibrate", pokes(settle_time=0.5))
-    assert not second.accepted and "goal refused: another one is running" in process.output
+    second = run(observer, pokes(settle_time=0.5))
+    assert second.error_code == ErrorCode.BUSY and "goal refused: action calibrate has been running" in process.output
     wait_until(first.done, PATIENCE_S)
     assert_each_once(first.result().result, bench, folder)
 

@@ -82,15 +82,15 @@ def test_calibrate_store_publish_and_serve(node: NodeProcess, bench: StandIn, ob
     assert received[0].id == ""
     bench.failing = {"poke+04"}
     seen: list[Any] = []
-    handle, future = observer.send_goal(
+    _, future = observer.send_goal(
         Calibrate, "calibrate", pokes(note="on the bench"), lambda message: seen.append(message.feedback)
     )
     wait_until(lambda: bench.measured, 60)
-    second, _ = observer.send_goal(Calibrate, "calibrate", pokes())
-    assert not second.accepted
+    second = observer.run_goal(Calibrate, "calibrate", pokes()).result
+    assert second.error_code == ErrorCode.BUSY and "action calibrate has been running" in second.message
     wait_until(future.done, 60, node.output)
     result = future.result().result
-    assert handle.accepted and future.result().status == GoalStatus.STATUS_SUCCEEDED
+    assert future.result().status == GoalStatus.STATUS_SUCCEEDED
     assert result.error_code == ErrorCode.OK, result.message
     assert "the mirror is back at mid range" in result.message
     assert (bench.signals == 0.0).all()

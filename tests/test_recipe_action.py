@@ -74,13 +74,12 @@ def test_what_is_reachable_is_what_requests_go_by(observer: Observer, host: Host
 
 def test_recipes_are_built_and_stored(observer: Observer, host: Host, bench: StandIn, store: Store) -> None:
     feedback: list[Any] = []
-    handle, future = observer.send_goal(
+    _, future = observer.send_goal(
         BuildRecipes,
         "build_recipes",
         goal(0.02, -0.01, max_maps=16, tolerance=1e-9),
         lambda message: feedback.append(message.feedback),
     )
-    assert handle.accepted
     wait_until(future.done, 60)
     result = future.result().result
     assert (result.error_code, result.recipes) == (ErrorCode.OK, 2), result.message

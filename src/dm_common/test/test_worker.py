@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 from action_msgs.msg import GoalStatus
-from dm_msgs.action import Degauss, MoveFocus
-from dm_msgs.msg import ErrorCode
-from dm_msgs.srv import Flatten, HoldMirror, SetSignals
+from dm_msgs.action import Converge, Degauss, MoveFocus
+from dm_msgs.msg import ErrorCode, FocusRequest
+from dm_msgs.srv import Flatten, HoldMirror, PredictError, SetSignals
 from std_msgs.msg import Int32
 
 from dm_common.errors import Refusal
@@ -77,6 +77,16 @@ def test_a_failing_service_callback_answers_with_the_reason(observer: Observer) 
         assert "the plate is bent" in response.message
 
 
+def test_figures_that_a_callback_refuses_to_give_are_nan(observer: Observer) -> None:
+    def refusing(request: Any, response: Any) -> Any:
+        response.upper = float(len(request.signals))
+        raise Refusal(ErrorCode.BUSY, "held")
+
+    answer = never_silent(observer.node, "refusing", refusing)
+    assert math.isnan(answer(PredictError.Request(), PredictError.Response()).lower)
+    assert answer(PredictError.Request(signals=[0.0]), PredictError.Response()).lower == 0.0, "what it filled in stays"
+
+
 def test_the_loop_survives_a_callback_that_raises(observer: Observer) -> None:
     received = []
 
@@ -125,8 +135,7 @@ class Mover:
 def test_action_succeeds_with_its_result_and_feedback(observer: Observer) -> None:
     mover = Mover(observer, "refuse")
     feedback: list[Any] = []
-    handle, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal(tolerance=2.5), feedback.append)
-    assert handle.accepted
+    _, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal(tolerance=2.5), feedback.append)
     wait_until(lambda: feedback)
     mover.release.set()
     wait_until(result.done)
@@ -172,26 +181,33 @@ def test_action_cancel_is_honoured(observer: Observer) -> None:
 
 def test_a_second_goal_is_refused_while_one_runs(observer: Observer) -> None:
     mover = Mover(observer, "refuse")
-    first, result = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
-    second, _ = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
-    assert first.accepted
-    assert not second.accepted
+    _, first = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
+    wait_until(lambda: mover.started)
+    second = observer.run_goal(MoveFocus, "move", MoveFocus.Goal())
+    assert second.status == GoalStatus.STATUS_ABORTED and second.result.error_code == ErrorCode.BUSY
+    assert "action move has been running for 0 s: cancel it first, or set take_over" in second.result.message
     mover.release.set()
-    wait_until(result.done)
-    third, _ = observer.send_goal(MoveFocus, "move", MoveFocus.Goal())
-    assert third.accepted
+    wait_until(first.done)
+    assert observer.run_goal(MoveFocus, "move", MoveFocus.Goal()).status == GoalStatus.STATUS_SUCCEEDED
 
 
-def test_a_goal_that_takes_over_ends_the_one_that_runs(observer: Observer) -> None:
+@pytest.mark.parametrize(
+    ("kind", "taking_over"),
+    [
+        (Degauss, Degauss.Goal(take_over=True)),
+        (Converge, Converge.Goal(request=FocusRequest(take_over=True))),
+    ],
+)
+def test_a_goal_that_takes_over_ends_the_one_that_runs(observer: Observer, kind: Any, taking_over: Any) -> None:
     def run(goal: WorkerGoal) -> tuple[str, Any]:
-        if goal.request.take_over:
-            return "succeed", Degauss.Result()
+        if goal.request == taking_over:
+            return "succeed", kind.Result()
         wait_until(lambda: goal.is_cancel_requested)
-        return "canceled", Degauss.Result(error_code=ErrorCode.CANCELED, message="at mid range")
+        return "canceled", kind.Result(error_code=ErrorCode.CANCELED, message="at mid range")
 
-    WorkerActionServer(observer.node, Degauss, "run", run)
-    _, first = observer.send_goal(Degauss, "run", Degauss.Goal())
-    assert observer.run_goal(Degauss, "run", Degauss.Goal(take_over=True)).status == GoalStatus.STATUS_SUCCEEDED
+    WorkerActionServer(observer.node, kind, "run", run)
+    _, first = observer.send_goal(kind, "run", kind.Goal())
+    assert observer.run_goal(kind, "run", taking_over).status == GoalStatus.STATUS_SUCCEEDED
     wait_until(first.done)
     result = first.result().result
     assert (result.error_code, result.message) == (ErrorCode.PREEMPTED, "a newer goal has taken over: at mid range")

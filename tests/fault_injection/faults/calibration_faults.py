@@ -61,8 +61,6 @@ class _Runs:
         )
         self.rig.wait(accepted.done, "the acceptance of a goal")
         self._handle = accepted.result()
-        if not self._handle.accepted:
-            raise RigError("calibrate: the goal was refused")
         self._result = self._handle.get_result_async()
 
     def cancel(self) -> None:

@@ -233,7 +233,7 @@ class FocusRig(DriverRig):
         accepted = client.send_goal_async(goal)
         self.wait(accepted.done, f"the acceptance by {kind.__name__}", ANSWER_S)
         handle = accepted.result()
-        return handle, handle.get_result_async() if handle.accepted else None
+        return handle, handle.get_result_async()
 
     def near(self, signals: ArrayLike) -> bool:
         """Whether the actuators stand in this shape, but for corrections of creep."""

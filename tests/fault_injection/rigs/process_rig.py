@@ -130,14 +130,12 @@ class ProcessRig(DriverRig):
         """Send a goal to the action; the future of its result.
 
         Raises:
-            RigError: it is not accepted.
+            RigError: no answer.
         """
         client = self._actions[kind]
         self.wait(client.server_is_ready, f"the action {kind.__name__}")
         accepted = client.send_goal_async(goal, feedback_callback=feedback)
         self.wait(accepted.done, "the acceptance of a goal")
-        if not accepted.result().accepted:
-            raise RigError(f"{kind.__name__}: the goal was refused")
         return accepted.result().get_result_async()
 
     def all_works(self) -> float:

@@ -114,7 +114,7 @@ def run_goal(
     Never call this from an executor callback: it would wait for itself.
 
     Raises:
-        ServiceCallError: no server, no answer or no end in time, the goal was refused, or `stop()` before it began.
+        ServiceCallError: no server, no answer or no end in time, or `stop()` before it began.
     """
     name = client._action_name
     answer_s = timeout_s if answer_s is None else answer_s
@@ -132,8 +132,6 @@ def run_goal(
     accepted = client.send_goal_async(goal, lambda message: on_feedback(message.feedback), identity)
     try:
         wait(accepted.done, answer_s, "no answer to the goal")
-        if not accepted.result().accepted:
-            raise ServiceCallError(f"{name}: refused, another goal is running", ErrorCode.BUSY)
         finished = accepted.result().get_result_async()
         wait(lambda: finished.done() or stop(), timeout_s, "not finished")
         if not finished.done():
@@ -143,9 +141,8 @@ def run_goal(
     except BaseException:
         with suppress(ServiceCallError):
             wait(accepted.done, answer_s, "no answer to the goal")
-            if accepted.result().accepted:
-                accepted.result().cancel_goal_async()
-                wait(accepted.result().get_result_async().done, CANCEL_S, "not finished")
+            accepted.result().cancel_goal_async()
+            wait(accepted.result().get_result_async().done, CANCEL_S, "not finished")
         raise
 
 

@@ -247,16 +247,14 @@ def until_discovered(send: Callable[..., None]) -> Callable[..., None]:
 
 
 class PatientActionServer(ActionServer):
-    """An action server that repeats acceptance and result of a goal when they were dropped."""
+    """An action server that accepts every goal, and repeats acceptance and result when they were dropped."""
 
-    def __init__(self, *arguments: Any, goal_callback: Callable[[Any], GoalResponse], **keywords: Any) -> None:
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
         self._judged = self._begun = 0.0
 
-        def judge(goal: Any) -> GoalResponse:
-            try:
-                return goal_callback(goal)
-            finally:
-                self._judged = time.monotonic()
+        def judge(_goal: Any) -> GoalResponse:
+            self._judged = time.monotonic()
+            return GoalResponse.ACCEPT
 
         def begin(goal_handle: ServerGoalHandle) -> None:
             self._begun = time.monotonic()
@@ -265,12 +263,11 @@ class PatientActionServer(ActionServer):
         super().__init__(*arguments, goal_callback=judge, handle_accepted_callback=begin, **keywords)
 
     async def _execute_goal_request(self, request: Any) -> None:
-        self._judged, self._begun = time.monotonic(), 0.0
+        self._judged = self._begun = 0.0
         await super()._execute_goal_request(request)
         # rclpy sends the answer between judging a goal and beginning it.
-        accepted = self._begun > self._judged
-        if (self._begun if accepted else time.monotonic()) - self._judged >= DROPPED_S:
-            answer = self._action_type.Impl.SendGoalService.Response(accepted=accepted)
+        if self._begun - self._judged >= DROPPED_S:
+            answer = self._action_type.Impl.SendGoalService.Response(accepted=True)
             _send_again(self._handle.send_goal_response, request[0], answer)
 
     def _send_result_response(self, request_header: Any, future: Any) -> None:

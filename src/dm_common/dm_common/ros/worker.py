@@ -10,10 +10,9 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from typing import Any
 
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.clock import Clock
 from rclpy.duration import Duration
@@ -64,14 +63,12 @@ def never_silent(
         nonlocal refused
         before, refused = refused, ""
         try:
-            try:
-                _check_active(node)
-                fields.check(request)
-            except Refusal:
-                without_figures(response)
-                raise
+            _check_active(node)
+            fields.check(request)
             return callback(request, response)
         except EXPECTED as error:
+            if response == type(response)():  # else the callback knows already what it has filled in
+                without_figures(response)
             refused = str(error)
             response.error_code, response.message = error_code(error), refused
             if refused != before:
@@ -124,12 +121,13 @@ class WorkerGoal:
     Attributes:
         handle: of rclpy.
         request, publish_feedback: of the handle.
+        since: steady time when it came, s.
     """
 
     def __init__(self, handle: ServerGoalHandle, node: Node) -> None:
         self.handle, self._node = handle, node
         self.request, self.publish_feedback = handle.request, handle.publish_feedback
-        self.taken_over, self._begun = False, self._session
+        self.taken_over, self._begun, self.since = False, self._session, time.monotonic()
 
     @property
     def _session(self) -> int:
@@ -157,7 +155,10 @@ class WorkerActionServer(PatientActionServer):
     Args:
         exclusive: "refuse" refuses a goal while another runs, unless it sets `take_over`: then the running goal is
             cancelled; "preempt" asks the running goal to stop and starts the newest one after it.
-        fields, admit: of the goal, and what raises the Refusal of one and logs it; that aborts it, no other goal hears.
+        fields, admit: of the goal, and what raises the Refusal of one and logs it.
+
+    Every goal is accepted, and one that is refused aborted, for only a result has room for the reason. No other goal
+    hears of it.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class WorkerActionServer(PatientActionServer):
     ) -> None:
         if exclusive not in ("refuse", "preempt"):
             raise ValueError(f"exclusive = {exclusive!r}: must be 'refuse' or 'preempt'")
-        self._worker_node = node
+        self._worker_node, self._worker_name = node, name
         self._body = body
         self._exclusive, self._fields, self._admit = exclusive, fields, admit
         self._turn = threading.Lock()  # held by the goal that runs
@@ -185,7 +186,6 @@ class WorkerActionServer(PatientActionServer):
             action_type,
             name,
             execute_callback=lambda goal_handle: action_type.Result(),  # replaced in notify_execute
-            goal_callback=self._on_goal,
             cancel_callback=lambda goal_handle: CancelResponse.ACCEPT,
             result_timeout=RESULT_TIMEOUT_S,
             goal_service_qos_profile=qos.SERVICE,
@@ -204,15 +204,14 @@ class WorkerActionServer(PatientActionServer):
         with self._bookkeeping:
             return self._newest is not goal
 
-    def _on_goal(self, goal: Any) -> GoalResponse:
-        with suppress(Refusal):  # a node that rests says so in the result
-            _check_active(self._worker_node)
-            if self._exclusive == "refuse" and self.busy and not getattr(goal, "take_over", False):
-                self._worker_node.get_logger().warning("goal refused: another one is running")
-                return GoalResponse.REJECT
-        with self._bookkeeping:
-            self._running += 1
-        return GoalResponse.ACCEPT
+    def _check_free(self, goal: Any) -> None:
+        """Raise Refusal while another goal runs that this one leaves alone."""
+        asked = getattr(goal, "request", goal)  # a FocusRequest has the field where the goal is about one
+        if self._exclusive == "refuse" and self.busy and not asked.take_over:
+            assert self._newest is not None
+            lasts = time.monotonic() - self._newest.since
+            text = f"action {self._worker_name} has been running for {lasts:.0f} s: cancel it first, or set take_over"
+            raise Refusal(ErrorCode.BUSY, text)
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
         """Run the body in a thread; rclpy's own execution only publishes the outcome, when it is there."""
@@ -220,13 +219,12 @@ class WorkerActionServer(PatientActionServer):
             try:
                 _check_active(self._worker_node)
                 self._fields.check(goal_handle.request)
+                self._check_free(goal_handle.request)
             except Refusal as refusal:
                 self._worker_node.get_logger().warning(f"goal refused: {refusal}")
                 raise
             self._admit(goal_handle.request)
         except Refusal as refusal:
-            with self._bookkeeping:
-                self._running -= 1
             result = without_figures(self._action_type.Result())
             result.error_code, result.message = refusal.error_code, str(refusal)
             self._finish(goal_handle, "abort", result)
@@ -236,6 +234,7 @@ class WorkerActionServer(PatientActionServer):
             if self._newest is not None and self._exclusive == "refuse":
                 self._newest.taken_over = True
             self._newest = goal
+            self._running += 1
         threading.Thread(target=self._work, args=(goal,), daemon=True).start()
 
     def _work(self, goal: WorkerGoal) -> None:
@@ -243,7 +242,7 @@ class WorkerActionServer(PatientActionServer):
             with self._turn:
                 outcome, result = self._body(goal)
         except Exception as error:
-            outcome, result = "abort", self._action_type.Result()
+            outcome, result = "abort", without_figures(self._action_type.Result())
             _answer_error(self._worker_node, "action", error, result)
         finally:
             with self._bookkeeping:
