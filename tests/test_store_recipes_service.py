@@ -51,7 +51,7 @@ def test_recipes_are_stored_and_published_again(
     refused = store("another", mirror.actuators)
     assert refused.error_code == ErrorCode.CALIBRATION_MISMATCH
     assert f"the calibration in use is '{made.id}'" in refused.message
-    assert store(made.id, 37).error_code == ErrorCode.CALIBRATION_MISMATCH
+    assert store(made.id, 37).error_code == ErrorCode.INVALID_LENGTH
     assert not CalibrationStore(tmp_path / "c").load(made.id).recipes.recipes
 
     answer = store(made.id, mirror.actuators)

@@ -58,8 +58,9 @@ class Answer:
 
     def sentence(self) -> str:
         """The message without what differs from run to run."""
-        text = re.sub(r"PDM30-37_\S+?Z|/\S+/|\S+\.dat\b", "…", self.message)
+        text = re.sub(r"PDM30-37_\S+?Z|/\S+/(?:\S+\.dat\b)?|\S+\.dat\b", "…", self.message)
         text = re.sub(r"inside [-+]0\.\d{4} to [-+]0\.\d{4}", "inside … to …", text)  # what the calibration reaches
+        text = re.sub(r"error is \S+ nm; nothing", "error is … nm; nothing", text)
         text = re.sub(r"; the range was swept: .*", "", text)  # which search serves depends on the images,
         text = re.sub(r" \+- \S+ dioptre", " dioptre", text)  # and only one of them knows its standard error
         exact = self.code is None or self.code in EXACT

@@ -37,9 +37,9 @@ A latched topic keeps its last message for those who come late. To see it, ask f
 best effort, which shows nothing before the next message.
 
 Every field of a request or goal is checked before anything is done: NaN and infinity are answered with NOT_FINITE,
-numbers out of range and unknown modes with OUT_OF_RANGE, arrays of another length and texts of over 1000 characters
-with INVALID_LENGTH, unknown names with UNKNOWN_NAME; the sentence names field, value and what is allowed. Figures of
-a refused request are NaN.
+numbers out of range with OUT_OF_RANGE, arrays of another length and texts of over 1000 characters with
+INVALID_LENGTH, unknown names and modes with UNKNOWN_NAME; the sentence names field, value and what is allowed.
+Figures of a refused request are NaN, and so are those that a run did not come to.
 
 A program asks by the topic `focus_request` or the service `set_focus` (`dry_run` predicts only), moves with the action
 `move_focus`, and finds what the mirror can do on the latched topic `capabilities`. `actuator_command`, `set_signals`

@@ -11,7 +11,7 @@ from dm_autofocus.autofocus_parameters import focus_lens, given_focal_length, se
 from dm_autofocus.focus_probe import SharpnessSample, raw_image
 from dm_autofocus.images import exposure_fault, grey
 from dm_autofocus.optics import depth_of_focus, distance_of
-from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
+from dm_autofocus.probe_action import ASKED, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
@@ -23,15 +23,13 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import seconds
 from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerGoal
-from dm_common.values import Fields, real, reals
+from dm_common.values import Fields, reals
 
 #: Uncertainty of a move's curvature with which the mirror stands where it is sent, in depths of focus.
 TRUSTED = 2.0
 
 
-AUTOFOCUS = Fields(
-    {"region": reals([], 0.0, 1.0, sizes=(0, 4)), "curvature_min": real(0.0), "curvature_max": real(0.0)}
-)
+AUTOFOCUS = Fields(ASKED | {"region": reals([], 0.0, 1.0, sizes=(0, 4))})
 
 
 class AutofocusAction(ProbeAction):

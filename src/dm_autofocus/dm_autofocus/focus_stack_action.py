@@ -15,17 +15,17 @@ from sensor_msgs.msg import CameraInfo, Image
 from dm_autofocus.autofocus_parameters import tolerance_of
 from dm_autofocus.focus_stack import FEWEST, ImageStack
 from dm_autofocus.images import PLANAR, exposure_fault, grey, pixels_of
-from dm_autofocus.probe_action import ProbeAction, range_of, ready_capabilities
+from dm_autofocus.probe_action import ASKED, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.peak_search import NOISE_POINTS, Phase
 from dm_autofocus.sharpness import WHOLE
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerGoal
-from dm_common.values import Fields, real, whole
+from dm_common.values import Fields, whole
 
 #: Most images of a stack.
 MOST = 1000
-FOCUS_STACK = Fields({"curvature_min": real(0.0), "curvature_max": real(0.0), "images": whole(0, 0, MOST)})
+FOCUS_STACK = Fields(ASKED | {"images": whole(0, 0, MOST)})
 #: Percentiles of the distances in the result.
 NEAR, FAR = 5, 95
 

@@ -14,10 +14,13 @@ from dm_autofocus.search.peak_search import Phase
 from dm_autofocus.sharpness import Region
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal
-from dm_common.values import Fields
+from dm_common.values import Fields, real, text, without_figures
 
 #: Share of the reachable range left out at each end: the controller's own test of the limits must not fail on rounding.
 MARGIN = 0.002
+
+#: What fields may be that every goal has.
+ASKED = {"curvature_min": real(0.0), "curvature_max": real(0.0), "holder": text("")}
 
 #: How long a goal waits for a controller that may be starting still, s.
 START_GRACE_S = 5.0
@@ -95,7 +98,7 @@ class ProbeAction(ABC):
 
     def _run(self, goal_handle: WorkerGoal) -> tuple[str, Any]:
         started = time.monotonic()
-        result = self._type.Result()
+        result = without_figures(self._type.Result())  # until they are known
         outcome = "succeed"
         try:
             self._probe.await_capabilities(START_GRACE_S, lambda: self._stopping(goal_handle))

@@ -24,6 +24,7 @@ from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
 from dm_common.mirror import Mirror
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerGoal, wait_for_clock
+from dm_common.values import without_figures
 
 #: Least time between two feedback messages, s.
 FEEDBACK_PERIOD_S = 0.1
@@ -56,7 +57,7 @@ class CalibrateAction:
         self._driver_facts, self._enough = driver_facts, GoodEnough(0.0)
 
     def run(self, handle: WorkerGoal) -> tuple[str, Calibrate.Result]:
-        goal, result = handle.request, Calibrate.Result()
+        goal, result = handle.request, without_figures(Calibrate.Result())
         clock = self._node.get_clock()
         started = clock.now()
         try:

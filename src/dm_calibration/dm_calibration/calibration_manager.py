@@ -176,8 +176,8 @@ class CalibrationManager:
             count, has = len(book.recipes[0].effective), calibration.fit.actuators
             if count != has:
                 raise Refusal(
-                    ErrorCode.CALIBRATION_MISMATCH,
-                    f"recipes: have {count} effective signals each, calibration {calibration.id} {has} actuators",
+                    ErrorCode.INVALID_LENGTH,
+                    f"effective has {count} values: calibration {calibration.id} has {has} actuators",
                 )
             return replace(calibration, recipes=calibration.recipes.merged(book))
 

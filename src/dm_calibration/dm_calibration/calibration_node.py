@@ -37,6 +37,7 @@ from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import WARN, Health, ManagedNode
 from dm_common.ros.worker import WorkerActionServer, WorkerService
+from dm_common.values import reals
 
 
 class CalibrationNode(ManagedNode):
@@ -202,6 +203,9 @@ class CalibrationNode(ManagedNode):
     def _on_store_recipes(self, request: Any, response: Any) -> Any:
         for recipe in request.recipes.recipes:
             requests.RECIPE.check(recipe)
+            one_each = reals([], sizes=(len(request.recipes.recipes[0].effective),))
+            one_each.check("effective", recipe.effective)
+            one_each.check("signals", recipe.signals)
         book = recipe_book_from(request.recipes)
         calibration = self._manager.add_recipes(request.calibration_id, book)
         response.message = (

@@ -132,6 +132,8 @@ class InterferometerNode(ManagedNode):
 
     @staticmethod
     def _expanded(path: str) -> Path:
+        if not path:
+            raise Refusal(ErrorCode.INVALID_ARGUMENT, "path is empty: must name a map file")
         try:
             return Path(path).expanduser()
         except RuntimeError as error:

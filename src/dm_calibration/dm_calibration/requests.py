@@ -22,6 +22,7 @@ CALIBRATE = Fields(
         "hysteresis_maps": whole(0, MAPS_MIN, MAPS_MAX, zero=_CONFIGURED),
         "until": real(0.0, 1e-12, 1e-3, "m", zero="the whole plan"),
         "note": text(""),
+        "holder": text(""),
     }
 )
 LOAD_CALIBRATION = Fields(_CALIBRATION)
@@ -31,6 +32,7 @@ FIT_REGRESSION = Fields(
     | _METHOD
     | {"p_enter": real(0.0, 0.0, 1.0, zero="the default"), "p_remove": real(0.0, 0.0, 1.0, zero="the default")}
 )
+UPDATE_CALIBRATION = Fields({"holder": text("")})
 STORE_RECIPES = Fields(
     {
         "calibration_id": text(""),

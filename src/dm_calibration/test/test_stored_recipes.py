@@ -121,7 +121,7 @@ def test_a_write_that_fails_leaves_everything_as_it_was(stand: Stand, monkeypatc
             ErrorCode.CALIBRATION_MISMATCH,
             "calibration_id = 'other': the calibration in use",
         ),
-        ("known", lambda: book(0.01, actuators=19), ErrorCode.CALIBRATION_MISMATCH, "19 effective signals each"),
+        ("known", lambda: book(0.01, actuators=19), ErrorCode.INVALID_LENGTH, "effective has 19 values"),
         ("known", lambda: NO_RECIPES, ErrorCode.INVALID_ARGUMENT, "must hold at least one"),
         ("known", lambda: book(0.02, steps=50), ErrorCode.INVALID_ARGUMENT, "degauss_steps = 50: the recipes there"),
     ],

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.clients import ThreadedActionClient
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
+from dm_common.values import without_figures
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
 from dm_controller.focus_parameters import MOVE_FOCUS
@@ -78,7 +79,7 @@ class MoveFocusAction:
         )
 
     def _run(self, handle: WorkerGoal) -> tuple[str, Any]:
-        started, result = time.monotonic(), MoveFocus.Result()
+        started, result = time.monotonic(), without_figures(MoveFocus.Result())
         outcome, result.error_code, result.message = self._carry_out(handle, result)
         result.duration = time.monotonic() - started
         return outcome, result
@@ -97,8 +98,8 @@ class MoveFocusAction:
                 return (
                     "abort",
                     ErrorCode.OUT_OF_RANGE,
-                    f"tolerance = {goal.tolerance * 1e9:.2f} nm: the predicted largest coefficient error is "
-                    f"{preview.predicted_max_zernike * 1e9:.2f} nm; nothing moved",
+                    f"tolerance = {goal.tolerance * 1e9:.3g} nm: the predicted largest coefficient error is "
+                    f"{preview.predicted_max_zernike * 1e9:.3g} nm; nothing moved",
                 )
         order = node.order(goal.request)
         ended = self._follow(handle, order)

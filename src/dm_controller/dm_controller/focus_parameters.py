@@ -113,12 +113,13 @@ PARAMETERS: Final = (
 
 #: What the fields of goals may be; what they request of the mirror is judged with the mirror at hand.
 _TOLERANCE, _MAPS = real(0.0, 0.0, 1e-3, "m", zero="as configured"), whole(0, 1, 100, zero="as configured")
-CONVERGE = Fields({"method": text(""), "tolerance": _TOLERANCE, "max_maps": _MAPS})
+CONVERGE = Fields({"request.holder": text(""), "method": text(""), "tolerance": _TOLERANCE, "max_maps": _MAPS})
 BUILD_RECIPES = Fields(
     {
         "curvatures": reals([], sizes=range(1, 1001)),
         "conic_constant": real(0.0),
         "zernike": reals([]),
+        "holder": text(""),
         "tolerance": _TOLERANCE,
         "max_maps": whole(0, 4, 100, zero="as configured"),
     }

@@ -21,6 +21,7 @@ from dm_common.ros import parameters, qos
 from dm_common.ros.executor import run_node
 from dm_common.ros.lifecycle import Health, ManagedNode
 from dm_common.ros.worker import WorkerService, never_silent
+from dm_common.values import without_figures
 from dm_driver.actuator_writer import ActuatorWriter
 from dm_driver.commands.command_gate import CODE_OF_OUTCOME, MARGIN_S, CommandGate
 from dm_driver.commands.degauss_action import DegaussAction
@@ -160,6 +161,8 @@ class PdmDriverNode(ManagedNode):
         self._gate.attempt("actuator_command", message, carry_out)
 
     def _on_set_signals(self, request: Any, response: Any) -> Any:
+        without_figures(response)  # until they are known
+
         def carry_out(writer: ActuatorWriter, configuration: DriverConfiguration) -> Move | None:
             target = configuration.limiter.check_shape(request.signals)
             response.ramp_time = writer.ramp_time(target)

@@ -92,6 +92,9 @@ def test_a_driver_that_was_restarted_takes_a_renewal_for_a_hold(clock: Clock) ->
         (ErrorCode.NOT_FINITE, {"lease": float("nan")}),
         (ErrorCode.OUT_OF_RANGE, {"lease": -1.0}),
         (ErrorCode.NOT_FINITE, {"duration": float("inf")}),
+        (ErrorCode.OUT_OF_RANGE, {"duration": 2e9}),
+        (ErrorCode.INVALID_LENGTH, {"holder": "x" * 5000}),
+        (ErrorCode.INVALID_LENGTH, {"purpose": "x" * 5000}),
     ],
 )
 def test_fields_that_cannot_be(clock: Clock, code: ErrorCode, fields: dict[str, object]) -> None:

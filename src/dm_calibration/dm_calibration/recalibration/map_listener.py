@@ -20,6 +20,7 @@ from dm_calibration.calibration_parameters import update_options
 from dm_calibration.procedure.applied_history import AppliedHistory, MapNotUsableError
 from dm_calibration.recalibration.temperature import TemperatureLog
 from dm_calibration.recalibration.updates import RecalibrationManager, Verdict
+from dm_calibration.requests import UPDATE_CALIBRATION
 from dm_common.errors import EXPECTED, ErrorCode, Refusal
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.measurement import Measurement
@@ -28,7 +29,7 @@ from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.lifecycle import OK, WARN, ManagedNode
 from dm_common.ros.worker import WorkerService
-from dm_common.values import wholes
+from dm_common.values import wholes, without_figures
 
 #: Wall time for the driver to report after a map, s (it does so every 0.5 s).
 REPORT_WAIT_S = 3.0
@@ -83,7 +84,7 @@ class MapListener:
         node.create_subscription(ZernikeCoefficients, "zernike", lambda m: self._on_part("zernike", m), qos.STATE)
         node.create_subscription(SurfaceSamples, "surface_samples", lambda m: self._on_part("samples", m), qos.STATE)
         node.create_subscription(SurfaceMapInfo, "surface_map_info", lambda m: self._on_part("info", m), qos.STATE)
-        self._service = WorkerService(node, UpdateCalibration, "update_calibration", self._on_update)
+        WorkerService(node, UpdateCalibration, "update_calibration", self._on_update, UPDATE_CALIBRATION)
 
     def stop(self) -> None:
         """Take no more maps."""
@@ -223,6 +224,7 @@ class MapListener:
         self._refused, self._last_refusal = self._refused + 1, reason
 
     def _on_update(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> Any:
+        without_figures(response)  # until they are known
         try:
             if request.forget:
                 self._forget(request, response)

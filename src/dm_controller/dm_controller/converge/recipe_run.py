@@ -4,7 +4,6 @@ Recipes that are whole are stored however the goal ends: on a failure of the ben
 The mirror goes back to mid range.
 """
 
-import math
 import time
 from typing import Any
 
@@ -48,7 +47,7 @@ class RecipeRun:
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""
         feedback = without_figures(BuildRecipes.Feedback())
-        result = BuildRecipes.Result(residual_rms=math.nan, max_zernike=math.nan)
+        result = without_figures(BuildRecipes.Result())
 
         def body() -> tuple[int, str]:
             return self._build_and_store(handle, feedback, result)

@@ -29,6 +29,7 @@ REQUEST = Fields(
     {
         "mode": text("", choices=("", *MODES)),
         "time_budget": real(0.0, 0.0, 1e9, "s", zero="as configured"),
+        "holder": text(""),
         **_TARGET,
     }
 )

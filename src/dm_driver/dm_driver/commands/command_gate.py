@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_driver.actuator_writer import ActuatorWriter
-from dm_driver.commands.mirror_hold import MirrorHold
+from dm_driver.commands.mirror_hold import TEXT, MirrorHold
 from dm_driver.driver_configuration import DriverConfiguration
 from dm_driver.moves import Outcome
 
@@ -65,6 +65,7 @@ class CommandGate:
                 raise Refusal(
                     ErrorCode.DRIVER_INACTIVE, "the driver is not configured: configure and activate it first"
                 )
+            TEXT.check("holder", request.holder)
             takes_over = not dry_run and self.hold.check(request.holder, request.take_over)
             result = carry_out(writer, configuration)
             if result is not None:

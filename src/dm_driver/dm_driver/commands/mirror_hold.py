@@ -22,8 +22,10 @@ LEASE_MAX_S = 3600.0
 #: What may be asked, as its constants HOLD, RENEW, TAKE_OVER and RELEASE.
 Operation = HoldMirror.Request
 _OPERATION = text("", choices=("", Operation.HOLD, Operation.RENEW, Operation.TAKE_OVER, Operation.RELEASE))
-_DURATION = real(0.0, 0.0, unit="s")
+_DURATION = real(0.0, 0.0, 1e9, "s")
 _LEASE = real(0.0, 0.0, LEASE_MAX_S, "s")
+#: Of `holder` and `purpose`, which stand in every refusal and state.
+TEXT = text("")
 
 
 class MirrorHold:
@@ -62,6 +64,8 @@ class MirrorHold:
         _OPERATION.check("operation", operation)
         if not holder.strip():
             raise Refusal(ErrorCode.INVALID_ARGUMENT, "holder is empty: must say who holds the mirror")
+        TEXT.check("holder", holder)
+        TEXT.check("purpose", purpose)
         _DURATION.check("duration", duration)
         _LEASE.check("lease", lease)
         with self._lock:
