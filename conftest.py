@@ -29,6 +29,7 @@ LONGEST = (
     "test_whole_runs",
     "test_end_to_end",
     "test_console_page",
+    "test_answers",
     "test_faults_calibration",
     "test_faults_processes",
     "test_faults_network",

@@ -8,51 +8,39 @@ from __future__ import annotations
 
 from typing import Any
 
-from dm_msgs.action import Autofocus, BuildRecipes, Calibrate, Converge, Degauss, FocusStack, MoveFocus
-from dm_msgs.msg import ActuatorCommand, FocusRequest
-from dm_msgs.srv import (
-    FitInfluenceFunction,
-    FitRegression,
-    Flatten,
-    GetFocusRange,
-    HoldMirror,
-    IngestFile,
-    ListCalibrations,
-    LoadCalibration,
-    Measure,
-    PredictError,
-    SetFocus,
-    SetFocusDistance,
-    SetSignals,
-    StoreRecipes,
-    UpdateCalibration,
-)
+from dm_msgs import action, msg, srv
 
-#: Of every request of a focus, where it stands in a field `request` or alone.
-_FOCUS = (
+#: Of every request of a focus, where it stands in a field `request` or alone: of each field a wrong value.
+_WRONG = (
     "curvature: .nan",
-    "curvature: .inf",
     "curvature: 0.5",
-    "curvature: 1000.0",
     "conic_constant: .nan",
+    "zernike: [1.0e-9, 2.0e-9]",
+    "mode: sideways",
+    "time_budget: -1.0",
+    "header: {stamp: {sec: 1}}",
+)
+#: More of the same.
+_FOCUS = (
+    *_WRONG,
+    "curvature: .inf",
+    "curvature: 1000.0",
     "conic_constant: -.inf",
     "conic_constant: 1.0e+9, curvature: 0.01",
-    "zernike: [1.0e-9, 2.0e-9]",
     "zernike: [22 x 0.0]",
     "zernike: [21 x .nan]",
     "zernike: [21 x 1.0e-3]",
-    "mode: sideways",
     "mode: conditioned",
     "time_budget: .nan",
-    "time_budget: -1.0",
     "time_budget: 1.0e+9",
-    "header: {stamp: {sec: 1}}",
 )
+#: Of a recipe that could be stored.
+_RECIPE = "effective: [37 x 0.0], signals: [37 x 0.0]"
 
 #: {interface: (type, values)}, in the order in which they are tried.
 CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
     "set_signals": (
-        SetSignals,
+        srv.SetSignals,
         (
             "signals: [37 x 0.1], wait: true",
             "signals: [37 x 0.1], dry_run: true",
@@ -64,17 +52,18 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "actuator_command": (
-        ActuatorCommand,
+        msg.ActuatorCommand,
         (
             "signals: [37 x 0.0]",
             "signals: [36 x 0.0]",
             "signals: [37 x .nan]",
             "signals: [37 x -1.5]",
             "signals: [37 x 0.0], header: {stamp: {sec: 1}}",
+            "signals: [37 x 0.0], expected_turns: 1",
         ),
     ),
     "degauss": (
-        Degauss,
+        action.Degauss,
         (
             "steps: 4",
             "amplitude: .nan",
@@ -88,7 +77,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "hold_mirror": (
-        HoldMirror,
+        srv.HoldMirror,
         (
             "operation: hold, holder: me, purpose: a test",
             "operation: release, holder: me",
@@ -97,10 +86,13 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
             "operation: hold, holder: me, lease: .nan",
             "operation: hold, holder: me, lease: -1.0",
             "operation: hold, holder: me, duration: .inf",
+            "operation: hold, holder: me, duration: 2.0e+9",
+            "operation: hold, holder: LONG",
+            "operation: hold, holder: me, purpose: LONG",
         ),
     ),
     "measure": (
-        Measure,
+        srv.Measure,
         (
             "label: by hand",
             "timeout: .nan",
@@ -111,7 +103,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "ingest_file": (
-        IngestFile,
+        srv.IngestFile,
         (
             "path: LAST_MAP",
             "path: ''",
@@ -120,18 +112,9 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
             "path: LONG",
         ),
     ),
-    "list_calibrations": (ListCalibrations, ("",)),
-    "load_calibration": (
-        LoadCalibration,
-        (
-            "calibration: ''",
-            "calibration: nonsense",
-            "calibration: /etc/passwd",
-            "calibration: LONG",
-        ),
-    ),
+    "list_calibrations": (srv.ListCalibrations, ("",)),
     "fit_influence_function": (
-        FitInfluenceFunction,
+        srv.FitInfluenceFunction,
         (
             "method: AZreg",
             "method: AZregg",
@@ -139,10 +122,21 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
             "calibration: LONG",
             "exclude: [poke+99]",
             "exclude: ['LONG']",
+            "activate: true",
+        ),
+    ),
+    "load_calibration": (
+        srv.LoadCalibration,
+        (
+            "calibration: ''",
+            "calibration: nonsense",
+            "calibration: /etc/passwd",
+            "calibration: LONG",
+            "calibration: IN_USE",
         ),
     ),
     "fit_regression": (
-        FitRegression,
+        srv.FitRegression,
         (
             "",
             "method: nonsense",
@@ -156,38 +150,18 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "predict_error": (
-        PredictError,
+        srv.PredictError,
         ("signals: [37 x 0.1]", "signals: [36 x 0.0]", "signals: [37 x .nan]", "signals: [37 x -1.5]"),
     ),
-    "store_recipes": (
-        StoreRecipes,
-        (
-            "calibration_id: IN_USE",
-            "calibration_id: nonsense",
-            "calibration_id: LONG",
-            *(
-                f"calibration_id: IN_USE, recipes: {{degauss_steps: 100, recipes: [{{{recipe}}}]}}"
-                for recipe in (
-                    "curvature: .nan, effective: [37 x 0.0], signals: [37 x 0.0]",
-                    "conic_constant: .inf, effective: [37 x 0.0], signals: [37 x 0.0]",
-                    "effective: [36 x 0.0], signals: [36 x 0.0]",
-                    "effective: [37 x .nan], signals: [37 x 0.0]",
-                    "effective: [37 x 0.0], signals: [37 x .inf]",
-                    "effective: [37 x 0.0], signals: [37 x 3.0]",
-                    "max_zernike: -1.0, effective: [37 x 0.0], signals: [37 x 0.0]",
-                    "rms: .nan, effective: [37 x 0.0], signals: [37 x 0.0]",
-                )
-            ),
-            "calibration_id: IN_USE, recipes: {degauss_steps: 0, recipes: [{effective: [37 x 0.0]}]}",
-            "calibration_id: IN_USE, recipes: {degauss_steps: 100, interpolation_error: .nan}",
-        ),
+    "update_calibration": (
+        srv.UpdateCalibration,
+        ("dry_run: true", "without: [38]", "forget: true", "forget: true, dry_run: true"),
     ),
-    "update_calibration": (UpdateCalibration, ("dry_run: true", "forget: true", "forget: true, dry_run: true")),
     "calibrate": (
-        Calibrate,
+        action.Calibrate,
         (
             "dry_run: true",
-            "plan: poke_check",
+            "activate: false, dry_run: true",
             "plan: everything",
             "poke_amplitude: .nan",
             "poke_amplitude: -0.1",
@@ -201,28 +175,29 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
             "plan: hysteresis, hysteresis_maps: 5",
             "plan: hysteresis, hysteresis_maps: 100000",
             "plan: hysteresis, skip_degauss: true",
+            "plan: hysteresis, until: .nan",
+            "plan: hysteresis, until: -1.0",
+            "plan: pokes, until: 1.0e-9",
             "plan: surfaces, surfaces: [p0x]",
             "plan: surfaces, surfaces: ['LONG']",
             "note: LONG",
         ),
     ),
     "set_focus": (
-        SetFocus,
+        srv.SetFocus,
         (
             "request: {curvature: 0.02}",
             "request: {curvature: 0.02}, dry_run: true",
             *(f"request: {{{case}}}" for case in _FOCUS),
         ),
     ),
-    "focus_request": (FocusRequest, ("curvature: 0.01", *_FOCUS[:1], *_FOCUS[2:3], *_FOCUS[7:8], *_FOCUS[11:12])),
-    "flatten": (Flatten, ("", "dry_run: true")),
+    "focus_request": (msg.FocusRequest, ("curvature: 0.01", *_WRONG)),
+    "flatten": (srv.Flatten, ("", "dry_run: true")),
     "move_focus": (
-        MoveFocus,
+        action.MoveFocus,
         (
             "request: {curvature: 0.02}, settle_time: 0.2",
-            "request: {curvature: .nan}",
-            "request: {curvature: 0.5}",
-            "request: {mode: sideways}",
+            *(f"request: {{{case}}}" for case in _WRONG),
             "tolerance: .nan",
             "tolerance: .inf",
             "tolerance: -1.0",
@@ -234,12 +209,9 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "converge": (
-        Converge,
+        action.Converge,
         (
-            "request: {curvature: 0.02}, tolerance: 5.0e-9",
-            "request: {curvature: .nan}",
-            "request: {mode: sideways}",
-            "request: {time_budget: -1.0}",
+            *(f"request: {{{case}}}" for case in _WRONG),
             "method: nonsense",
             "method: LONG",
             "tolerance: .nan",
@@ -249,25 +221,53 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "build_recipes": (
-        BuildRecipes,
+        action.BuildRecipes,
         (
-            "curvatures: [0.01], tolerance: 2.0e-9, max_maps: 8",
             "curvatures: []",
             "curvatures: [.nan]",
             "curvatures: [0.01, 0.01]",
             "curvatures: [0.5]",
             "curvatures: [2000 x 0.01]",
             "curvatures: [0.01], conic_constant: .nan",
+            "curvatures: [0.01], zernike: [2 x 0.0]",
             "curvatures: [0.01], tolerance: .nan",
             "curvatures: [0.01], tolerance: -1.0",
             "curvatures: [0.01], max_maps: 1000",
         ),
     ),
-    "get_focus_range": (GetFocusRange, ("",)),
+    "store_recipes": (
+        srv.StoreRecipes,
+        (
+            "calibration_id: IN_USE",
+            "calibration_id: LONG",
+            f"calibration_id: nonsense, recipes: {{degauss_steps: 100, recipes: [{{{_RECIPE}}}]}}",
+            *(
+                f"calibration_id: IN_USE, recipes: {{degauss_steps: 100, recipes: [{{{recipe}}}]}}"
+                for recipe in (
+                    f"curvature: .nan, {_RECIPE}",
+                    f"conic_constant: .inf, {_RECIPE}",
+                    f"zernike: [2 x 0.0], {_RECIPE}",
+                    "effective: [36 x 0.0], signals: [36 x 0.0]",
+                    "effective: [37 x 0.0], signals: [36 x 0.0]",
+                    "effective: [37 x .nan], signals: [37 x 0.0]",
+                    "effective: [37 x 0.0], signals: [37 x .inf]",
+                    "effective: [37 x 0.0], signals: [37 x 3.0]",
+                    f"max_zernike: -1.0, {_RECIPE}",
+                    f"rms: .nan, {_RECIPE}",
+                )
+            ),
+            f"calibration_id: IN_USE, recipes: {{degauss_steps: 0, recipes: [{{{_RECIPE}}}]}}",
+            "calibration_id: IN_USE, recipes: {degauss_steps: 100, interpolation_error: .nan}",
+            "calibration_id: IN_USE, recipes: {stamp: {sec: 1}, degauss_steps: 100, interpolation_error: 1.0e-9, "
+            f"recipes: [{{curvature: 0.03, conic_constant: -1.0, maps: 4, {_RECIPE}}}]}}",
+        ),
+    ),
+    "get_focus_range": (srv.GetFocusRange, ("",)),
     "set_focus_distance": (
-        SetFocusDistance,
+        srv.SetFocusDistance,
         (
             "distance: 100.0",
+            "distance: 100.0, dry_run: true",
             "dioptre: 0.01",
             "distance: .inf",
             "distance: .nan",
@@ -280,9 +280,9 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "autofocus": (
-        Autofocus,
+        action.Autofocus,
         (
-            "",
+            "track: true",
             "region: [0.1]",
             "region: [4 x .nan]",
             "region: [-1.0, 0.0, 1.0, 1.0]",
@@ -293,7 +293,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...]]] = {
         ),
     ),
     "focus_stack": (
-        FocusStack,
-        ("images: 12", "images: 4", "images: 1001", "curvature_min: .nan", "curvature_min: 0.02, curvature_max: -0.02"),
+        action.FocusStack,
+        ("images: 4", "images: 1001", "curvature_min: .nan", "curvature_min: 0.02, curvature_max: -0.02"),
     ),
 }

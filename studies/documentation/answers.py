@@ -1,7 +1,7 @@
 """The section Answers of docs/interfaces.md, from a run (`python -m studies.documentation.answers`).
 
-Every case of `answer_cases` is asked over ROS, one after another, of a calibrated mirror; the table holds code and
-sentence. What differs from run to run, names of files and measured figures, is an ellipsis.
+Every case of `answer_cases` and `special_cases` is asked over ROS, one after another, of a calibrated mirror; the table
+holds code and sentence. What differs from run to run, names of files and measured figures, is an ellipsis.
 """
 
 from __future__ import annotations
@@ -17,17 +17,24 @@ from typing import Any
 import yaml
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ActuatorState, FocusState
+from rcl_interfaces.msg import Log
 
 from dm_client.connection import Connection
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 from dm_common.ros.clients import call
 from studies.documentation.answer_cases import CASES
+from studies.documentation.special_cases import BENCH, HELD, HOLD, MAP, TOPICS
 from studies.documentation.state_answers import SHOWN, Nodes
 
 #: Topics that carry commands: where their answers come.
 ANSWERED_ON = {"actuator_command": ("actuator_state", ActuatorState), "focus_request": ("focus_state", FocusState)}
+#: Figures of a refused answer that may be 0: what was asked for, is known all the same, or says by 0 that it is not.
+KNOWN = {"curvature", "power", "conic_constant", "dioptre", "duration", "gain_drift", "offset_drift"}
+KNOWN |= {"expected_max_zernike"}
 PATIENCE_S = 120.0
+#: How long focus is followed before that is cancelled, s.
+TRACK_S = 2.0
 TITLE = "## Answers\n"
 #: Codes whose sentences hold nothing that was measured.
 EXACT = (
@@ -47,7 +54,7 @@ class Answer:
     Attributes:
         name: of the interface.
         values: as typed.
-        code: ErrorCode; None = set or refused, of a parameter.
+        code: ErrorCode; None = there is none, of parameters, of the bench and in logs.
         message: as it came.
     """
 
@@ -64,7 +71,7 @@ class Answer:
         text = re.sub(r"; the range was swept: .*", "", text)  # which search serves depends on the images,
         text = re.sub(r" \+- \S+ dioptre", " dioptre", text)  # and only one of them knows its standard error
         exact = self.code is None or self.code in EXACT
-        return text if exact else re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
+        return text if exact else re.sub(r"(?<!\^)[-+]?\d+(\.\d+)?(e[-+]?\d+)?(?!\d*/m)", "…", text)
 
 
 def fill(message: Any, values: Mapping[str, Any]) -> Any:
@@ -89,26 +96,61 @@ def parsed(values: str, names: Mapping[str, str]) -> dict[str, Any]:
     return yaml.safe_load(f"{{{values}}}") or {}
 
 
+def zeros(message: Any) -> set[str]:
+    """The names of all figures in a message that are 0."""
+    found = set()
+    for name, kind in message.get_fields_and_field_types().items():
+        if kind == "double" and getattr(message, name) == 0.0:
+            found.add(name)
+        elif "/" in kind and not kind.startswith("sequence"):
+            found |= zeros(getattr(message, name))
+    return found
+
+
 class Asker(Connection):
     """Calls every interface, see `Connection`."""
 
     def __init__(self, domain: int | None) -> None:
-        interfaces = {name: kind for name, (kind, _) in CASES.items() if name not in ANSWERED_ON}
+        interfaces = {name: kind for name, (kind, _) in (CASES | BENCH).items() if name not in ANSWERED_ON}
         topics = {topic: (kind, qos.STATE) for topic, kind in ANSWERED_ON.values()}
         super().__init__("answers", "", domain, topics, interfaces, timeout_s=60.0)
         self._publishers = {name: self.node.create_publisher(CASES[name][0], name, qos.COMMAND) for name in ANSWERED_ON}
+        self._log: list[Log] = []
+        self.node.create_subscription(Log, "/rosout", self._log.append, 1000)
         self.start()
 
     def ask(self, name: str, values: str, names: Mapping[str, str]) -> Answer:
         """Try one case."""
-        kind, fields = CASES[name][0], parsed(values, names)
+        kind, fields = (CASES | BENCH)[name][0], parsed(values, names)
         if name in ANSWERED_ON:
             answer = self._publish(name, fill(kind(), fields))
         elif hasattr(kind, "Goal"):
             answer = self._goal(self.clients[name], fill(kind.Goal(), fields))
         else:
             answer = call(self.clients[name], fill(kind.Request(), fields), PATIENCE_S)
-        return Answer(name, values, answer.error_code, answer.message)
+        code = getattr(answer, "error_code", None)
+        assert not code or zeros(answer) <= KNOWN, f"{name}: {values}: {zeros(answer) - KNOWN} = 0, not NaN"
+        return Answer(name, values, code, answer.message)
+
+    def tell(self, topic: str) -> Answer:
+        """Publish what is wrong on a topic with data until the node that it is for says so."""
+        kind, values, node = TOPICS[topic]
+        messages = {name: part() for name, part in MAP.items() if topic in MAP}
+        messages[topic] = fill(kind(), parsed(values, {}))
+        publishers = [
+            (self.node.create_publisher(type(message), name, qos.with_lease(qos.LATCHED)), message)
+            for name, message in messages.items()
+        ]
+        words = (topic, values.partition(":")[0])
+        self._log.clear()
+        deadline, said = time.monotonic() + PATIENCE_S, ""
+        while not said and time.monotonic() < deadline:
+            for publisher, message in publishers:
+                publisher.publish(message)
+            time.sleep(0.05)
+            lines = (line.msg for line in self._log if line.name == node)
+            said = next((line for line in lines if any(word in line for word in words)), "")
+        return Answer(topic, values, None, said)
 
     def _publish(self, name: str, message: Any) -> Any:
         topic, _ = ANSWERED_ON[name]
@@ -126,6 +168,9 @@ class Asker(Connection):
         accepted = client.send_goal_async(goal)
         self.wait(accepted.done)
         finished = accepted.result().get_result_async()
+        if getattr(goal, "track", False):  # it ends no other way
+            self.wait(finished.done, TRACK_S)
+            accepted.result().cancel_goal_async()
         self.wait(finished.done, PATIENCE_S)
         return finished.result().result
 
@@ -145,7 +190,7 @@ def run() -> Iterator[Answer]:
         config["calibration"] |= {"write_report": False, "settle_time": 0.1}
         with running_bench(config, folder, domain, DeformableMirrorClient) as client:
             done = client.calibrate(
-                Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES, activate=True), lambda _feedback: None
+                Calibrate.Goal(plan=Calibrate.Goal.PLAN_FULL, activate=True), lambda _feedback: None
             )
             last = max((folder / "maps").iterdir(), key=lambda path: path.stat().st_mtime)
             names = {"LONG": "x" * 5000, "IN_USE": done.id, "LAST_MAP": str(last)}
@@ -154,6 +199,10 @@ def run() -> Iterator[Answer]:
                 for name, (_, cases) in CASES.items():
                     yield from (asker.ask(name, values, names) for values in cases)
                     time.sleep(0.2)  # a move that the last case began
+                yield asker.ask("hold_mirror", HOLD, names)
+                for name, cases in HELD.items():
+                    asker.ask("hold_mirror", HOLD, names)  # the last one took it over
+                    yield from (asker.ask(name, values, names) for values in cases)
                 nodes = Nodes(asker)
                 nodes.check_every_parameter()
                 yield from (
@@ -161,6 +210,8 @@ def run() -> Iterator[Answer]:
                     for node, name, value in SHOWN
                 )
                 yield from (Answer(*answer) for answer in nodes.at_rest())
+                yield from map(asker.tell, TOPICS)
+                yield from (asker.ask(name, values, names) for name, (_, cases) in BENCH.items() for values in cases)
             finally:
                 asker.close()
 
@@ -171,7 +222,8 @@ def section(answers: Iterator[Answer]) -> str:
         TITLE,
         "Asked of a calibrated mirror on the virtual bench; `./dm exec python -m studies.documentation.answers` writes",
         "this section. `[37 x 0.0]` stands for so many values, LONG for a text of 5000 characters. `ros2 param set`",
-        "knows no codes; every parameter of every node refuses a value of another type, by its name.",
+        "knows no codes; every parameter of every node refuses, by its name, a value of another type, twice the",
+        "largest and NaN. Of topics that carry data, the sentence is that in the log of the node that hears them.",
         "",
         "| interface | values | code | sentence |",
         "|---|---|---|---|",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,6 +16,7 @@ from rclpy.parameter import Parameter
 from dm_bringup.nodes import NODES
 from dm_client.connection import Connection
 from dm_common.ros.clients import call
+from dm_common.values import Value
 
 PATIENCE_S = 60.0
 #: Node, parameter and value: right ones, wrong ones, one that nobody knows, and those that wait for another state.
@@ -37,6 +39,15 @@ AT_REST = (
     ("focus_controller", "set_focus", SetFocus),
     ("autofocus", "get_focus_range", GetFocusRange),
 )
+
+
+def _wrong(value: Value) -> Iterator[Any]:
+    """Of another type; where it is a number, beyond the largest, and NaN."""
+    yield 1.5 if value.kind is str else "nonsense"
+    if value.kind in (int, float) and math.isfinite(value.high):
+        yield value.item(2 * value.high + 1)
+    if value.kind is float:
+        yield math.nan
 
 
 class Nodes:
@@ -63,7 +74,7 @@ class Nodes:
         return "" if result.successful else result.reason
 
     def check_every_parameter(self) -> None:
-        """Give every parameter a value of another type, and its own again.
+        """Give every parameter values that it may not have, and its own again.
 
         Raises:
             AssertionError: an answer that does not name the parameter.
@@ -71,8 +82,9 @@ class Nodes:
         for node in NODES:
             for parameter in node.load_parameters():
                 name = parameter.name
-                wrong = self.put(node.name, name, 1.5 if parameter.value.kind is str else "nonsense")
-                assert name in wrong, f"{node.name}: {name}: {wrong!r}"
+                for value in _wrong(parameter.value):
+                    reason = self.put(node.name, name, value)
+                    assert name in reason, f"{node.name}: {name} = {value!r}: {reason!r}"
                 request = GetParameters.Request(names=[name])
                 (now,) = self.ask(GetParameters, f"{node.name}/get_parameters", request).values
                 again = self._put(node.name, Message(name=name, value=now))

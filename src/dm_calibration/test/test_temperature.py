@@ -13,11 +13,15 @@ from dm_common.messages import time_message
 
 
 class Node:
-    """Has a clock and takes the subscription."""
+    """Has a clock, takes the subscription and keeps warnings."""
 
     def __init__(self) -> None:
         self.seconds = 1000.0
         self.read: Any = None
+        self.warnings: list[str] = []
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(warning=lambda text, **_throttle: self.warnings.append(text))
 
     def get_clock(self) -> Any:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=round(1e9 * self.seconds)))
@@ -66,6 +70,10 @@ def test_readings_that_are_none_are_left_out(node: Node, log: TemperatureLog) ->
     for value, seconds in ((float("nan"), 1000.0), (1e4, 1000.0), (21.0, 5000.0)):
         node.say(value, seconds)
     assert log.now() != log.now()
+    assert node.warnings[1:] == [
+        "reading not taken: temperature = 10000 degC: must be -100 to 200 degC",
+        "reading not taken: header.stamp is 4000 s ahead of now",
+    ]
     node.say(21.0, 0.0)  # without a stamp it is of now
     assert log.now() == 21.0
 

@@ -38,9 +38,13 @@ class TemperatureLog:
         while self._readings and self._readings[-1][0] > latest:
             self._readings.pop()  # of before the clock was set back
         # One that a clock set back or a torn driver has spoilt is none; one that comes late keeps its place.
-        if POSSIBLE[0] <= message.temperature <= POSSIBLE[1] and stamp <= latest:
+        if (possible := POSSIBLE[0] <= message.temperature <= POSSIBLE[1]) and stamp <= latest:
             insort(self._readings, (stamp, message.temperature))
             del self._readings[:-KEPT]
+        else:
+            wrong = f"temperature = {message.temperature:g} degC: must be {POSSIBLE[0]:g} to {POSSIBLE[1]:g} degC"
+            text = f"header.stamp is {stamp - now:.0f} s ahead of now" if possible else wrong
+            self._node.get_logger().warning(f"reading not taken: {text}", throttle_duration_sec=60.0)
 
     def at(self, time: float) -> float:
         """degC at `time` (s): the last reading before it; NaN when there is none that is recent enough."""
