@@ -82,6 +82,25 @@ def test_retrace_error_from_the_tilts_that_maps_happen_to_have(tmp_path: Path) -
     assert error(files[-1], truth, settings) < 1.5e-9 < 6e-9 < error(files[-1], truth, SETTINGS)
 
 
+def test_regions_that_stand_off_by_whole_fringes_are_brought_back(tmp_path: Path) -> None:
+    with bench(tmp_path, phase_steps=3.0) as simulated:
+        files = [simulated.measure() for _ in range(4)]
+        truth = simulated.interferometer.true_sag(simulated.displacement())
+    assert all(error(file, truth, SETTINGS) < 1.5e-9 for file in files)
+    assert sum(Ingest().read(file, SETTINGS)[0].phase_steps for file in files) > 6
+
+
+def test_ripples_by_vibration_average_out(tmp_path: Path) -> None:
+    with bench(tmp_path, vibration=10e-9, tilt_spread=0.0) as simulated:
+        files = [simulated.measure() for _ in range(32)]
+        truth = simulated.interferometer.true_sag(simulated.displacement())
+    ingest = Ingest()
+    wanted = ingest.measure(SurfaceMap(truth, 632.8e-9, None, "array"), SETTINGS)[1].coefficients
+    apart = np.array([ingest.read(file, SETTINGS)[1].coefficients - wanted for file in files])[:, PISTON_TILT:]
+    single = np.sqrt(np.square(apart).mean(axis=0)).max()
+    assert np.abs(apart.mean(axis=0)).max() < 0.2 * single and single > 5e-9
+
+
 def test_distortion_from_a_grid_of_marks(tmp_path: Path) -> None:
     distortion = 0.004
     quiet = {"pixel_noise": 0.0, "low_order_noise": 0.0, "specks": 0, "blobs": 0}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.optics.aperture import find_aperture
 from dm_common import Floats
+from dm_common.optics.zernike import MAX_ORDER
 
 #: Highest radial order of the flats' errors that is found.
 ORDER = 12
@@ -83,7 +84,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
     seen[:, 0], seen[turning, 1] = measured[: len(orders)], measured[len(orders) :]
     flats = list(dict.fromkeys(name for test in tests for name in (test.reference, test.part)))
     sag, everywhere = np.where(disc, 0.0, np.nan), aperture.places(*np.nonzero(disc))
-    squares, freedom, worst, open_orders = 0.0, 0, 0.0, set[int]()
+    squares, judged, freedom, worst, open_orders = 0.0, 0.0, 0, 0.0, set[int]()
     for (n, m), coefficients in zip(orders, seen, strict=True):
         if n < 2:  # piston and tilt are those of the mounts
             continue
@@ -91,8 +92,13 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         inverse = np.linalg.pinv(matrix, rcond=DETERMINED)
         told = np.isclose(np.diag(inverse @ matrix), 1.0)[: 2 if m else 1]
         solution = inverse @ coefficients.T.ravel()
-        squares += float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
-        freedom += (2 if m else 1) * len(tests) - int(np.linalg.matrix_rank(matrix, rtol=DETERMINED))
+        apart = float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
+        squares += apart
+        if (
+            n <= MAX_ORDER
+        ):  # what the bound is for: retrace error and vibration spoil these more than those of higher orders
+            judged += apart
+            freedom += (2 if m else 1) * len(tests) - int(np.linalg.matrix_rank(matrix, rtol=DETERMINED))
         worst = max(worst, *np.linalg.norm(inverse[: len(told)], axis=1)[told], 0.0)
         if not told.all():
             open_orders.add(m)
@@ -100,7 +106,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         sag[disc] += np.real(known * _term(everywhere, n, m))
     if len(open_orders) == ORDER + 1:
         raise ValueError(f"{len(tests)} maps of {', '.join(flats)} tell no flat from another: exchange or turn them")
-    sigma = np.sqrt(squares / freedom) if freedom else np.nan
+    sigma = np.sqrt(judged / freedom) if freedom else np.nan
     left = np.sqrt(squares / len(tests))
     return FlatError(sag, float(LARGEST_SIGMAS * worst * sigma), float(left), tuple(sorted(open_orders)))
 

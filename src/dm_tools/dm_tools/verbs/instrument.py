@@ -40,10 +40,18 @@ def instrument(
 ) -> None:
     """Find the errors of the interferometer itself from files, as parameters to paste. Needs no nodes."""
     from dm_calibration.influence.poke_cure import parameter_text
-    from dm_calibration.map_files import MapFileError, read_map
+    from dm_calibration.map_files import read_map
+    from dm_calibration.optics.phase_steps import PhaseStepError, mend_phase_steps
+    from dm_common.errors import CodedError
 
     def read(path: Path) -> Any:
-        return read_map(path, xyz_unit=xyz_unit or None)
+        surface = read_map(path, xyz_unit=xyz_unit or None)
+        if not surface.wavelength:  # the file does not tell it
+            return surface
+        try:
+            return replace(surface, sag=mend_phase_steps(surface.sag, 0.5 * surface.wavelength)[0])
+        except PhaseStepError as error:
+            raise PhaseStepError(f"{path}: {error}") from error
 
     if (write is not None) != (procedure is Procedure.FLATS):
         raise typer.BadParameter("--write FILE.fits: flats need it, the others leave no file")
@@ -57,7 +65,7 @@ def instrument(
             found = _retrace([read(file).sag for file in files])
         else:
             found = _grid(files[0], read(files[1]).sag.shape)
-    except (MapFileError, ValueError, OSError) as error:
+    except (CodedError, ValueError, OSError) as error:
         raise typer.BadParameter(str(error)) from error
     console.print(parameter_text({"interferometer": found}), soft_wrap=True, markup=False, highlight=False)
     write_json(json, {"instrument": found})
