@@ -110,12 +110,34 @@ def test_the_sentence_gives_turn_image_shift_and_their_errors() -> None:
     assert re.fullmatch(pattern, findings[0]), findings[0]
 
 
+TURNS, SHIFTS, SCALES = st.floats(-np.pi, np.pi), st.floats(-1.5e-3, 1.5e-3), st.floats(0.98, 1.02)
+
+
+@settings(max_examples=25, deadline=None)
+@given(TURNS, st.booleans(), st.tuples(SHIFTS, SHIFTS), SCALES, st.integers(0, 10**6), st.booleans())
+def test_any_mounting_with_any_numbering(
+    turn: float, mirrored: bool, shift: tuple[float, float], scale: float, seed: int, by_rings: bool
+) -> None:
+    """Rings begun at another actuator, or no order at all: each is found where it stands, by whichever turn."""
+    random = np.random.default_rng(seed)
+    rings = np.split(np.arange(37), [1, 7, 19])
+    begun = np.concatenate([np.roll(ring, random.integers(ring.size)) for ring in rings])
+    order = begun if by_rings else random.permutation(37)
+    x, y = stand(turn, mirrored, complex(*shift), scale)
+    result = check(response(x[order], y[order], seed=seed))
+    stands = result.registration
+    assert stands is not None
+    found_x, found_y = stand(stands.turn, stands.mirrored, complex(*stands.shift), stands.scale)
+    apart = np.hypot(found_x[result.place] - x[order], found_y[result.place] - y[order])
+    assert apart.max() < 1e-4, result.standing
+
+
 @settings(max_examples=40, deadline=None)
 @given(
-    st.floats(-np.pi, np.pi),
+    TURNS,
     st.booleans(),
-    st.tuples(st.floats(-1.5e-3, 1.5e-3), st.floats(-1.5e-3, 1.5e-3)),
-    st.floats(0.98, 1.02),
+    st.tuples(SHIFTS, SHIFTS),
+    SCALES,
     st.integers(0, 10**6),
     st.lists(st.sampled_from(["dead", "weak", "inverted", "doubled", "crossed"]), max_size=5),
 )
