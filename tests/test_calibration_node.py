@@ -24,6 +24,7 @@ from calibration_stand_in import StandIn, doubles
 from dm_calibration.calibration_node import CalibrationNode
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
+from dm_calibration.procedure.recorded_run import planned
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import ErrorCode
 from dm_common.optics.piston_tilt import remove_piston_tilt
@@ -104,6 +105,8 @@ def test_calibrate_store_publish_and_serve(node: NodeProcess, bench: StandIn, ob
     assert result.duration > 0.0
     assert seen and all(feedback.steps == 2 * ACTUATORS + 6 for feedback in seen)
     assert any(feedback.phase == Calibrate.Feedback.PHASE_POKES for feedback in seen)
+    plan, maps_per_state = planned(seen[0].plan, make_mirror(RINGS))
+    assert plan.kind is PlanKind.POKES and len(plan.steps) == seen[0].steps and maps_per_state == 1
 
     message = wait_until(lambda: received[-1] if received[-1].id else None, 60)
     assert message.id == result.id and message.file == result.file == str(folder / f"{result.id}.h5")

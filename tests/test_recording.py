@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +69,8 @@ def session_messages(run: RecordedRun) -> list[tuple[str, Any]]:
         ("/mirror_info", mirror_info_of(run.mirror)),
         ("/actuator_state", ActuatorState(requested=rest, applied=rest, turns=7, degausses=2)),
     ]
-    for step, label in sorted(run.labels.items()):
-        told = Calibrate.Impl.FeedbackMessage()
-        told.feedback.step, told.feedback.steps, told.feedback.label = step, run.steps, label
-        messages.append(("/calibrate/_action/feedback", told))
+    told = Calibrate.Impl.FeedbackMessage(feedback=Calibrate.Feedback(plan=run.plan))
+    messages.append(("/calibrate/_action/feedback", told))
     events: list[tuple[int, list[tuple[str, Any]]]] = []
     degausses = 2
     for number, move in enumerate(run.moves, start=8):
@@ -153,6 +152,16 @@ def test_a_recording_without_hidden_topics_says_how_to_make_one(
     messages = [message for message in run_and_bag[2].read() if "/_" not in message.topic.name]
     write_rosbag2(tmp_path / "theirs", messages, "mcap")
     with pytest.raises(RecordingError, match="--include-hidden-topics"):
+        read_session(BagReader(tmp_path / "theirs"))
+
+
+def test_a_recording_of_another_version_is_refused(
+    run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
+) -> None:
+    """Whose feedback had a field less."""
+    shorter = [replace(m, data=m.data[: -4 if "/_" in m.topic.name else None]) for m in run_and_bag[2].read()]
+    write_rosbag2(tmp_path / "theirs", shorter, "mcap")
+    with pytest.raises(RecordingError, match="feedback: dm_msgs/action/Calibrate_FeedbackMessage had another layout"):
         read_session(BagReader(tmp_path / "theirs"))
 
 

@@ -18,6 +18,7 @@ from dm_calibration.procedure.event_frames import Storing
 from dm_calibration.procedure.forecast import GoodEnough, forecast
 from dm_calibration.procedure.plan import LAST_PART_ENDS, Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
+from dm_calibration.procedure.recorded_run import plan_text
 from dm_calibration.procedure.resumable_run import OpenRun, ResumeOptions, identity_of, mirror_facts, open_run
 from dm_calibration.procedure.unfinished_runs import UnfinishedRuns
 from dm_common.errors import EXPECTED, ErrorCode, Refusal, error_code
@@ -95,7 +96,7 @@ class CalibrateAction:
     ) -> None:
         """Begin or resume a run, keep each map as it comes, conclude; fills `result`, also after a failure."""
         run = self._opened(handle.request, plan, options, mirror, runs)
-        procedure, report = self._procedure(handle, plan, mirror, run)
+        procedure, report = self._procedure(handle, plan, options, mirror, run)
         try:
             if run.storing is None:  # else all is measured, and what may be stored already must stay as it is
                 procedure.run()
@@ -169,10 +170,11 @@ class CalibrateAction:
             result.message = f"{maps} maps in about {expected.duration:.0f} s{guess}{accuracy}; nothing was moved"
 
     def _procedure(
-        self, handle: WorkerGoal, plan: Plan, mirror: Mirror, run: OpenRun
+        self, handle: WorkerGoal, plan: Plan, options: PlanOptions, mirror: Mirror, run: OpenRun
     ) -> tuple[Procedure, Callable[[int, str, int], None]]:
         """The run of `plan`, and a function that reports phase, label and step."""
         feedback = Calibrate.Feedback(steps=len(plan.steps))
+        feedback.plan = plan_text(plan.kind, options, handle.request.maps_per_state or 1)
         sent = -FEEDBACK_PERIOD_S
 
         def report(phase: int, label: str, step: int) -> None:

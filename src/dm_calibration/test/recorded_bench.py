@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions, Progress
-from dm_calibration.procedure.recorded_run import RecordedRun
+from dm_calibration.procedure.procedure import Outcome, Procedure, ProcedureOptions
+from dm_calibration.procedure.recorded_run import RecordedRun, plan_text
 from hysteretic_mirror import MIRROR, lagging_bench
 
 
@@ -21,14 +21,7 @@ def recorded(
     bench = lagging_bench()
     bench.failing = dict.fromkeys(failing, 99)
     plan = make_plan(kind, MIRROR, options)
-    labels: dict[int, str] = {}
-
-    def follow(progress: Progress) -> None:
-        """Feedback is published at most so often: every second step is reported."""
-        if progress.done < progress.steps and progress.done % 2 == 0:
-            labels[progress.done] = progress.label
-
     how = ProcedureOptions(maps_per_state=maps_per_state)
-    outcome = Procedure(plan, MIRROR, bench, how, progress=follow, enough=enough).run()
+    outcome = Procedure(plan, MIRROR, bench, how, enough=enough).run()
     bench.apply(MIRROR.rest)  # as the node does when a run has ended
-    return RecordedRun(MIRROR, tuple(bench.moves), tuple(bench.maps), labels, len(plan.steps)), outcome
+    return RecordedRun(MIRROR, tuple(bench.moves), tuple(bench.maps), plan_text(kind, options, maps_per_state)), outcome

@@ -1,7 +1,7 @@
 """What a recording says of a calibration run, and the calibration made again from it."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
@@ -14,8 +14,7 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibration_parameters import PARAMETERS, fit_options, procedure_options
 from dm_calibration.calibrator import Provenance, calibrate
-from dm_calibration.procedure.plan import PlanOptions
-from dm_calibration.procedure.recorded_run import Move, RecordedRun, RecordingError, maps_per_state, repeat_run
+from dm_calibration.procedure.recorded_run import Move, RecordedRun, RecordingError, repeat_run
 from dm_common.measurement import Measurement
 from dm_common.messages import measurement_from, mirror_from, stamp_ns
 from dm_common.mirror import Mirror
@@ -52,8 +51,7 @@ class _Run:
     """One goal of `calibrate` while its messages are gathered."""
 
     begun: int
-    labels: dict[int, str] = field(default_factory=dict)
-    steps: int = 0
+    plan: str = ""
     ended: int = 0
 
 
@@ -80,7 +78,7 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     """Run `number` (1 = the first, 0 = the last) of the recording.
 
     Raises:
-        RecordingError: no such run, or topics that are missing.
+        RecordingError: no such run, topics that are missing, or messages that another version recorded.
         BagError: the file is damaged.
     """
     prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
@@ -108,7 +106,7 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     maps = _maps(received, chosen.begun, end)
     moves = [move for time, move in _moves(received["actuator_state"], mirror) if chosen.begun <= time < end]
     before = [message for time, message in received["calibration"] if time < chosen.begun and message.id]
-    run = RecordedRun(mirror, tuple(moves), maps, chosen.labels, chosen.steps, _model(before[-1]) if before else None)
+    run = RecordedRun(mirror, tuple(moves), maps, chosen.plan, _model(before[-1]) if before else None)
     parameters, remarks = _parameters(bag, f"{prefix}calibration", chosen.begun)
     last = max((measured.stamp_ns for measured in maps), default=-1)
     known = {message.id for message in before}
@@ -131,9 +129,7 @@ def recalibrate(session: Session, identifier: str, created_ns: int) -> Calibrati
         TooFewMapsError, ValueError: as live.
     """
     values, run = session.parameters, session.run
-    configured = PlanOptions(values["poke_amplitude"], values["reference_every"])
-    options = procedure_options(values, maps_per_state(run))
-    _plan, outcome = repeat_run(run, options, configured)
+    _plan, outcome = repeat_run(run, procedure_options(values))
     provenance = Provenance(identifier, created_ns, "made again from a recording")
     return calibrate(outcome, mirror=run.mirror, options=fit_options(values), provenance=provenance)
 
@@ -149,18 +145,22 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _decode(message: Message) -> Any:
-    return deserialize_message(message.data, message_class(message.topic.type_name))
+    topic = message.topic
+    try:
+        return deserialize_message(message.data, message_class(topic.type_name))
+    except RuntimeError as error:  # of the middleware
+        raise RecordingError(
+            f"{topic.name}: {topic.type_name} had another layout when it was recorded: a calibration is made again by "
+            "the version that recorded it only"
+        ) from error
 
 
 def _runs(messages: Iterable[tuple[int, Any]]) -> list[_Run]:
     """Goals in the order they began."""
     runs: dict[bytes, _Run] = {}
     for time, message in messages:
-        feedback = message.feedback
-        run = runs.setdefault(bytes(message.goal_id.uuid), _Run(begun=time))
-        run.ended, run.steps = time, feedback.steps
-        if feedback.step < feedback.steps and feedback.phase not in (feedback.PHASE_FIT, feedback.PHASE_STORE):
-            run.labels[feedback.step] = feedback.label
+        run = runs.setdefault(bytes(message.goal_id.uuid), _Run(begun=time, plan=message.feedback.plan))
+        run.ended = time
     return list(runs.values())
 
 
