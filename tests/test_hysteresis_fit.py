@@ -61,13 +61,13 @@ def plays(maps: MapSet) -> HysteresisFit:
 
 
 def test_commands_without_a_map_stay_in_the_history() -> None:
-    blind = ("excitation 30", "excitation 31", "check 95")
+    blind = ("rest 3", "excitation 30", "excitation 31", "check 95")
     maps = run(blind)
     assert maps.label == run().label
     assert not np.isfinite(maps.coefficients[[maps.label.index(label) for label in blind]]).any()
     whole, gappy = fitted(), plays(maps)
     assert gappy.maps == whole.maps - len(blind)
-    assert gappy.held_out_max_zernike < 2.0 * whole.held_out_max_zernike
+    assert 0.5 < gappy.held_out_max_zernike / whole.held_out_max_zernike < 2.0
     assert any("excitation 30" in remark for remark in gappy.remarks)
 
 

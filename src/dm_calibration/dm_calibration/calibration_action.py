@@ -156,7 +156,7 @@ class CalibrateAction:
         """Fill in what is to be expected; the message of a dry run."""
         in_use, taken, guessed = self._manager.in_use, self._services.map_time, self._values["map_time"]
         settle_time = goal.settle_time or self._values["settle_time"]
-        expected = forecast(plan, settle_time, in_use, taken, mirror, goal.until, guessed)
+        expected = forecast(plan, settle_time, in_use, mirror, taken, goal.until, guessed)
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = expected.maps or sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)

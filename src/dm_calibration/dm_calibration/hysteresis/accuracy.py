@@ -27,7 +27,7 @@ TYPICAL_NOISE = 2e-10
 #: the run, a law that is nearly right only. What held-out simulated maps show where (X'X)^-1 says much less, from
 #: 300 maps on.
 FLOOR = 3.5e-10
-#: Draws for quantiles of the largest of many errors.
+#: Draws for quantiles of the largest of many correlated errors.
 DRAWS = 4000
 #: Directions of the features weaker than this share of the strongest cannot be distinguished, and need not be.
 RESOLVED = 1e-7
@@ -83,8 +83,13 @@ def expected_accuracy(
     features = _features(signals, time, start)
     free = np.linalg.qr(gains[~check, :3])[0]
     covariance += scale**2 * _shared_error(without(features[~check], free), features[check], response)
+    return ExpectedAccuracy(np.sqrt(np.diag(covariance)), largest_of(covariance))
+
+
+def largest_of(covariance: Floats) -> float:
+    """95 % quantile of the largest of D errors with `covariance` (D, D), in their unit."""
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
-    return ExpectedAccuracy(np.sqrt(np.diag(covariance)), float(np.quantile(np.abs(draws).max(axis=1), 0.95)))
+    return float(np.quantile(np.abs(draws).max(axis=1), 0.95))
 
 
 def _features(signals: Floats, time: Floats, start: float) -> Floats:

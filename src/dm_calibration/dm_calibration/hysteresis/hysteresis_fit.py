@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dm_calibration.hysteresis.accuracy import largest_of
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Candidate, Run
 from dm_calibration.hysteresis.creep_uncertainty import creep_covariance
 from dm_calibration.hysteresis.features import follow, weights_of
@@ -21,8 +22,6 @@ from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 #: A map whose residual is so many times the median contradicts the law: somebody touched the mirror, or the map is of
 #: another. The law is fitted again without such maps, a few times, unless they are too many to be exceptions.
 OUTLIER, OUTLIER_ROUNDS, OUTLIERS_MAX = 8.0, 4, 0.1
-#: Draws for quantiles of the largest of many correlated errors.
-DRAWS = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +60,7 @@ def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -
     run = Run(maps.applied, time, responses_of(maps), -BEFORE_FIRST_MAP_S, maps.moved_s(), maps.segment)
     test = np.array([kind == CHECK for kind in maps.kind])
     found, run = _without_outliers(run, test, candidates)
-    covariance = _error_covariance(found, run, maps.terms)
-    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance, DRAWS, method="svd")
+    covariance = _error_covariance(found, run.responses.coefficients, maps)
     sigma = np.concatenate((np.zeros(PISTON_TILT), np.sqrt(np.diag(covariance))))
     law = _followed(maps, found.fit.law, run.responses)[1]
     if law.creep_rate:
@@ -71,7 +69,7 @@ def fit_hysteresis(maps: MapSet, candidates: Sequence[Candidate] = CANDIDATES) -
         name=found.fit.candidate.name,
         law=law,
         zernike_sigma=sigma,
-        held_out_max_zernike=float(np.quantile(np.abs(draws).max(axis=1), 0.95)),
+        held_out_max_zernike=largest_of(covariance),
         unknown_sigma=unknown_history_sigma(found.fit.law),
         maps=int(run.responses.usable.sum()),
         remarks=(*_remarks(found), *_left_out(maps, run)),
@@ -187,21 +185,11 @@ def unknown_history_sigma(law: HysteresisModel) -> float:
     return float(np.std(differences) / np.sqrt(2.0))
 
 
-def _error_covariance(found: Identification, run: Run, terms: int) -> Floats:
-    """(K - 3, K - 3) m^2 of the coefficients of moves predicted, without the noise of their maps."""
-    count = run.responses.coefficients
-    scale = TERM_RMS[PISTON_TILT:terms]
-    rows = found.held_out[:, :count] / scale
+def _error_covariance(found: Identification, count: int, maps: MapSet) -> Floats:
+    """(K - 3, K - 3) m^2 of the `count` coefficients of moves predicted, without the noise of their maps."""
+    rows = found.held_out[:, :count] / TERM_RMS[PISTON_TILT : maps.terms]
     rows = rows[np.isfinite(rows).all(axis=1)]
-    covariance = rows.T @ rows / len(rows)
-    same = (np.diff(run.signals, axis=0) == 0.0).all(axis=1)
-    same[[part.start - 1 for part in run.parts[1:]]] = False  # a degauss lies between
-    repeated = np.flatnonzero(same) + 1
-    if repeated.size >= 3:
-        values = run.responses.values[:, :count] / scale
-        noise = 0.5 * np.mean(np.square(values[repeated] - values[repeated - 1]), axis=0)
-        covariance = covariance - np.diag(noise)
-    size, axes = np.linalg.eigh(covariance)
+    size, axes = np.linalg.eigh(rows.T @ rows / len(rows) - np.diag(maps.noise_variance()))
     return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
 
 

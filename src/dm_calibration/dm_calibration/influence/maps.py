@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dm_common import Floats
 from dm_common.measurement import Measurement
 from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import PISTON_TILT
 
 REFERENCE = "reference"
 POKE = "poke"
@@ -19,6 +20,8 @@ SURFACE = "surface"
 EXCITATION = "excitation"
 CHECK = "check"
 KINDS = (REFERENCE, POKE, SURFACE, EXCITATION, CHECK)
+#: Fewest pairs of maps of the same command that tell the noise.
+PAIRS_MIN = 3
 
 
 def same_points(a: SamplePoints, b: SamplePoints) -> bool:
@@ -96,6 +99,15 @@ class MapSet:
         plausible = (self.moved_ns > 0) & (self.moved_ns <= self.stamp_ns)
         plausible[1:] &= self.moved_ns[1:] >= self.stamp_ns[:-1]
         return np.asarray(1e-9 * (np.where(plausible, self.moved_ns, before) - self.stamp_ns[0]))
+
+    def noise_variance(self) -> Floats:
+        """(K - 3,) m^2 of the coefficients of one map, from maps of the same command that follow each other; 0 where
+        these are too few.
+        """
+        same = (np.diff(self.applied, axis=0) == 0.0).all(axis=1) & (np.diff(self.segment) == 0)
+        change = np.diff(self.coefficients[:, PISTON_TILT:], axis=0)[same]
+        change = change[np.isfinite(change).all(axis=1)]
+        return 0.5 * np.square(change).mean(axis=0) if len(change) >= PAIRS_MIN else np.zeros(change.shape[1])
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """What a hysteresis plan will take and give, before anything moves."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -8,7 +9,6 @@ import numpy as np
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.accuracy import TYPICAL_NOISE, expected_accuracy
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
-from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.registration import bumps
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
@@ -19,10 +19,8 @@ from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.piston_tilt import weighted_fit
 from dm_common.optics.sampling import edge_clustered_points
-from dm_common.optics.zernike import PISTON_TILT, basis
+from dm_common.optics.zernike import basis
 
-#: Fewest pairs of maps of the same command that tell the noise.
-PAIRS_MIN = 4
 #: A run stands still when so many parts together better it by less than this share.
 STANDSTILL_PARTS, STANDSTILL = 2, 0.05
 #: What the data sheets of piezo mirrors say: rise of the surface over an actuator per unit signal, m, and the width of
@@ -45,8 +43,8 @@ def forecast(
     plan: Plan,
     settle_time: float,
     earlier: Calibration | None,
+    mirror: Mirror,
     map_time: float = 0.0,
-    mirror: Mirror | None = None,
     until: float = 0.0,
     guessed: float = 1.0,
 ) -> Forecast:
@@ -55,8 +53,8 @@ def forecast(
     Args:
         settle_time: s between command and map.
         earlier: calibration of the same mirror that tells gains and noise; None = there is none.
+        mirror: whose data sheet counts where there is no calibration.
         map_time: s that the last map took; 0 = none was taken: then as in `earlier`, or `guessed`.
-        mirror: whose data sheet counts where there is no calibration; None = the accuracy is then not known.
         until: m at which the run ends, where its plan may.
         guessed: s that a map is said to take where nothing tells it.
     """
@@ -69,15 +67,12 @@ def forecast(
     duration = float(time[-1]) if len(time) else 0.0
     signals = [step.signals for step in steps if step.signals is not None]
     check = np.array([step.kind is StepKind.CHECK for step in steps], dtype=bool)
-    if (earlier is None and mirror is None) or len(signals) < len(steps) or not check.any():
+    # Of a single actuator no neighbour's distance tells the width of its bump.
+    if (earlier is None and mirror.x.size < 2) or len(signals) < len(steps) or not check.any():
         return Forecast(duration, 0.0)
+    noise, influence = TYPICAL_NOISE, earlier.fit.influence_zernike if earlier else typical_influence(mirror)
     if earlier is not None:
-        noise, influence = map_noise(earlier.maps), earlier.fit.influence_zernike
-    else:
-        assert mirror is not None
-        if mirror.x.size < 2:  # no neighbour whose distance tells the width of a bump
-            return Forecast(duration, 0.0)
-        noise, influence = TYPICAL_NOISE, typical_influence(mirror)
+        noise = math.sqrt(earlier.maps.noise_variance().mean()) or TYPICAL_NOISE
     parts = [*(end - 1 for end in sorted(plan.ends)), len(steps)]  # the degauss is no step here
     expected = Forecast(duration, 0.0)
     for part in parts:
@@ -137,13 +132,3 @@ class GoodEnough:
             return f"{in_nanometres(self._until)} is reached: {in_nanometres(found)}{parts}"
         reason = "more maps did not help" if self._no_longer_better else "no more maps were allowed (hysteresis_maps)"
         return f"{in_nanometres(self._until)} is not reached, {in_nanometres(found)} is: {reason}{parts}"
-
-
-def map_noise(maps: MapSet) -> float:
-    """Standard deviation of a coefficient of one map, m, from maps of the same command that follow each other."""
-    same = (np.diff(maps.applied, axis=0) == 0.0).all(axis=1)
-    change = np.diff(maps.coefficients[:, PISTON_TILT:], axis=0)[same]
-    change = change[np.isfinite(change).all(axis=1)]
-    if len(change) < PAIRS_MIN:
-        return TYPICAL_NOISE
-    return float(np.sqrt(0.5 * np.mean(np.square(change))))
