@@ -65,7 +65,7 @@ def main(place: str) -> int:
         case "after_store":
             store.write_whole = after(place, store.write_whole)
         case "read_back":
-            calibration_manager.map_hashes = before(place, calibration_manager.map_hashes)
+            calibration_manager.raw_hash = before(place, calibration_manager.raw_hash)
         case "frame":
             run_journal.os = type("Os", (), {**vars(os), "pwrite": staticmethod(half_a_frame)})  # type: ignore[assignment]
     return calibration_node.main()

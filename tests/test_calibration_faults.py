@@ -20,12 +20,12 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_msgs.srv import ListCalibrations, LoadCalibration
 
 from calibration_stand_in import StandIn
-from dm_calibration.procedure.event_frames import map_hashes, record_hash
 from dm_calibration.procedure.run_journal import read_run
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.errors import ErrorCode
 from dm_common.ros import qos
 from linear_mirror import LinearMirror, make_mirror
+from map_hashes import map_hashes, record_hash
 from stuck_calibration import MARK
 from support import NodeProcess, Observer, wait_until
 

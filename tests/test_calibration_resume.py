@@ -19,7 +19,7 @@ from dm_calibration.hysteresis.candidate_fit import CANDIDATES
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.procedure.event_frames import Storing, map_hashes, record_hash
+from dm_calibration.procedure.event_frames import Storing
 from dm_calibration.procedure.outcome import Event, MapTaken
 from dm_calibration.procedure.plan import Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
@@ -31,6 +31,7 @@ from dm_common.atomic_write import StoreError
 from dm_common.errors import Refusal
 from dm_common.measurement import Measurement
 from hysteretic_mirror import MIRROR, lagging_bench
+from map_hashes import map_hashes, record_hash
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = pytest.mark.slow

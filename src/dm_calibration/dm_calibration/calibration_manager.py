@@ -8,8 +8,7 @@ from pathlib import Path
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance
-from dm_calibration.procedure.event_frames import map_hashes
-from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError
+from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError, raw_hash
 from dm_common.atomic_write import StoreError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.mirror import Mirror, mismatch
@@ -194,7 +193,7 @@ class CalibrationManager:
             file = self.store.find(calibration.id)
         except UnknownCalibrationError:
             file = self.store.save(calibration)
-        if map_hashes(self.store.load(calibration.id).maps) != map_hashes(calibration.maps):
+        if raw_hash(self.store.load(calibration.id)) != raw_hash(calibration):
             raise StoreError(f"calibration {calibration.id}: the maps in {file} are not those that were measured")
         return file
 

@@ -15,7 +15,6 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_messages import calibration_message, put_updates
 from dm_calibration.hysteresis.features import follow
-from dm_calibration.procedure.event_frames import record_hash
 from dm_calibration.procedure.outcome import Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.resumable_run import ResumeOptions, identity_of, open_run
@@ -25,6 +24,7 @@ from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common import Floats
 from dm_common.messages import hysteresis_model_from, recipe_book_from
 from linear_mirror import make_mirror
+from map_hashes import record_hash
 
 STORED = Path(__file__).with_name("stored")
 EXPECTED: dict[str, Floats] = dict(np.load(STORED / "expected.npz"))

@@ -21,7 +21,6 @@ import numpy as np
 from dm_msgs.action import Calibrate
 from dm_msgs.msg import ErrorCode
 
-from dm_calibration.procedure.event_frames import map_hashes, record_hash
 from dm_calibration.procedure.run_journal import read_run
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.ros.clients import ThreadedActionClient
@@ -29,6 +28,7 @@ from fault_injection.fault import Fault, FaultRecord
 from fault_injection.rigs.driver_rig import RigError
 from fault_injection.rigs.parts import checked
 from fault_injection.rigs.process_rig import ProcessRig
+from map_hashes import map_hashes, record_hash
 
 #: Push and pull of 37 actuators, a reference frame before each ten and at the end.
 STATES = 2 * 37 + 9

@@ -124,15 +124,3 @@ def _rebuilt(values: dict[str, Any], payload: memoryview) -> dict[str, Any]:
         else:
             made[name] = tuple(value) if isinstance(value, list) else value
     return made
-
-
-def map_hashes(maps: MapSet) -> list[str]:
-    """SHA-256 over what was measured in each map: equal only when every bit is."""
-    return [record_hash(record) for record in maps.measurements()]
-
-
-def record_hash(record: Measurement) -> str:
-    """The same of one map."""
-    arrays: list[bytes] = []
-    head = json.dumps(_plain(record, arrays))
-    return hashlib.sha256(head.encode() + b"".join(arrays)).hexdigest()

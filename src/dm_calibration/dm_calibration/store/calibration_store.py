@@ -83,12 +83,7 @@ class CalibrationStore:
             CalibrationFileError: the old file is damaged: it is not overwritten.
         """
         target = self.find(calibration.id)
-        stored = to_columns(self.load(calibration.id))[0]
-        columns = to_columns(calibration)[0]
-        raw = [name for name in stored.keys() | columns.keys() if name.startswith(_RAW)]
-        if content_hash({n: stored[n] for n in raw if n in stored}, {}) != content_hash(
-            {n: columns[n] for n in raw if n in columns}, {}
-        ):
+        if raw_hash(self.load(calibration.id)) != raw_hash(calibration):
             raise StoreError(f"calibration {calibration.id}: its raw data differ from those in the file; not replaced")
         self._write(target, calibration)
         return target
@@ -154,6 +149,12 @@ def check_id(identifier: str) -> None:
     """Raise ValueError unless `identifier` is a safe file stem."""
     if not _ID.fullmatch(identifier):
         raise ValueError(f"calibration id {identifier!r}: letters, digits, '.', '_', '-', at most 128, no leading dot")
+
+
+def raw_hash(calibration: Calibration) -> str:
+    """Of what was measured, and where: equal only when every bit is."""
+    columns = to_columns(calibration)[0]
+    return content_hash({name: values for name, values in columns.items() if name.startswith(_RAW)}, {})
 
 
 def _read(file: Path) -> Calibration:
