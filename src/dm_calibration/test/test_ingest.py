@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from std_msgs.msg import Header
 
-from dm_calibration.acquisition.ingest import Ingest, IngestSettings, MapRejectedError
+from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.interferometer_messages import zernike_message
 from dm_calibration.acquisition.reference_surface import load_reference
 from dm_calibration.map_files import NoValidPixelsError, read_map
-from dm_calibration.optics.aperture import InsufficientDataError
+from dm_calibration.optics.aperture import InsufficientDataError, MapRejectedError
 from dm_calibration.optics.orientation import Orientation
 from dm_common.measurement import Measurement
 from dm_common.optics.conic import conic_sag, pitch_of_sphere

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.map_files import SurfaceMap
-from dm_calibration.optics.phase_steps import PhaseStepError, mend_phase_steps
+from dm_calibration.optics.aperture import MapRejectedError
+from dm_calibration.optics.phase_steps import mend_phase_steps
 
 WAVELENGTH = 632.8e-9
 FRINGE = WAVELENGTH / 2
@@ -58,7 +59,7 @@ def test_what_was_counted_right_stays_as_it_is(sag: NDArray[np.float64]) -> None
 
 
 def test_another_step_is_refused_by_its_place(sag: NDArray[np.float64]) -> None:
-    with pytest.raises(PhaseStepError, match=r"about column 1[67]\d, row (99|100) stands \+1.50 fringes off"):
+    with pytest.raises(MapRejectedError, match=r"about column 1[67]\d, row (99|100) stands \+1.50 fringes off"):
         mend_phase_steps(sag + 1.5 * FRINGE * (X > 0.4), FRINGE)
 
 
@@ -70,5 +71,5 @@ def test_maps_are_mended_as_they_are_read(sag: NDArray[np.float64]) -> None:
     assert surface.phase_steps == 1
     np.testing.assert_allclose(measured.coefficients, right.coefficients, atol=1e-12)
     np.testing.assert_allclose(measured.sag, right.sag, atol=1e-12)
-    with pytest.raises(PhaseStepError, match="fringes off"):
+    with pytest.raises(MapRejectedError, match="fringes off"):
         Ingest().measure(SurfaceMap(sag + 0.7 * WAVELENGTH * (X > 0.4), WAVELENGTH, None, "array"), settings)

@@ -12,8 +12,8 @@ from dm_msgs.msg import ZernikeCoefficients
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.acquisition.interferometer_messages import sensor_map
-from dm_calibration.acquisition.reference_surface import MapRejectedError
 from dm_calibration.acquisition.sensor import SensorAcquisition, read_sensor
+from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.optics.zernike import TERM_RMS, TERMS, basis
 

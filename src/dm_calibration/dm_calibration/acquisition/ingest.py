@@ -7,13 +7,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_calibration.acquisition.reference_surface import MapRejectedError, absolute_sag, corrections
+from dm_calibration.acquisition.reference_surface import absolute_sag, corrections
 from dm_calibration.map_files import XYZ_UNITS, SurfaceMap, read_map
-from dm_calibration.optics.aperture import Aperture, InsufficientDataError, configured_aperture, find_aperture
+from dm_calibration.optics.aperture import (
+    Aperture,
+    InsufficientDataError,
+    MapRejectedError,
+    configured_aperture,
+    find_aperture,
+)
 from dm_calibration.optics.instrument import undistorted, without_retrace
 from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.optics.orientation import Orientation
-from dm_calibration.optics.phase_steps import PhaseStepError, mend_phase_steps
+from dm_calibration.optics.phase_steps import mend_phase_steps
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sampling import edge_clustered_points, sample_map
@@ -108,14 +114,14 @@ class Ingest:
             MapFileError: the file is not a whole, readable map.
             InsufficientDataError, NoValidPixelsError: too few valid pixels.
             MapRejectedError: another wavelength than expected, another setting than the reference surface, an aperture
-                in m for a map without a pitch, or one that is larger than the mirror.
-            PhaseStepError: a region stands off by what is no whole number of fringes.
+                in m for a map without a pitch, one that is larger than the mirror, or a region that stands off by no
+                whole number of fringes.
         """
         with self._turn:
             source = read_map(path, xyz_unit=settings.xyz_unit or None)
             try:
                 return self._measure(source, settings)
-            except (InsufficientDataError, MapRejectedError, PhaseStepError) as error:
+            except (InsufficientDataError, MapRejectedError) as error:
                 raise type(error)(f"{path}: {error}") from error
 
     def measure(self, source: SurfaceMap, settings: IngestSettings) -> tuple[SurfaceMap, Measurement]:

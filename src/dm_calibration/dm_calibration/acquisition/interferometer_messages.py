@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from dm_calibration.acquisition.reference_surface import MapRejectedError
 from dm_calibration.acquisition.sensor import sensor_surface
 from dm_calibration.map_files import SurfaceMap
+from dm_calibration.optics.aperture import MapRejectedError
 from dm_common.measurement import Measurement
 from dm_common.messages import OF_FILE, OF_FIT, doubles, taken
 from dm_common.optics.zernike import TERMS, ansi_to_born_wolf, fringe_to_born_wolf, noll_to_born_wolf

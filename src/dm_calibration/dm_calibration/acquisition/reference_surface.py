@@ -5,14 +5,8 @@ from pathlib import Path
 
 from dm_calibration.map_files import MapFileError, SurfaceMap, read_map
 from dm_calibration.map_files.surface_map import PITCH_TOLERANCE
+from dm_calibration.optics.aperture import MapRejectedError
 from dm_common import Floats
-from dm_common.errors import CodedError, ErrorCode
-
-
-class MapRejectedError(CodedError):
-    """A readable map that does not belong to this bench: another wavelength, setting or reference surface."""
-
-    error_code = ErrorCode.MAP_REJECTED
 
 
 def load_reference(path: str, xyz_unit: str, wavelength: float, tolerance: float) -> SurfaceMap:

@@ -28,6 +28,12 @@ class InsufficientDataError(CodedError):
     error_code = ErrorCode.MAP_INSUFFICIENT
 
 
+class MapRejectedError(CodedError):
+    """A readable map that does not belong to this bench, or whose phase steps cannot be mended."""
+
+    error_code = ErrorCode.MAP_REJECTED
+
+
 @dataclass(frozen=True)
 class Aperture:
     """A circle on a map.

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from dm_calibration.optics.aperture import MapRejectedError
 from dm_common import Floats
-from dm_common.errors import CodedError, ErrorCode
 
 #: Share of the valid pixels below which a region is a speck.
 SPECK = 1e-3
@@ -19,12 +19,6 @@ WHOLE = 0.25
 GAP = 4.0
 
 
-class PhaseStepError(CodedError):
-    """A region of a map stands off by what is no whole number of fringes; the message says which and by how much."""
-
-    error_code = ErrorCode.MAP_REJECTED
-
-
 def mend_phase_steps(sag: Floats, fringe: float) -> tuple[Floats, int]:
     """The map (height, width), m, with all its regions on the fringes of the largest, and how many stood off.
 
@@ -32,7 +26,7 @@ def mend_phase_steps(sag: Floats, fringe: float) -> tuple[Floats, int]:
         fringe: m of sag, half a wavelength.
 
     Raises:
-        PhaseStepError: a step is not of whole fringes.
+        MapRejectedError: a step is not of whole fringes.
     """
     valid = np.isfinite(sag)
     inside = valid.copy()
@@ -104,7 +98,7 @@ def _whole(fringes: float, middle: Floats) -> int:
     """`fringes` as a whole number; of a region about `middle`, row and column."""
     if abs(fringes - round(fringes)) >= WHOLE:
         row, column = np.round(middle).astype(int)
-        raise PhaseStepError(
+        raise MapRejectedError(
             f"the region about column {column}, row {row} stands {fringes:+.2f} fringes off what is beside it: phase "
             "steps are of whole fringes; is a second surface in view?"
         )
