@@ -17,6 +17,7 @@ from studies.paper.regions import (
     figure_5,
     levelled_rms,
     region_statistics,
+    residual_map,
     row_spans,
     squared_distance,
 )
@@ -33,6 +34,14 @@ def smooth_map(seed: int) -> np.ndarray:
     for cx, cy, height in random.uniform(-1, 1, (12, 3)):
         sag += height * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * 0.25**2))
     return np.where(APERTURE.disc(sag.shape), sag, np.nan)
+
+
+def test_residual_map() -> None:
+    sag = smooth_map(7)
+    coefficients = 1e-8 * np.arange(1.0, 22.0)
+    row, column = np.nonzero(np.isfinite(sag))
+    expected = sag[row, column] - basis(column / 150.0 - 1.0, 1.0 - row / 150.0) @ coefficients
+    np.testing.assert_allclose(residual_map(sag, coefficients, APERTURE)[row, column], expected, atol=1e-15)
 
 
 def test_points_tell_the_regional_errors_of_the_map() -> None:

@@ -18,7 +18,7 @@ to.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -27,19 +27,21 @@ from numpy.typing import NDArray
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import complete_sag
+from dm_calibration.influence.weights import surface_control_error
 from dm_calibration.regression.sag_history import RunHistory
 from dm_calibration.regression.stepwise import SelectionOptions, StepwiseFit
 from dm_calibration.regression.surface_error import (
     MODEL,
     SURFACES,
+    Prediction,
     SurfaceErrors,
     held_out_errors,
-    model_candidates,
     regress,
     surface_errors,
 )
 from dm_common import Floats
 from dm_common.names import unknown_name
+from dm_common.optics.piston_tilt import rms
 from dm_common.optics.zernike import TERM_RMS, basis
 from studies.paper.reported import TEST_SURFACES
 
@@ -156,7 +158,7 @@ def regress_surface_errors(
     names, candidates = _candidates(maps, fit, errors, test, reading)
     if options is None and reading is Reading.LINEAR:
         options = SelectionOptions()
-    found = regress(errors, names, candidates, fit.method, options, ~test)
+    found = regress(_some(errors, ~test), names, candidates[~test], fit.method, options)
     fitted = found.fit
     residual = errors.response[~test] - fitted.predict(candidates[~test])[0]
     actual = errors.response[test]
@@ -181,6 +183,25 @@ def regress_surface_errors(
     return ReadRegression(reading, names, fitted, table2, table3)
 
 
+def _some(errors: SurfaceErrors, keep: NDArray[np.bool_]) -> SurfaceErrors:
+    labels = tuple(np.array(errors.labels)[keep])
+    return SurfaceErrors(errors.rows[keep], labels, errors.signals[keep], errors.regional[keep])
+
+
+def _held_out_errors(
+    maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction, test: NDArray[np.bool_]
+) -> Floats:
+    """(S, P) m, as :func:`held_out_errors`; no fit sees the surfaces in `test` (S,)."""
+    tested = errors.rows[test]
+    seen = fit.used & ~np.isin(maps.step, maps.step[tested])
+    found = np.empty((len(test), len(maps.points)))
+    found[~test] = held_out_errors(maps, replace(fit, used=seen), _some(errors, ~test), predict)
+    if test.any():
+        sag = predict(seen)[tested]
+        found[test] = surface_control_error(sag, errors.signals[test], fit.influence_zernike, maps.points)
+    return found
+
+
 def _candidates(
     maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, test: NDArray[np.bool_], reading: Reading
 ) -> tuple[tuple[str, ...], Floats]:
@@ -192,13 +213,14 @@ def _candidates(
     filling = fit.sag_offset + maps.applied @ fit.influence_sag.T
     kind: type[RunHistory | LinearHistory] = RunHistory if reading is Reading.HISTORY else LinearHistory
     predict = kind(maps, filling).predict
+    held_out = _held_out_errors(maps, fit, errors, predict, test)
     if reading is not Reading.MEASURED:
-        return model_candidates(maps, fit, errors, predict, test)
+        return (MODEL, *signals), np.column_stack((rms(held_out, maps.points.weight), errors.signals))
     inside = (measured - errors.signals @ fit.influence_zernike.T)[:, 3:] * TERM_RMS[3:]
     # Terms and points are orthogonal in the weighted sum, but for the discreteness of the points.
     root = np.sqrt(maps.points.weight)
     orthogonal = np.linalg.qr(root[:, np.newaxis] * basis(maps.points.x, maps.points.y))[0]
-    beyond = root * held_out_errors(maps, fit, errors, predict, test)
+    beyond = root * held_out
     beyond = beyond - (beyond @ orthogonal) @ orthogonal.T
     model = np.hypot(np.linalg.norm(inside, axis=1), np.linalg.norm(beyond, axis=1))
     return (MODEL, *signals, *coefficients), np.column_stack((model, errors.signals, measured))

@@ -6,12 +6,15 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from dm_calibration.optics.aperture import Aperture
+from dm_calibration.optics.map_fit import in_products
 from dm_common.optics.piston_tilt import weighted_fit
 from dm_common.optics.sample_regions import AREA_FRACTIONS, check_regions, disc_shares
 from dm_common.optics.sampling import SamplePoints
+from dm_common.optics.zernike import MAX_ORDER
 
 #: Surfaces that are left out of the mean of Fig. 5(b) in [1]: Z_2^0 and Z_2^2.
 OUTSIDE_MEAN = ("pz02", "pz03")
@@ -47,6 +50,17 @@ def squared_distance(aperture: Aperture, shape: tuple[int, int]) -> NDArray[np.f
     x = (np.arange(shape[1]) - aperture.centre_x_px) / aperture.radius_px
     y = (np.arange(shape[0]) - aperture.centre_y_px) / aperture.radius_px
     return np.asarray(x**2 + y[:, None] ** 2)
+
+
+def residual_map(
+    sag: NDArray[np.float64], coefficients: NDArray[np.float64], aperture: Aperture
+) -> NDArray[np.float64]:
+    """(height, width) the map minus the sag of its Zernike coefficients (21,); NaN outside the aperture."""
+    height, width = sag.shape
+    x = (np.arange(width) - aperture.centre_x_px) / aperture.radius_px
+    y = (aperture.centre_y_px - np.arange(height)) / aperture.radius_px
+    terms = legendre.legvander(y, MAX_ORDER) @ in_products(coefficients) @ legendre.legvander(x, MAX_ORDER).T
+    return np.where(aperture.disc(sag.shape), sag - terms, np.nan)
 
 
 def row_spans(

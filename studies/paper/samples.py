@@ -16,7 +16,6 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import SURFACE, MapSet
 from dm_calibration.influence.region_weighting import RegionWeighting, weighting_of
 from dm_calibration.influence.weights import region_weights, surface_control_error
-from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.procedure.procedure import Progress
 from dm_common import Floats
 from dm_common.measurement import Measurement
@@ -24,7 +23,7 @@ from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sample_regions import regional_rms
 from dm_common.optics.zernike import PISTON_TILT
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
-from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5, levelled_rms
+from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5, levelled_rms, residual_map
 from studies.paper.weights_cancel import weights_cancel_max_abs
 
 #: Ways to read Fig. 5: rms about zero over the sampling points, or over all pixels, each with piston and tilt removed
@@ -165,14 +164,11 @@ def measure_samples(
 def _on_every_pixel(bench: _MapKeepingBench, surfaces: MapSet, influence: Floats) -> Floats:
     """(M, 10) m: rms surface control error inside the regions over all pixels of the maps."""
     aperture = bench.aperture
-    where = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
-    # Only evaluates the nominal surfaces; the maps' own gaps stay NaN.
-    evaluator = MapFitter(aperture.disc((bench.config.pixels,) * 2), *where)
     regions = ConcentricRegions((bench.config.pixels,) * 2, aperture)
 
     def errors() -> Iterator[Floats]:
         for label, signals in zip(surfaces.label, surfaces.applied, strict=True):
-            yield remove_plane(evaluator.residual(bench.kept[label].astype(np.float64), influence @ signals))
+            yield remove_plane(residual_map(bench.kept[label].astype(np.float64), influence @ signals, aperture))
 
     return regions.rms_of_each(errors(), surfaces.label)
 

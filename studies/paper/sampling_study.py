@@ -29,7 +29,7 @@ from dm_common import Floats
 from dm_common.optics.sampling import GOLDEN_ANGLE, SamplePoints, edge_clustered_points, sample_map
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS, TERMS, basis
 from dm_simulation.interferometer.interferometer import InterferometerConfig
-from studies.paper.regions import squared_distance
+from studies.paper.regions import residual_map, squared_distance
 from studies.paper.samples import Samples
 
 #: Of the surfaces of Table 1 every so many are studied: pokes, spheres and Zernike surfaces among them.
@@ -165,7 +165,7 @@ def study_sampling(
             rim_ringing_peak=float(np.abs(ringing).max()),
             rim_error_rms=_rms(rim_sag - coefficients @ rim_terms.T),
         )
-    beyond = [whole.residual(surface, c)[valid] for surface, c in zip(surfaces, true, strict=True)]
+    beyond = [residual_map(surface, c, aperture)[valid] for surface, c in zip(surfaces, true, strict=True)]
     return SamplingStudy(results, len(surfaces), _rms(np.stack(beyond)), pixel_noise, draws)
 
 

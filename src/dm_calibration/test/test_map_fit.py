@@ -129,15 +129,6 @@ def test_fitter_knows_what_it_was_made_for() -> None:
     assert not fitter.fits(mask, Aperture(29.5, 29.5, 21))
 
 
-def test_residual_map() -> None:
-    sag = rough_map((80, 80), 4)
-    aperture = Aperture(40.2, 39.1, 35.0)
-    fitter = MapFitter(np.isfinite(sag), aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
-    residual = fitter.residual(sag, fitter.fit(sag).coefficients)
-    _coefficients, expected, _inverse = plain_fit(sag, 40.2, 39.1, 35.0)
-    np.testing.assert_allclose(residual[np.isfinite(residual)], expected, atol=1e-15)
-
-
 LETTER_F = np.array([[1, 1, 1], [1, 0, 0], [1, 1, 0], [1, 0, 0]], dtype=float)
 
 

@@ -16,7 +16,7 @@ from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.zernike import TERMS, basis, noll_to_born_wolf
 from studies.benchmarks.sample_maps import CAMERA, Ring, full_aperture, maps, mask_of
 from studies.benchmarks.timing import Effort, medians
-from studies.paper.regions import ConcentricRegions, squared_distance
+from studies.paper.regions import ConcentricRegions, residual_map, squared_distance
 
 Fit = Callable[[Floats], Floats]
 
@@ -89,7 +89,7 @@ def _new_mask(effort: Effort, generator: np.random.Generator) -> dict[str, Any]:
 
 
 def _regions(effort: Effort, fitter: MapFitter, some: list[Floats]) -> dict[str, Any]:
-    residuals = [fitter.residual(sag, fitter.fit(sag).coefficients) for sag in some[:4]]
+    residuals = [residual_map(sag, fitter.fit(sag).coefficients, fitter.aperture) for sag in some[:4]]
     shape, aperture = residuals[0].shape, fitter.aperture
     regions = ConcentricRegions(shape, aperture)
     discs = [squared_distance(aperture, shape) <= fraction for fraction in AREA_FRACTIONS]

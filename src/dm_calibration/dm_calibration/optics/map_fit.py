@@ -171,7 +171,7 @@ class MapFitter:
         coefficients = linalg.cho_solve(self._factor, right / self._scale) / self._scale
         squares = energy - float(coefficients @ right)
         if squares < _CANCELLATION * energy:
-            left = (inner - self._evaluate(coefficients))[self._used]
+            left = (inner - self._thin_y @ in_products(coefficients) @ self._thin_x.T)[self._used]
             squares = float(np.vdot(left, left))
         squares = max(squares, 0.0)
         freedom = max(self.valid_pixels - len(TERMS), 1)
@@ -182,17 +182,6 @@ class MapFitter:
             valid_fraction=self.valid_fraction,
             valid_pixels=self.valid_pixels,
         )
-
-    def residual(self, sag: Floats, coefficients: Floats) -> Floats:
-        """(height, width): the map minus the sag of these coefficients; NaN outside mask and aperture."""
-        result = np.full(self._shape, np.nan)
-        inner = sag[self._rows, self._columns] - self._evaluate(coefficients)
-        np.copyto(result[self._rows, self._columns], inner, where=self._used)
-        return result
-
-    def _evaluate(self, coefficients: Floats) -> Floats:
-        """Sag of these coefficients on the square around the aperture."""
-        return self._thin_y @ in_products(coefficients) @ self._thin_x.T
 
 
 def in_products(coefficients: Floats) -> Floats:

@@ -63,13 +63,11 @@ class StepwiseFit:
         variables: (k,) names, in the order in which they entered.
         columns: (k,) their columns among the candidates.
         result: of statsmodels for the selected model.
-        weighted: whether samples had weights (WLS).
     """
 
     variables: tuple[str, ...]
     columns: tuple[int, ...]
     result: Any
-    weighted: bool
 
     @property
     def parameters(self) -> Floats:
@@ -150,7 +148,7 @@ def stepwise(
     columns = _select(x, y, w, options)
     design = np.column_stack((np.ones(len(y)), x[:, columns]))
     model = sm.OLS(y, design) if weights is None else sm.WLS(y, design, weights=w)
-    return StepwiseFit(tuple(names[column] for column in columns), tuple(columns), model.fit(), weights is not None)
+    return StepwiseFit(tuple(names[column] for column in columns), tuple(columns), model.fit())
 
 
 def leave_one_out(

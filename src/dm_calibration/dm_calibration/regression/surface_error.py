@@ -128,7 +128,6 @@ def regress(
     candidates: Floats,
     method: str,
     options: SelectionOptions | None = None,
-    train: NDArray[np.bool_] | None = None,
 ) -> ErrorRegression:
     """Select and fit a regression of the surface control error on `candidates` (S, C).
 
@@ -136,45 +135,33 @@ def regress(
         names: (C,) of the candidates.
         method: of the influence function; AZWreg makes the regression a weighted one.
         options: thresholds; None = those of the module's docstring.
-        train: (S,) the surfaces to train on; None = all.
 
     Raises:
         TooFewMapsError: see :mod:`~dm_calibration.regression.stepwise`.
         ValueError: constant errors.
     """
-    rows = slice(None) if train is None else train
-    x, y = candidates[rows], errors.response[rows]
-    weights = surface_weights(errors)[rows] if method == "AZWreg" else None
+    weights = surface_weights(errors) if method == "AZWreg" else None
     options = options or SelectionOptions(P_ENTER / len(names), P_REMOVE / len(names))
-    fitted = stepwise(x, y, names, weights, options)
-    left_out = y - leave_one_out(x, y, weights, options)
+    fitted = stepwise(candidates, errors.response, names, weights, options)
+    left_out = errors.response - leave_one_out(candidates, errors.response, weights, options)
     return ErrorRegression(fitted, float(np.sqrt(np.mean(left_out**2))))
 
 
 def model_candidates(
-    maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction, test: NDArray[np.bool_] | None = None
+    maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction
 ) -> tuple[tuple[str, ...], Floats]:
     """`model` and the signals: their names, and (S, 1 + N)."""
-    model = rms(held_out_errors(maps, fit, errors, predict, test), maps.points.weight)
+    model = rms(held_out_errors(maps, fit, errors, predict), maps.points.weight)
     names = (MODEL, *(f"s{k + 1:02d}" for k in range(maps.actuators)))
     return names, np.column_stack((model, errors.signals))
 
 
-def held_out_errors(
-    maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction, test: NDArray[np.bool_] | None = None
-) -> Floats:
-    """(S, P) error surfaces of the sample surfaces, each predicted without having seen it, m.
-
-    Args:
-        test: (S,) surfaces that no fit sees; None = none.
-    """
-    rows = errors.rows
-    test = np.zeros(len(rows), dtype=bool) if test is None else test
-    fold = np.full(len(rows), FOLDS)
-    fold[~test] = np.arange((~test).sum()) % FOLDS
-    seen = fit.used & ~np.isin(maps.step, maps.step[rows[test]])  # repeated maps of a state leave together
-    sag = np.empty((len(rows), len(maps.points)))
+def held_out_errors(maps: MapSet, fit: InfluenceFit, errors: SurfaceErrors, predict: Prediction) -> Floats:
+    """(S, P) error surfaces of the sample surfaces, each predicted without having seen it, m."""
+    fold = np.arange(len(errors.rows)) % FOLDS
+    sag = np.empty((len(errors.rows), len(maps.points)))
     for k in np.unique(fold):
-        own = fold == k
-        sag[own] = predict(seen & ~np.isin(maps.step, maps.step[rows[own]]))[rows[own]]
+        own = errors.rows[fold == k]
+        # Repeated maps of a state leave together.
+        sag[fold == k] = predict(fit.used & ~np.isin(maps.step, maps.step[own]))[own]
     return surface_control_error(sag, errors.signals, fit.influence_zernike, maps.points)
