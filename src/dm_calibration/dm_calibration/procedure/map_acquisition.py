@@ -183,7 +183,7 @@ def check_comparable(
 def _other_setup(measured: Measurement, setup: Setup) -> str:
     """What a map does not share with those before; "" = nothing."""
     if not same_points(measured.points, setup.points):
-        return "sampled at other points than the maps before: leave the interferometer's sample_count alone in a run"
+        return "sampled at other points than the maps before: measure the whole run with one interferometer node"
     if abs(measured.wavelength - setup.wavelength) > WAVELENGTH_TOLERANCE * setup.wavelength:
         return (
             f"wavelength {measured.wavelength * 1e9:.3f} nm, before it was {setup.wavelength * 1e9:.3f} nm "

@@ -264,7 +264,8 @@ def check_map(measured: Measurement, calibration: Calibration, options: UpdateOp
         raise MapNotUsableError("coefficients: hold values that are not finite")
     if not same_points(measured.points, calibration.fit.points):
         raise MapNotUsableError(
-            "sampled at other points than the calibration: set the interferometer's sample_count back"
+            "sampled at other points than the calibration, which another interferometer node or version was used for: "
+            "calibrate anew"
         )
     if not abs(measured.wavelength - calibration.wavelength) <= WAVELENGTH_TOLERANCE * calibration.wavelength:
         raise MapNotUsableError(

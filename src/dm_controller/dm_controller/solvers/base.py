@@ -53,8 +53,8 @@ def measured_shape(coefficients: Floats, sag: Floats, model: InfluenceModel) -> 
     if coefficients.shape != model.zernike_offset.shape or sag.shape != model.sag_offset.shape:
         raise ValueError(
             f"the map has {coefficients.size} terms and {sag.size} sampling points, the calibration has "
-            f"{model.zernike_offset.size} and {model.sag_offset.size}: set the interferometer's sample_count to the "
-            "calibration's, or calibrate anew"
+            f"{model.zernike_offset.size} and {model.sag_offset.size}: it was made with another interferometer node or "
+            "version, calibrate anew"
         )
     terms = basis(model.sample_x, model.sample_y) @ coefficients
     return Shape(coefficients, np.where(np.isfinite(sag), sag, terms))
