@@ -10,16 +10,20 @@ import numpy as np
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
+from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NAMES, GRADE_NOT_EXCITED
 from dm_calibration.store.hdf5_image import Attribute, Column
 from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
 from dm_common import Floats
 from dm_common.errors import ErrorCode
+from dm_common.figures import in_nanometres
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
 from dm_common.recipes import NO_RECIPES, RecipeBook
 
 SCHEMA = "dm_calibration/calibration"
 SCHEMA_VERSION = 1
+#: What a calibrated mirror promises at least, m, unless the parameter says otherwise: about wavelength / 20.
+CALIBRATED_ERROR_MAX = 32e-9
 
 _POINTS = ("x", "y", "weight")
 #: Fields of a calibration that are attributes of its file, and their types there.
@@ -96,6 +100,28 @@ class Calibration:
     def stamp_ns(self) -> int:
         """Time of the last map, ns."""
         return int(self.maps.stamp_ns.max())
+
+    @property
+    def promise(self) -> float:
+        """m, 95 % bound on the largest coefficient error of a request, from maps that had no part in the fit."""
+        found = self.hysteresis
+        error = self.fit.held_out_max_zernike if found is None else found.law.in_use * found.held_out_max_zernike
+        return float(error)
+
+    def doubts(self, error_max: float = CALIBRATED_ERROR_MAX) -> list[str]:
+        """The reasons why it is approximate only; empty = the mirror is calibrated.
+
+        Args:
+            error_max: m that it must promise.
+        """
+        reasons = []
+        for grade in (GRADE_DEAD, GRADE_NOT_EXCITED):
+            numbers = np.flatnonzero(self.fit.grades == grade) + 1
+            if numbers.size:
+                reasons.append(f"actuators {', '.join(map(str, numbers))} are {GRADE_NAMES[grade]}")
+        if self.promise > error_max:
+            reasons.append(f"the promise is above {in_nanometres(error_max)} (calibrated_error_max)")
+        return reasons
 
     @property
     def maps_dropped(self) -> int:

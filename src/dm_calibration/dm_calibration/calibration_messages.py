@@ -43,18 +43,12 @@ def driver_facts(message: MirrorInfo) -> dict[str, Any]:
 def calibration_message(
     calibration: Calibration | None, file: Path | None, frame_id: str, calibrated_error_max: float
 ) -> CalibrationMsg:
-    """The message on `calibration`; None = no calibration.
-
-    A calibration counts as CALIBRATED when its held-out coefficient error is at most `calibrated_error_max` (m) and no
-    actuator is dead or was never moved, else as APPROXIMATE.
-    """
+    """The message on `calibration`; None = no calibration. It is judged by `calibrated_error_max`, m."""
     message = CalibrationMsg()
     message.header.frame_id = frame_id
     if calibration is None:
         return message
     fit, points = calibration.fit, calibration.fit.points
-    usable = np.isin(fit.grades, (CalibrationMsg.GRADE_GOOD, CalibrationMsg.GRADE_WEAK)).all()
-    good = fit.held_out_max_zernike <= calibrated_error_max and bool(usable)
     message.header.stamp = time_message(calibration.stamp_ns)
     message.file = str(file or "")
     message.convention = ZernikeCoefficients.BORN_WOLF
@@ -69,7 +63,8 @@ def calibration_message(
             setattr(message, name, getattr(source, name))
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
-    message.quality = CalibrationMsg.CALIBRATED if good else CalibrationMsg.APPROXIMATE
+    doubtful = calibration.doubts(calibrated_error_max)
+    message.quality = CalibrationMsg.APPROXIMATE if doubtful else CalibrationMsg.CALIBRATED
     message.actuator_grade = _grades(fit)
     message.known_limitations = list(calibration.limitations)
     message.region_weights = doubles(calibration.region_weights)

@@ -53,7 +53,7 @@ class CalibrationNode(ManagedNode):
         self._loaded_by = ""  # what `load_on_start` was when it was carried out last
         # Latched: a controller that starts later must know the calibration in use.
         self._publisher = self.create_publisher(CalibrationMsg, "calibration", qos.with_lease(qos.LATCHED))
-        self._reports = ReportWriter(self._log_report)
+        self._reports = ReportWriter(self._log_report, lambda: self._values["calibrated_error_max"])
         self._manager = CalibrationManager(
             CalibrationStore(self._values["calibration_folder"], self._write_report),
             lambda: float(self._values["aperture_tolerance"]),
@@ -122,8 +122,7 @@ class CalibrationNode(ManagedNode):
             self.get_logger().info(text)
 
     def _publish(self, calibration: Calibration | None, file: Path | None) -> None:
-        error_max = self._values["calibrated_error_max"]
-        message = calibration_message(calibration, file, self._frame_id, error_max)
+        message = calibration_message(calibration, file, self._frame_id, self._values["calibrated_error_max"])
         message.aperture_tolerance = float(self._values["aperture_tolerance"])
         self._listener.begin(calibration)
         self._listener.amend(message)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from dm_calibration.calibration import CALIBRATED_ERROR_MAX
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.bump_check import BumpOptions
 from dm_calibration.procedure.procedure import ProcedureOptions
@@ -64,8 +65,9 @@ PARAMETERS = (
     *parameters_of("", FitOptions),
     live(
         "calibrated_error_max",
-        real(32e-9, 0.0, 1e-3, "m"),
-        "A calibration whose held-out coefficient error is larger counts as APPROXIMATE (default: wavelength / 20).",
+        real(CALIBRATED_ERROR_MAX, 0.0, 1e-3, "m"),
+        "A calibration whose promise, the 95 % bound on the largest coefficient error of a request, is larger counts "
+        "as APPROXIMATE, as does one with actuators that are dead or were never moved (default: wavelength / 20).",
     ),
     live(
         "updates.enable",

@@ -14,6 +14,7 @@ import pytest
 from reportlab.platypus import LongTable, Paragraph
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.calibration_messages import calibration_message
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import FitOptions
@@ -21,7 +22,7 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.report import content, content_hysteresis
-from dm_calibration.report.certificate import certificate, curvatures, doubts, keep_people, people
+from dm_calibration.report.certificate import certificate, curvatures, keep_people, people
 from dm_calibration.report.checks import next_calibration
 from dm_calibration.report.content_hysteresis import loop_opening, step_response
 from dm_calibration.report.document import Section, Table
@@ -106,7 +107,7 @@ def test_the_page_names_what_was_dropped_and_every_limitation(page: str, calibra
 
 def test_the_first_page_is_a_certificate(page: str, calibration: Calibration) -> None:
     first = page[page.index("<h2>Certificate") : page.index("<h2>Every actuator")]
-    assert "approximate: hysteresis was not identified" in first and "<img " in first
+    assert "approximate: the promise is above 32 nm" in first and "<img " in first
     assert f"{calibration.fit.held_out_max_zernike * 1e9:.2f} nm" in first and "95 % bound" in first
     assert "2023-12-14" in first, "valid for thirty days"
     low, high = curvatures(calibration)
@@ -138,8 +139,23 @@ def test_a_good_calibration_is_called_so_and_names_are_kept(calibration: Calibra
     absolute = one_html("", [certificate(known, {})])
     assert "flat.dat, SHA-256 01" in absolute and " nm, limited by" in absolute.partition("absolute to ")[2][:20]
     dead = replace(calibration.fit, grades=np.array([2] + [0] * 36, dtype=np.uint8))
-    assert "actuators 1 are dead" in doubts(replace(calibration, fit=dead))[0]
+    assert "actuators 1 are dead" in replace(calibration, fit=dead).doubts()[0]
     assert people(tmp_path / "none.json") == {}
+
+
+@pytest.mark.parametrize(
+    ("grade", "promised", "error_max", "good"),
+    [(1, 20e-9, 32e-9, True), (2, 20e-9, 32e-9, False), (0, 40e-9, 32e-9, False), (0, 40e-9, 50e-9, True)],
+)
+def test_message_and_certificate_agree(
+    calibration: Calibration, grade: int, promised: float, error_max: float, good: bool
+) -> None:
+    """Of weak actuators, without a law of hysteresis, and by the limit that is configured."""
+    grades = np.array([grade] + [0] * 36, dtype=np.uint8)
+    judged = replace(calibration, fit=replace(calibration.fit, grades=grades, held_out_max_zernike=promised))
+    message = calibration_message(judged, None, "mirror", error_max)
+    assert (message.quality == message.CALIBRATED) is good
+    assert ("<td>calibrated</td>" in one_html("", [certificate(judged, {}, (), error_max)])) is good
 
 
 def checks_of(calibration: Calibration, growth: float, count: int = 8) -> list[Check]:

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dm_calibration.calibration import Calibration
-from dm_calibration.influence.quality import GRADE_GOOD, GRADE_NAMES
+from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
 from dm_calibration.influence.surfaces import solve_shape
 from dm_calibration.recalibration.check_log import Check
 from dm_calibration.report import figures
-from dm_calibration.report.checks import DEFAULTS, next_calibration
-from dm_calibration.report.content import length, promise, utc
+from dm_calibration.report.checks import next_calibration
+from dm_calibration.report.content import length, utc
 from dm_calibration.report.document import Picture, Section, Table
 from dm_common.atomic_write import write_whole
 from dm_common.figures import two_fold
@@ -50,20 +49,6 @@ def keep_people(names: Mapping[str, str], file: Path = PEOPLE) -> None:
         write_whole(file.expanduser(), json.dumps(people(file) | dict(names)).encode())
 
 
-def doubts(calibration: Calibration) -> list[str]:
-    """The reasons why a calibration is approximate only; empty = it is not."""
-    reasons = []
-    for grade, name in enumerate(GRADE_NAMES):
-        numbers = np.flatnonzero(calibration.fit.grades == grade) + 1
-        if grade != GRADE_GOOD and numbers.size:
-            reasons.append(f"actuators {', '.join(map(str, numbers))} are {name}")
-    if calibration.hysteresis is None:
-        reasons.append("hysteresis was not identified")
-    if promise(calibration) > DEFAULTS["calibrated_error_max"]:
-        reasons.append(f"the promise is above {length(DEFAULTS['calibrated_error_max'], 0.0)}")
-    return reasons
-
-
 def curvatures(calibration: Calibration) -> tuple[float, float]:
     """Smallest and largest curvature (1/m) of a sphere that the signals of the maps reach whatever the actuators went
     through before; (nan, nan) = not even 0.
@@ -96,16 +81,22 @@ def curvatures(calibration: Calibration) -> tuple[float, float]:
     return edge(-stroke), edge(stroke)
 
 
-def certificate(calibration: Calibration, names: Mapping[str, str], checks: Sequence[Check] = ()) -> Section:
+def certificate(
+    calibration: Calibration,
+    names: Mapping[str, str],
+    checks: Sequence[Check] = (),
+    error_max: float = CALIBRATED_ERROR_MAX,
+) -> Section:
     """Verdict, range, promise, term and names.
 
     Args:
         names: of `operator` and `instrument`.
         checks: since then, oldest first.
+        error_max: m that a calibrated mirror promises.
     """
-    reasons, bound = doubts(calibration), length(promise(calibration), calibration.wavelength)
+    reasons, bound = calibration.doubts(error_max), length(calibration.promise, calibration.wavelength)
     low, high = curvatures(calibration)
-    until, _reason = next_calibration(checks, promise(calibration), calibration.created_ns * 1e-9)
+    until, _reason = next_calibration(checks, calibration.promise, calibration.created_ns * 1e-9)
     verdict = f"approximate: {'; '.join(reasons)}" if reasons else "calibrated"
     reach = f"{low:+.3f} to {high:+.3f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
     farthest = max((low, high), key=abs) if np.isfinite(low) else 0.0
@@ -114,7 +105,7 @@ def certificate(calibration: Calibration, names: Mapping[str, str], checks: Sequ
         ("mirror", f"{calibration.mirror_name}, serial {calibration.mirror_serial}"),
         ("range of curvatures", reach if np.isfinite(low) else "flat is out of reach"),
         ("promise", f"{bound}, 95 % bound on the largest coefficient error of an open-loop move"),
-        ("repeatable, absolute", two_fold(promise(calibration), calibration, farthest)),
+        ("repeatable, absolute", two_fold(calibration.promise, calibration, farthest)),
         ("instrument's errors taken off", calibration.reference_surface or "none"),
         ("measured", utc(calibration.stamp_ns)),
         ("valid until", f"{utc(round(until * 1e9))}, longer when ./dm check agrees"),

@@ -9,7 +9,7 @@ from scipy.stats import theilslopes
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibration_parameters import PARAMETERS
 from dm_calibration.recalibration.check_log import Check
-from dm_calibration.report.content import NM, length, promise, utc
+from dm_calibration.report.content import NM, length, utc
 from dm_calibration.report.document import BLUE, GREY, ORANGE, VERMILION, Picture, Section, Table
 
 DAY_S = 86400.0
@@ -49,7 +49,7 @@ def checks_section(calibration: Calibration, checks: Sequence[Check]) -> Section
     Args:
         checks: at least one, oldest first.
     """
-    last, created, promised = checks[-1], calibration.created_ns * 1e-9, promise(calibration)
+    last, created, promised = checks[-1], calibration.created_ns * 1e-9, calibration.promise
     days = max(last.time - created, 1.0) / DAY_S
     when, reason = next_calibration(checks, promised, created)
     outside = sum(check.max_zernike > promised for check in checks)

@@ -30,14 +30,6 @@ def length(metres: float, wavelength: float) -> str:
     return with_wavelengths(f"{metres * NM:.2f} nm", metres, wavelength)
 
 
-def promise(calibration: Calibration) -> float:
-    """m, 95 % bound on the largest coefficient error of a request, from maps that had no part in the fit."""
-    found = calibration.hysteresis
-    if found is None:
-        return float(calibration.fit.held_out_max_zernike)
-    return float(found.law.in_use * found.held_out_max_zernike)
-
-
 def _counted(number: int, one: str, many: str) -> str:
     """A number with its noun."""
     return f"{number or 'No'} {one if number <= 1 else many}"

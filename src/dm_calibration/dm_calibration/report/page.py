@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dm_calibration.calibration import Calibration
+from dm_calibration.calibration import CALIBRATED_ERROR_MAX, Calibration
 from dm_calibration.influence.quality import GRADE_NAMES
 from dm_calibration.recalibration.check_log import SUFFIX, read_checks
 from dm_calibration.report import certificate, checks, content, content_fit, content_hysteresis
@@ -25,8 +25,10 @@ class Written(NamedTuple):
     pdf: Path
 
 
-def sections(calibration: Calibration, file: Path | None = None) -> list[Section]:
-    """All sections of the report of `calibration`, which was read from `file`.
+def sections(
+    calibration: Calibration, file: Path | None = None, error_max: float = CALIBRATED_ERROR_MAX
+) -> list[Section]:
+    """All sections of the report of `calibration`, which was read from `file`; `error_max` as of a certificate.
 
     Raises:
         OSError: `file` cannot be read.
@@ -35,7 +37,7 @@ def sections(calibration: Calibration, file: Path | None = None) -> list[Section
     log = read_checks(file.with_name(f"{calibration.id}{SUFFIX}")) if file is not None else []
     sha256 = hashlib.sha256(file.read_bytes()).hexdigest() if file is not None else ""
     return [
-        certificate.certificate(calibration, certificate.people(), log),
+        certificate.certificate(calibration, certificate.people(), log, error_max),
         certificate.every_actuator(calibration),
         Section("Appendix", ["What the two pages before rest on."]),
         *([checks.checks_section(calibration, log)] if log else []),
@@ -53,16 +55,19 @@ def sections(calibration: Calibration, file: Path | None = None) -> list[Section
     ]
 
 
-def write_report(calibration: Calibration, folder: Path, file: Path | None = None) -> Written:
+def write_report(
+    calibration: Calibration, folder: Path, file: Path | None = None, error_max: float = CALIBRATED_ERROR_MAX
+) -> Written:
     """Write ``<id>.html`` and ``<id>.pdf`` into `folder`; each is there whole or not at all.
 
     Args:
         file: that the calibration was read from, for its SHA-256.
+        error_max: m that a calibrated mirror promises.
 
     Raises:
         OSError: `file` cannot be read, or `folder` not written to.
     """
-    made = sections(calibration, file)
+    made = sections(calibration, file, error_max)
     title = f"Calibration {calibration.id} of {calibration.mirror_name}, serial {calibration.mirror_serial}"
     written = Written(folder / f"{calibration.id}.html", folder / f"{calibration.id}.pdf")
     write_whole(written.html, one_html(title, made).encode())

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from dm_calibration.calibration import CALIBRATED_ERROR_MAX
 from dm_calibration.store.calibration_store import CalibrationStore
 
 #: Longest time for one report, s of wall time; a loaded machine may need a multiple of the usual few.
@@ -26,10 +27,13 @@ class ReportWriter:
 
     Args:
         publish: called with a sentence and whether it is a warning, from a thread of its own.
+        error_max: m that a calibrated mirror promises now.
     """
 
-    def __init__(self, publish: Callable[[str, bool], None]) -> None:
-        self._publish = publish
+    def __init__(
+        self, publish: Callable[[str, bool], None], error_max: Callable[[], float] = lambda: CALIBRATED_ERROR_MAX
+    ) -> None:
+        self._publish, self._error_max = publish, error_max
         self._lock = threading.Lock()
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reports")
         self._waiting: set[Path] = set()
@@ -64,7 +68,7 @@ class ReportWriter:
             try:
                 command = [sys.executable, "-m", "dm_calibration.report.report_writer", str(file)]
                 self._process = subprocess.Popen(
-                    command,
+                    [*command, str(self._error_max())],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,
@@ -96,13 +100,15 @@ class ReportWriter:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the report of the calibration file named in `arguments` beside it; returns the exit status."""
+    """Write the report of the calibration file named in `arguments`, and judged by the number behind, m, beside it;
+    returns the exit status.
+    """
     from dm_calibration.report.page import write_report
 
     os.nice(NICENESS)
     file = Path(arguments[0])
     try:
-        write_report(CalibrationStore(file.parent).load(file.name), file.parent, file)
+        write_report(CalibrationStore(file.parent).load(file.name), file.parent, file, float(arguments[1]))
     except (OSError, ValueError) as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 1

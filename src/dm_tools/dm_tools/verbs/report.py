@@ -15,18 +15,24 @@ from dm_tools.output import JsonOption, NamespaceOption, console, nanometres, ne
 STORES = (Path("~/.ros/dm_bench/calibrations"), Path("~/.ros/dm_calibrations"))
 
 
-def running_calibration(namespace: str) -> Path | None:
-    """File of the calibration that the running suite uses; None = nothing runs, it has none, or it runs elsewhere."""
+def running_calibration(namespace: str) -> tuple[Path | None, float]:
+    """File of the calibration that the running suite uses, and what a calibrated mirror promises there, m.
+
+    No file: nothing runs, it has none, or it runs elsewhere.
+    """
+    from dm_calibration.calibration import CALIBRATED_ERROR_MAX
     from dm_client import DeformableMirrorClient
+    from dm_tools.parameter_changes import get_parameter
     from dm_tools.running_suite import BUSY_S, FIND_S, nodes_of_suite
 
     with DeformableMirrorClient(namespace) as client:
-        if not client.wait(lambda: nodes_of_suite(client), FIND_S):
-            return None
-        client.wait(lambda: "calibration" in client.messages, BUSY_S)
+        if client.wait(lambda: nodes_of_suite(client), FIND_S):
+            client.wait(lambda: "calibration" in client.messages, BUSY_S)
         message = client.messages.get("calibration")
-    file = Path(message.file if message is not None else "")
-    return file if file.name and file.is_file() else None
+        file = Path(message.file if message is not None else "")
+        if not (file.name and file.is_file()):
+            return None, CALIBRATED_ERROR_MAX
+        return file, float(get_parameter(client, "calibration", "calibrated_error_max"))
 
 
 def newest_store(folders: Sequence[Path]) -> Path:
@@ -91,6 +97,7 @@ def report(
 
     Reads the stored file; needs no running nodes, but takes the calibration of those that run.
     """
+    from dm_calibration.calibration import CALIBRATED_ERROR_MAX
     from dm_calibration.report.certificate import keep_people, people
     from dm_calibration.report.page import figures_of, write_report
     from dm_calibration.store.calibration_store import CalibrationStore
@@ -99,9 +106,11 @@ def report(
     folder = out.resolve()
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {out}: is a file; name a folder, which need not exist yet")
+    error_max = CALIBRATED_ERROR_MAX
     if store is None:
-        file_in_use = None if calibration else running_calibration(namespace)
-        calibration = str(file_in_use or calibration)
+        if not calibration:
+            file_in_use, error_max = running_calibration(namespace)
+            calibration = str(file_in_use or "")
         store = folder_with(calibration, STORES)
     found, file = find_calibration(calibration, CalibrationStore(store))
     names = {name: value for name, value in (("operator", operator), ("instrument", instrument)) if value}
@@ -109,7 +118,7 @@ def report(
         for name in sorted({"operator", "instrument"} - people().keys() - names.keys()):
             names[name] = typer.prompt(f"{name}, for the first page (Enter = none)", default="", show_default=False)
     keep_people(names)
-    written = write_report(found, folder, file)
+    written = write_report(found, folder, file, error_max)
     console.print(
         f"calibration [bold]{found.id}[/]: residual {nanometres(found.fit.held_out_rms):.2f} nm rms on maps held out, "
         f"{len(found.limitations)} known limitations"
