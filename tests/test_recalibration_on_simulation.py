@@ -11,7 +11,7 @@ import pytest
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.procedure.applied_history import AppliedHistory
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
-from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions
+from dm_calibration.recalibration.updates import InUse, RecalibrationManager, UpdateOptions
 from dm_common.measurement import Measurement
 from dm_common.optics.zernike import TERM_RMS, basis
 from dm_simulation.mirror.piezo import PiezoConfig
@@ -75,6 +75,11 @@ def simulation() -> AgeingSimulation:
     return AgeingSimulation(CONFIG)
 
 
+def in_use(updates: RecalibrationManager) -> InUse:
+    assert updates.in_use is not None
+    return updates.in_use
+
+
 def test_two_maps_show_creep_that_the_calibration_could_not(tmp_path: Path) -> None:
     """Creep ends after minutes, a shape is held for a day, and the law expects that it went on."""
     simulation = AgeingSimulation(replace(CONFIG, creep=0.02, piezo=PiezoConfig(creep_slowest=100.0)))
@@ -88,8 +93,8 @@ def test_two_maps_show_creep_that_the_calibration_could_not(tmp_path: Path) -> N
         simulation.move(rng)
         measured = simulation.measurement(simulation.bench.take_map())
         standing = simulation.history.settled(1e-9 * measured.stamp_ns, 0.1)
-        fits = (simulation.calibration.fit, updates.changed_fit())
-        errors.append([simulation.error(fit, standing.effective) for fit in fits if fit is not None])
+        fits = (simulation.calibration.fit, in_use(updates).changed_fit())
+        errors.append([simulation.error(fit, standing.effective) for fit in fits])
         if checks < 2:
             assert updates.take(measured, standing).accepted
     without, kept = np.median(errors[2:], axis=0)
@@ -106,8 +111,8 @@ def test_a_mirror_that_does_not_drift_is_not_made_worse(simulation: AgeingSimula
         simulation.night(rng)
         measured = simulation.measurement(simulation.bench.take_map())
         standing = simulation.history.settled(1e-9 * measured.stamp_ns, 0.1)
-        fits = (simulation.calibration.fit, updates.changed_fit())
-        errors.append([simulation.error(fit, standing.effective) for fit in fits if fit is not None])
+        fits = (simulation.calibration.fit, in_use(updates).changed_fit())
+        errors.append([simulation.error(fit, standing.effective) for fit in fits])
         assert updates.take(measured, standing).accepted
     without, kept = np.sqrt(np.mean(np.square(errors), axis=0))
     assert kept < 1.02 * without
@@ -125,14 +130,13 @@ def test_maps_of_the_nights_keep_the_calibration_true(simulation: AgeingSimulati
         simulation.night(rng)
         measured = simulation.measurement(simulation.bench.take_map())
         standing = simulation.history.settled(1e-9 * measured.stamp_ns, 0.1)
-        fits = (simulation.calibration.fit, updates.changed_fit())
-        errors.append([simulation.error(fit, standing.effective) for fit in fits if fit is not None])
+        fits = (simulation.calibration.fit, in_use(updates).changed_fit())
+        errors.append([simulation.error(fit, standing.effective) for fit in fits])
         assert updates.take(measured, standing).accepted, night
     without, kept = np.median(errors[-20:], axis=0)
     assert kept < 0.2 * without
     assert kept < 632.8e-9 / 200
-    before = updates.updates
-    assert before is not None
+    before = in_use(updates).drift
     assert before.offset_rms == pytest.approx(20e-9, rel=0.2)
 
     # A map of a bumped bench changes nothing.
@@ -141,6 +145,5 @@ def test_maps_of_the_nights_keep_the_calibration_true(simulation: AgeingSimulati
     bumped = simulation.measurement(simulation.bench.take_map())
     verdict = updates.take(bumped, simulation.history.settled(1e-9 * bumped.stamp_ns, 0.1))
     assert not verdict.accepted
-    after = updates.updates
-    assert after is not None
+    after = in_use(updates).drift
     assert after.gain is before.gain and after.offset is before.offset and after.covariance is before.covariance

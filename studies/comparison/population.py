@@ -7,6 +7,7 @@ planner as on the bench, with the calibration as the message says it.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import tempfile
 import time
@@ -128,9 +129,8 @@ def _checked(
             driven.hold(driven.go(driven.plan(target)), bench.config.settle_time)
             updates.take(bench.measure("check"), driven.settled())
         message = calibration_message(calibration, None, "mirror", 1.0)
-        found, fit = updates.updates, updates.changed_fit()
-        assert found is not None and fit is not None
-        put_updates(message, found, fit, [], updates.mirror_changed, updates.disagreement)
+        assert updates.in_use is not None
+        put_updates(message, updates.in_use, math.nan, [], updates.mirror_changed)
     return active_of(bench, message)
 
 

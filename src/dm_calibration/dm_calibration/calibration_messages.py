@@ -14,7 +14,7 @@ from dm_msgs.msg import Calibration as CalibrationMsg
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
-from dm_calibration.recalibration.drift import Drift
+from dm_calibration.recalibration.updates import InUse
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.messages import doubles, recipe_book_message, taken, time_message
@@ -75,36 +75,31 @@ def calibration_message(
 
 
 def put_updates(
-    message: CalibrationMsg,
-    updates: Drift,
-    fit: InfluenceFit,
-    doubts: list[str],
-    mirror_changed: bool,
-    disagreement: float,
-    warm_error: float = 0.0,
+    message: CalibrationMsg, kept: InUse, temperature: float, doubts: list[str], mirror_changed: bool
 ) -> None:
     """What later maps have shown, into the `message` of the calibration that they update.
 
     Args:
+        temperature: degC; NaN = not known.
         doubts: sentences, added to the known limitations.
         mirror_changed: the calibration no longer counts as CALIBRATED.
-        disagreement: largest coefficient error that maps have shown since one last agreed, m: no bound is below it.
-        warm_error: what a temperature that is not known may change, m.
     """
+    fit, drift = kept.changed_fit(temperature), kept.drift
     for name in _MODEL:
         setattr(message, name, doubles(getattr(fit, name)))
-    for promise in (message, message.hysteresis):
-        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, disagreement), warm_error)
-    message.revision = updates.revision
-    message.checked = time_message(updates.checked_ns)
-    message.gain_drift = abs(updates.largest_gain[0])
-    message.offset_drift = updates.offset_rms
-    message.creep_shown = updates.trust
+    warm_error = kept.warm_error(temperature)
+    for promise in (message, message.hysteresis):  # no bound is below what maps have shown since one last agreed
+        promise.held_out_max_zernike = math.hypot(max(promise.held_out_max_zernike, kept.disagreement), warm_error)
+    message.revision = drift.revision
+    message.checked = time_message(drift.checked_ns)
+    message.gain_drift = abs(drift.largest_gain[0])
+    message.offset_drift = drift.offset_rms
+    message.creep_shown = drift.trust
     message.known_limitations = [*message.known_limitations, *doubts]
     message.actuator_grade = _grades(fit)
-    if updates.given_up:
+    if drift.given_up:
         message.recipes = RecipeBook()  # of a mirror with all its actuators
-    if mirror_changed or updates.given_up:
+    if mirror_changed or drift.given_up:
         message.quality = CalibrationMsg.APPROXIMATE
 
 

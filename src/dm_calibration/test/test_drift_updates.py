@@ -16,7 +16,7 @@ from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.check_log import read_checks
 from dm_calibration.recalibration.drift import Drift, DriftRates
-from dm_calibration.recalibration.updates import RecalibrationManager, UpdateOptions, Verdict
+from dm_calibration.recalibration.updates import InUse, RecalibrationManager, UpdateOptions, Verdict
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_calibration.store.hdf5_image import HASH, read_image, write_image
 from dm_common.atomic_write import StoreError
@@ -56,15 +56,17 @@ def begun(made: Made, folder: Path, options: UpdateOptions = EXACT, remark: str 
     return updates
 
 
+def in_use(manager: RecalibrationManager) -> InUse:
+    assert manager.in_use is not None
+    return manager.in_use
+
+
 def known(manager: RecalibrationManager) -> Drift:
-    assert manager.updates is not None
-    return manager.updates
+    return in_use(manager).drift
 
 
-def changed_fit(manager: RecalibrationManager) -> InfluenceFit:
-    fit = manager.changed_fit()
-    assert fit is not None
-    return fit
+def changed_fit(manager: RecalibrationManager, temperature: float = np.nan) -> InfluenceFit:
+    return in_use(manager).changed_fit(temperature)
 
 
 def error(bench: SteadyMirror, fit: InfluenceFit) -> float:
@@ -151,7 +153,7 @@ def test_one_map_of_an_actuator_that_sticks_widens_the_bound_for_every_other_sha
     shapes = rng.uniform(-0.7, 0.7, (20, bench.mirror.actuators))
     shapes[0, 6] = 0.35
     first = shown(shapes[0]).comparison.max_zernike
-    bound = updates.disagreement
+    bound = in_use(updates).disagreement
     errors = [shown(wanted).comparison.max_zernike for wanted in shapes[1:]]
     assert max(errors) > 2.0 * first
     assert max(errors) < bound < 4.0 * max(errors)
@@ -173,8 +175,8 @@ def test_it_goes_on_without_actuators_that_stick(bench: SteadyMirror, made: Made
         np.testing.assert_allclose(known(manager).stuck[stuck], [0.0, 0.3], atol=0.01)
         assert not fit.influence_sag[:, stuck].any() and (fit.grades[stuck] == GRADE_DEAD).all()
         assert error(bench, fit) < 3e-9
-        message = calibration_message(manager.calibration, None, "mirror", 1.0)
-        put_updates(message, known(manager), fit, manager.doubts, False, 0.0)
+        message = calibration_message(in_use(manager).calibration, None, "mirror", 1.0)
+        put_updates(message, in_use(manager), np.nan, manager.doubts, False)
         assert message.quality == message.APPROXIMATE and message.actuator_grade[6] == message.GRADE_DEAD
         assert any("Goes on without actuators 7" in sentence for sentence in message.known_limitations)
     for _ in range(2):  # later maps agree, whatever is asked of the two
@@ -260,16 +262,16 @@ def test_what_the_temperature_does_is_foretold(
     assert known(updates).thermal_trust > 0.5
     for temperature in (12.0, 16.0, 24.0, 28.0):
         warm(bench, rng, gain, figure, temperature)
-        fits = (made[1].fit, updates.changed_fit(), updates.changed_fit(temperature))
-        errors.append([error(bench, fit) for fit in fits if fit is not None])
+        fits = (made[1].fit, changed_fit(updates), changed_fit(updates, temperature))
+        errors.append([error(bench, fit) for fit in fits])
     without, not_known, with_temperature = np.sqrt(np.mean(np.square(errors), axis=0))
     assert with_temperature < 0.3 * without
     # Where it stops coming the bound says what it may do; where it comes, no bound is wider.
-    bound = updates.warm_error(float("nan"))
+    bound = in_use(updates).warm_error(np.nan)
     assert 0.3 * not_known < bound < 10.0 * not_known
-    assert updates.warm_error(20.0) == 0.0
-    message = calibration_message(updates.calibration, None, "mirror", 1.0)
-    put_updates(message, known(updates), changed_fit(updates), [], False, 0.0, bound)
+    assert in_use(updates).warm_error(20.0) == 0.0
+    message = calibration_message(in_use(updates).calibration, None, "mirror", 1.0)
+    put_updates(message, in_use(updates), np.nan, [], False)
     assert message.held_out_max_zernike > bound
     warm(bench, rng, gain, figure, 25.0)  # and a map without it is still taken
     assert updates.take(bench.measure("not known"), bench.settled()).accepted
@@ -284,8 +286,8 @@ def test_a_temperature_that_does_nothing_makes_nothing_worse(
     for _ in range(12):
         warm_months(bench, updates, rng, 0.0, 0.0, 1)
         bench.apply(rng.uniform(-0.7, 0.7, bench.mirror.actuators))
-        fits = (made[1].fit, updates.changed_fit(float(rng.uniform(15.0, 25.0))))
-        errors.append([error(bench, fit) for fit in fits if fit is not None])
+        fits = (made[1].fit, changed_fit(updates, float(rng.uniform(15.0, 25.0))))
+        errors.append([error(bench, fit) for fit in fits])
     without, kept = np.sqrt(np.mean(np.square(errors), axis=0))
     assert kept < 1.02 * without
 
@@ -313,11 +315,8 @@ def test_a_bad_map_widens_the_bound_at_once_and_a_good_one_restores_it(
     told = {}
     for name, bump in (("first", 0.0), ("bad", 40e-9), ("good", 0.0)):
         updates.take(bench.measure(name, bump=bump), bench.settled())
-        fit, known = updates.changed_fit(), updates.updates
-        assert fit is not None
-        assert known is not None
-        message = calibration_message(updates.calibration, None, "mirror", 1.0)
-        put_updates(message, known, fit, [], False, updates.disagreement)
+        message = calibration_message(in_use(updates).calibration, None, "mirror", 1.0)
+        put_updates(message, in_use(updates), np.nan, [], False)
         told[name] = message.held_out_max_zernike
     assert told["bad"] > 20e-9
     assert told["good"] == told["first"] < 5e-9

@@ -76,11 +76,10 @@ def test_what_later_maps_changed(store: CalibrationStore) -> None:
     calibration, message = published(store, "linear")
     manager = RecalibrationManager(store.folder, lambda: UpdateOptions(signal_sigma=1e-3))
     assert manager.begin(calibration) == ""
-    updates, fit = manager.updates, manager.changed_fit()
-    assert updates is not None
-    assert updates.trust == 1.0  # all of it was used then
-    assert fit is not None
-    put_updates(message, updates, fit, [], False, 0.0)
+    kept = manager.in_use
+    assert kept is not None
+    assert kept.drift.trust == 1.0  # all of it was used then
+    put_updates(message, kept, np.nan, [], False)
     check(message, "updated")
     drift = (message.revision, message.gain_drift, message.offset_drift)
     np.testing.assert_allclose(drift, EXPECTED["updated/drift"], rtol=1e-12)

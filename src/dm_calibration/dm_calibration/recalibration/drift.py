@@ -1,10 +1,10 @@
 """What maps that came later have shown of a calibrated mirror."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, cho_solve
+from scipy.special import ndtri
 
 from dm_common import Floats
 
@@ -49,11 +49,10 @@ class Drift:
         revision: maps taken in.
         checked_ns: stamp of the last of them; 0 = none.
         surprising: maps in a row, the last ones, that disagreed.
-        foretold: sum of squares of the changes that were foretold to maps, in standard deviations.
-        borne_out: sum of their products with the changes that the maps showed.
+        evidence: (2, 2) sum of squares of the changes that were foretold to maps, in standard deviations, and of their
+            products with the changes that the maps showed; then the same of the changes by temperature alone.
         stuck: (N,) effective signals at which actuators stand that do not move any more; NaN = it moves.
         temperatures: (3,) degC, that gain and offset hold at, and the lowest and highest of the maps; NaN = not known.
-        warm_foretold, warm_borne_out: as `foretold` and `borne_out`, of the changes by temperature alone.
     """
 
     gain: Floats
@@ -64,23 +63,20 @@ class Drift:
     stamp_ns: int
     stuck: Floats
     temperatures: Floats
+    evidence: Floats = field(default_factory=lambda: np.zeros((2, 2)))
     revision: int = 0
     checked_ns: int = 0
     surprising: int = 0
-    foretold: float = 0.0
-    borne_out: float = 0.0
-    warm_foretold: float = 0.0
-    warm_borne_out: float = 0.0
 
     @property
     def trust(self) -> float:
         """The share of gain and offset that maps not used for them have borne out, 0 to 1."""
-        return _share(self.foretold, self.borne_out)
+        return _share(*self.evidence[0])
 
     @property
     def thermal_trust(self) -> float:
         """The same of the changes by temperature."""
-        return _share(self.warm_foretold, self.warm_borne_out)
+        return _share(*self.evidence[1])
 
     def warmer(self, temperature: float) -> float:
         """K above what gain and offset hold at; 0 where not known."""
@@ -132,28 +128,6 @@ class Drift:
         return self.trust * float(np.linalg.norm(self.figure))
 
 
-class Taken(NamedTuple):
-    """A map that came later.
-
-    Attributes:
-        coefficients: (K,) m.
-        sag: (P,) m, NaN = no data.
-        effective: (N,) effective signals at the time of the map.
-        stamp_ns: of the map; a time before the drift's is taken as the drift's.
-        repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
-            does not average out, so repeats count for less and less.
-        temperature: degC; NaN = not known. That of the first map which tells it stands for that of a calibration
-            which does not.
-    """
-
-    coefficients: Floats
-    sag: Floats
-    effective: Floats
-    stamp_ns: int
-    repeat: int = 0
-    temperature: float = float("nan")
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """A map against its prediction.
@@ -174,6 +148,16 @@ class Comparison:
     updated: Drift
     displaced: dict[int, float]
     probability: dict[int, float]
+
+
+def surprise_of(innovation: Floats, expected: Floats, factor: tuple[Floats, bool]) -> float:
+    """`innovation` (R,) over its `expected` covariance (R, R)."""
+    size = len(innovation)
+    together = np.sqrt(innovation @ cho_solve(factor, innovation) / size)
+    # Median of the largest of so many normal numbers.
+    largest = -ndtri(0.5 * (1.0 - 0.5 ** (1.0 / size)))
+    single = np.abs(innovation / np.sqrt(np.diag(expected))).max() / largest
+    return float(max(together, single))
 
 
 def _share(foretold: float, borne_out: float) -> float:

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import ndtri
 
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
 from dm_calibration.hysteresis.reduction import Reduction
@@ -31,10 +30,11 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
 from dm_calibration.recalibration.displaced import displaced_actuators, displacement
-from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, Taken
+from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, surprise_of
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import slow_creep
 from dm_common.hysteresis.model import HysteresisModel
+from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, rms
 from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 
@@ -128,10 +128,18 @@ class DriftFilter:
             temperatures=np.full(3, self._temperature),
         )
 
-    def compare(self, drift: Drift, taken: Taken) -> Comparison:
-        """Compare a map with what `drift` makes of it; nothing is changed."""
-        stamp_ns, temperature = taken.stamp_ns, taken.temperature
-        seen = self._innovation(drift, taken)
+    def compare(self, drift: Drift, measured: Measurement, effective: Floats, repeat: int = 0) -> Comparison:
+        """Compare a map with what `drift` makes of it; nothing is changed.
+
+        Args:
+            measured: of a time before the drift's, it is taken as of the drift's. The temperature of the first map
+                which tells it stands for that of a calibration which does not.
+            effective: (N,) effective signals at its time.
+            repeat: maps that were taken of this very state before. The error of the law is the same in all of them and
+                does not average out, so repeats count for less and less.
+        """
+        stamp_ns = measured.stamp_ns
+        seen = self._innovation(drift, measured, effective, repeat)
         prior, design, factor = seen.prior, seen.design, seen.factor
         innovation = seen.shown - seen.foretold - seen.warm
         shared = prior @ design.T
@@ -141,14 +149,14 @@ class DriftFilter:
         left = np.eye(len(prior)) - kalman @ design
         noise = seen.expected - design @ shared
         covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
-        evidence = np.array((drift.foretold, drift.borne_out, drift.warm_foretold, drift.warm_borne_out))
-        if not taken.repeat:  # a repeat shares the error of the law with the map before it
+        evidence = drift.evidence.copy()
+        if not repeat:  # a repeat shares the error of the law with the map before it
             weighed, warm = cho_solve(factor, seen.foretold), cho_solve(factor, seen.warm)
             rest = seen.shown - drift.thermal_trust * seen.warm, seen.shown - drift.trust * seen.foretold
-            evidence[:2] *= EVIDENCE_KEPT
-            evidence[2:] *= EVIDENCE_KEPT if seen.warm.any() else 1.0  # a map that is not warmer says nothing of it
-            evidence += weighed @ seen.foretold, weighed @ rest[0], warm @ seen.warm, warm @ rest[1]
-        known = np.append(drift.temperatures, temperature)
+            evidence[0] *= EVIDENCE_KEPT
+            evidence[1] *= EVIDENCE_KEPT if seen.warm.any() else 1.0  # a map that is not warmer says nothing of it
+            evidence += (weighed @ seen.foretold, weighed @ rest[0]), (warm @ seen.warm, warm @ rest[1])
+        known = np.append(drift.temperatures, measured.temperature)
         updated = replace(
             drift,
             gain=drift.gain + gain,
@@ -160,10 +168,7 @@ class DriftFilter:
             revision=drift.revision + 1,
             checked_ns=stamp_ns,
             surprising=0,
-            foretold=float(evidence[0]),
-            borne_out=float(evidence[1]),
-            warm_foretold=float(evidence[2]),
-            warm_borne_out=float(evidence[3]),
+            evidence=evidence,
             temperatures=np.array(
                 [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
             ),
@@ -173,21 +178,25 @@ class DriftFilter:
         return Comparison(
             max_zernike=float(np.abs(seen.zernike_error)[PISTON_TILT:].max()),
             rms=float(rms(departure, self._fit.points.weight)),
-            surprise=_surprise(innovation, seen.expected, factor),
+            surprise=surprise_of(innovation, seen.expected, factor),
             updated=updated,
             displaced=displaced,
             probability=probability,
         )
 
-    def give_up(self, drift: Drift, actuators: list[int], taken: Taken) -> Drift:
+    def give_up(
+        self, drift: Drift, actuators: list[int], measured: Measurement, effective: Floats, repeat: int = 0
+    ) -> Drift:
         """`drift` of a mirror on which `actuators` have no effect any more and stand where a map shows them.
+
+        Args as of :meth:`compare`.
 
         Raises:
             MapNotUsableError: one stands where it should, as far as the map shows.
         """
-        seen = self._innovation(drift, taken)
+        seen = self._innovation(drift, measured, effective, repeat)
         away, sigma = displacement(seen.shown - seen.foretold - seen.warm, self._gain, seen.factor, actuators)
-        at = drift.standing(taken.effective)
+        at = drift.standing(effective)
         stuck = drift.stuck.copy()
         for actuator, more, error in zip(actuators, away, sigma, strict=True):
             if np.isnan(stuck[actuator]) and abs(more) < DISPLACED_SIGMAS * error:
@@ -216,9 +225,8 @@ class DriftFilter:
         covariance[creep, creep] += grown**2 * self._unit
         return replace(drift, crept=kept * drift.crept, covariance=covariance)
 
-    def _innovation(self, drift: Drift, taken: Taken) -> _Innovation:
-        coefficients, sag, effective, stamp_ns, repeat, temperature = taken
-        drift = self._at(drift, stamp_ns)
+    def _innovation(self, drift: Drift, measured: Measurement, effective: Floats, repeat: int) -> _Innovation:
+        drift, temperature = self._at(drift, measured.stamp_ns), measured.temperature
         prior = drift.covariance
         moved = self._gain * np.where(np.isnan(drift.stuck), effective, 0.0)
         figure, warmer = np.eye(self.reduction.size), drift.warmer(temperature)
@@ -226,8 +234,8 @@ class DriftFilter:
         design = np.hstack((moved, figure, warmed, figure))
         changed = self.changed(drift, temperature)
         predicted_sag = changed.sag_offset + changed.influence_sag @ effective
-        zernike_error = coefficients - changed.zernike_offset - changed.influence_zernike @ effective
-        sag_error = fill_gaps(sag[None], predicted_sag[None], self._fit.points)[0] - predicted_sag
+        zernike_error = measured.coefficients - changed.zernike_offset - changed.influence_zernike @ effective
+        sag_error = fill_gaps(measured.sag[None], predicted_sag[None], self._fit.points)[0] - predicted_sag
         foretold, warm = moved @ drift.gain + drift.figure, warmed @ drift.thermal
         used = drift.trust * foretold + drift.thermal_trust * warm
         shown = self.reduction.reduce(zernike_error, sag_error) + used
@@ -285,13 +293,3 @@ class DriftFilter:
         reach = np.square(self._gain[:count]).sum()
         error = np.square(hysteresis.zernike_sigma[PISTON_TILT:] * TERM_RMS[PISTON_TILT : PISTON_TILT + count]).sum()
         return float(np.sqrt(error / reach))
-
-
-def _surprise(innovation: Floats, expected: Floats, factor: tuple[Floats, bool]) -> float:
-    """`innovation` (R,) over its `expected` covariance (R, R)."""
-    size = len(innovation)
-    together = np.sqrt(innovation @ cho_solve(factor, innovation) / size)
-    # Median of the largest of so many normal numbers.
-    largest = -ndtri(0.5 * (1.0 - 0.5 ** (1.0 / size)))
-    single = np.abs(innovation / np.sqrt(np.diag(expected))).max() / largest
-    return float(max(together, single))

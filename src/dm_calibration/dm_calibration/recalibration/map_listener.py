@@ -92,7 +92,8 @@ class MapListener:
 
     def begin(self, calibration: Calibration | None) -> None:
         """Keep `calibration` true from now on."""
-        if calibration is self._updates.calibration:
+        kept = self._updates.in_use
+        if calibration is (kept and kept.calibration):
             return
         self._updates.folder = self._manager.store.folder
         try:
@@ -111,30 +112,27 @@ class MapListener:
     def amend(self, message: CalibrationMsg) -> None:
         """Put what maps have shown since into the message of the calibration in use."""
         temperature = self._temperatures.published()
-        updates, fit = self._updates.updates, self._updates.changed_fit(temperature)
-        if updates is not None and fit is not None:
+        if (kept := self._updates.in_use) is not None:
             self._published_at, self._dirty = time.monotonic(), False
-            changed, disagreement = self._updates.mirror_changed, self._updates.disagreement
-            warm_error = self._updates.warm_error(temperature)
-            put_updates(message, updates, fit, self._doubts(), changed, disagreement, warm_error)
+            put_updates(message, kept, temperature, self._doubts(), self._updates.mirror_changed)
 
     def _doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more."""
         doubts = self._updates.doubts
         if self._stale:
             doubts.append(f"Stale: no map has agreed with this calibration for {self._age_s / 86400.0:.1f} days.")
-        if error := self._updates.warm_error(self._temperatures.now()):
+        kept = self._updates.in_use
+        if error := kept.warm_error(self._temperatures.now()) if kept else 0.0:
             doubts.append(f"The topic temperature does not come: up to {1e9 * error:.1f} nm are not corrected.")
         return doubts
 
     @property
     def _age_s(self) -> float:
         """Since a map last agreed with the calibration, or since it was made, s."""
-        calibration, updates = self._updates.calibration, self._updates.updates
-        if calibration is None or updates is None:
+        if (kept := self._updates.in_use) is None:
             return 0.0
         now = int(self._node.get_clock().now().nanoseconds)
-        return max(0.0, 1e-9 * (now - max(calibration.stamp_ns, updates.checked_ns)))
+        return max(0.0, 1e-9 * (now - max(kept.calibration.stamp_ns, kept.drift.checked_ns)))
 
     @property
     def _stale(self) -> bool:
@@ -144,8 +142,8 @@ class MapListener:
         """Publish what is due; called about once a second by the node."""
         stale = self._stale
         due = time.monotonic() - self._published_at >= PUBLISH_PERIOD_S
-        updates = self._updates.updates
-        warmed = updates is not None and updates.thermal_trust > 0.0 and self._temperatures.changed
+        kept = self._updates.in_use
+        warmed = kept is not None and kept.drift.thermal_trust > 0.0 and self._temperatures.changed
         if (self._dirty or stale != self._was_stale or warmed) and due:
             self._was_stale = stale
             self._manager.publish_again()
@@ -165,7 +163,7 @@ class MapListener:
             self._node.get_logger().error(f"actuator_state refused: {error}", throttle_duration_sec=10.0)
 
     def _on_part(self, name: str, message: Any) -> None:
-        if not (self._values["updates.enable"] and self._node.active and self._updates.calibration) or self._busy():
+        if not (self._values["updates.enable"] and self._node.active and self._updates.in_use) or self._busy():
             return
         stamp = stamp_ns(message.header.stamp)
         parts = self._incomplete.setdefault(stamp, {})
@@ -231,11 +229,10 @@ class MapListener:
             else:
                 self._check(request, response)
         finally:
-            updates = self._updates.updates
-            if updates is not None:
-                response.revision = updates.revision
-                response.gain_drift = abs(updates.largest_gain[0])
-                response.offset_drift = updates.offset_rms
+            if (kept := self._updates.in_use) is not None:
+                response.revision = kept.drift.revision
+                response.gain_drift = abs(kept.drift.largest_gain[0])
+                response.offset_drift = kept.drift.offset_rms
         return response
 
     def _forget(self, request: UpdateCalibration.Request, response: UpdateCalibration.Response) -> None:
@@ -274,15 +271,15 @@ class MapListener:
         return self._history.still_for(now) >= self._values["updates.still_time"]
 
     def _calibration(self) -> Calibration:
-        if self._updates.calibration is None:
+        if (kept := self._updates.in_use) is None:
             raise Refusal(ErrorCode.NOT_CALIBRATED, "no calibration is in use")
-        return self._updates.calibration
+        return kept.calibration
 
     def health(self) -> tuple[bytes, list[str], dict[str, object]]:
         """Level, warnings and figures for the node's diagnostics."""
-        updates = self._updates.updates
-        if updates is None:
+        if (kept := self._updates.in_use) is None:
             return OK, [], {}
+        updates = kept.drift
         warnings = [doubt.rstrip(".") for doubt in self._doubts()]
         gain, actuator = updates.largest_gain
         if abs(gain) > self._values["updates.gain_drift_max"]:

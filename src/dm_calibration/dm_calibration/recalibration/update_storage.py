@@ -46,7 +46,7 @@ def write_updates(path: Path, identifier: str, basis: str, updates: Drift) -> No
         "calibration": identifier,
         "basis_sha256": basis,
         **{name: getattr(updates, name) for name in _NUMBERS},
-        **{name: float(getattr(updates, name)) for name in _EVIDENCE},
+        **dict(zip(_EVIDENCE, updates.evidence.ravel().tolist(), strict=True)),
     }
     write_whole(path, write_image(columns, attributes))
 
@@ -96,5 +96,5 @@ def read_updates(path: Path, identifier: str, basis: str, like: Drift) -> Drift 
     for name, number in evidence.items():
         if not isinstance(number, float) or not np.isfinite(number):
             raise UpdatesFileError(f"{path.name}: {name} is {number!r}: must be a finite number")
-    found: dict[str, Any] = {**arrays, **numbers, **evidence}
-    return Drift(**found)
+    found: dict[str, Any] = {**arrays, **numbers}
+    return Drift(**found, evidence=np.reshape(list(evidence.values()), (2, 2)))

@@ -20,7 +20,7 @@ from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
 from dm_calibration.recalibration.displaced import described, worst_elsewhere
-from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, Taken
+from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
 from dm_common.atomic_write import storing
@@ -72,63 +72,69 @@ class Verdict:
     comparison: Comparison
 
 
+@dataclass(frozen=True, eq=False)
+class InUse:
+    """The calibration in use and what later maps have shown of it. Never changed in place.
+
+    Attributes:
+        basis: hash of what updates change, see :func:`basis_hash`.
+        repeats: maps that were taken of the present shape, which the mirror has had since `since` (s), the first of
+            them at `first_ns`.
+        disagreement: largest error (m) that maps have shown since one agreed, or that actuators they show make
+            elsewhere.
+    """
+
+    calibration: Calibration
+    filter: DriftFilter
+    basis: str
+    drift: Drift
+    repeats: int = 0
+    since: float = float("nan")
+    first_ns: int = 0
+    disagreement: float = 0.0
+
+    def changed_fit(self, temperature: float = math.nan) -> InfluenceFit:
+        """The influence function as maps have found it, at `temperature` (degC)."""
+        return self.filter.changed(self.drift, temperature)
+
+    def warm_error(self, temperature: float) -> float:
+        """95 % bound of what `temperature` (degC) may change of a coefficient, m; 0 where it is known."""
+        return 0.0 if math.isfinite(temperature) else self.filter.warm_error(self.drift)
+
+
 class RecalibrationManager:
     """Updates of the calibration in use; every method may be called from any thread.
 
     Args:
         options: asked for at every map; its rates and signal_sigma at every new calibration.
+
+    Attributes:
+        in_use: None without a calibration; replaced as a whole.
     """
 
     def __init__(self, folder: Path, options: Callable[[], UpdateOptions]) -> None:
         self.folder, self._options = folder, options
         self._lock = threading.RLock()
-        self._calibration: Calibration | None = None
-        self._filter: DriftFilter | None = None
-        self._updates: Drift | None = None
-        self._basis = ""
-        self._forget_repeats()
-
-    def _forget_repeats(self) -> None:
-        self._repeat, self._since, self._first_ns = 0, float("nan"), 0
-        self._disagreement = 0.0
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """The calibration in use, as it was made."""
-        with self._lock:
-            return self._calibration
-
-    @property
-    def updates(self) -> Drift | None:
-        """What maps have shown since; None without a calibration."""
-        with self._lock:
-            return self._updates
+        self.in_use: InUse | None = None
 
     @property
     def mirror_changed(self) -> bool:
         """Whether so many maps in a row disagreed that the calibration is in doubt."""
-        with self._lock:
-            return self._updates is not None and self._updates.surprising >= self._options().surprises_max
-
-    @property
-    def disagreement(self) -> float:
-        """Largest error (m) that maps have shown since one agreed, or that actuators they show make elsewhere."""
-        with self._lock:
-            return self._disagreement
+        kept = self.in_use
+        return kept is not None and kept.drift.surprising >= self._options().surprises_max
 
     @property
     def doubts(self) -> list[str]:
         """Sentences on why the calibration may not hold any more, or only in part."""
-        with self._lock:
-            doubts = []
-            if self._updates is not None and self.mirror_changed:
-                doubts.append(
-                    f"The last {self._updates.surprising} maps disagree with this calibration: the mirror has changed, "
-                    "calibrate again."
-                )
-            if self._updates is not None and self._updates.given_up:
-                doubts.append(f"{self._updates.given_up}.")
-            return doubts
+        doubts, kept = [], self.in_use
+        if kept is not None and self.mirror_changed:
+            doubts.append(
+                f"The last {kept.drift.surprising} maps disagree with this calibration: the mirror has changed, "
+                "calibrate again."
+            )
+        if kept is not None and kept.drift.given_up:
+            doubts.append(f"{kept.drift.given_up}.")
+        return doubts
 
     def begin(self, calibration: Calibration | None) -> str:
         """Keep `calibration` true from now on, with what is stored of it. Returns a remark on damaged files, "" = none.
@@ -137,36 +143,20 @@ class RecalibrationManager:
             ValueError: the calibration's maps make no sense.
         """
         with self._lock:
-            self._calibration, self._filter, self._updates = calibration, None, None
-            self._forget_repeats()
+            self.in_use = None
             if calibration is None:
                 return ""
-            options = self._options()
-            self._basis = basis_hash(calibration)
-            self._filter = DriftFilter(
+            options, basis = self._options(), basis_hash(calibration)
+            drift_filter = DriftFilter(
                 calibration.fit, calibration.maps, calibration.hysteresis, options.signal_sigma, options.rates
             )
-            self._updates = fresh = self._filter.start(calibration.stamp_ns)
-            file = self._file(calibration.id)
+            drift, remark = drift_filter.start(calibration.stamp_ns), ""
             try:
-                self._updates = read_updates(file, calibration.id, self._basis, fresh) or fresh
+                drift = read_updates(self._file(calibration.id), calibration.id, basis, drift) or drift
             except UpdatesFileError as error:
-                return f"updates of {calibration.id} are ignored: {error}"
-            return ""
-
-    def changed_fit(self, temperature: float = math.nan) -> InfluenceFit | None:
-        """The influence function as maps have found it, at `temperature` (degC); None without a calibration."""
-        with self._lock:
-            if self._filter is None or self._updates is None:
-                return None
-            return self._filter.changed(self._updates, temperature)
-
-    def warm_error(self, temperature: float) -> float:
-        """95 % bound of what `temperature` (degC) may change of a coefficient, m; 0 where it is known."""
-        with self._lock:
-            if self._filter is None or self._updates is None or math.isfinite(temperature):
-                return 0.0
-            return self._filter.warm_error(self._updates)
+                remark = f"updates of {calibration.id} are ignored: {error}"
+            self.in_use = InUse(calibration, drift_filter, basis, drift)
+            return remark
 
     def take(
         self, measured: Measurement, settled: SettledState, dry_run: bool = False, without: Sequence[int] = ()
@@ -183,22 +173,18 @@ class RecalibrationManager:
             StoreError: the update could not be stored; nothing has changed.
         """
         with self._lock:
-            calibration, updates, drift_filter = self._calibration, self._updates, self._filter
-            if calibration is None or updates is None or drift_filter is None:
-                raise MapNotUsableError("no calibration is in use")
-            options = self._options()
+            kept, options = self._kept(), self._options()
+            calibration, updates = kept.calibration, kept.drift
             check_map(measured, calibration, options)
             if settled.effective.shape != (calibration.fit.actuators,):
                 raise MapNotUsableError(
                     f"{settled.effective.size} signals stand at the mirror, the calibration has "
                     f"{calibration.fit.actuators}"
                 )
-            repeat = self._repeats(measured.stamp_ns, settled)
-            where = settled.effective, measured.stamp_ns, repeat, measured.temperature
-            taken = Taken(measured.coefficients, measured.sag, *where)
+            repeat = _repeats(kept, measured.stamp_ns, settled)
             if without:
-                updates = drift_filter.give_up(updates, list(without), taken)
-            comparison = drift_filter.compare(updates, taken)
+                updates = kept.filter.give_up(updates, list(without), measured, settled.effective, repeat)
+            comparison = kept.filter.compare(updates, measured, settled.effective, repeat)
             accepted = comparison.surprise <= options.surprise_max
             reason = f"differs by {comparison.surprise:.1f} times what is to be expected"
             found = comparison.displaced, comparison.probability, updates.standing(settled.effective)
@@ -210,20 +196,20 @@ class RecalibrationManager:
                 reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:
                 return Verdict(accepted, reason, comparison)
-            before = self._updates or updates
-            changed = comparison.updated if accepted else replace(before, surprising=before.surprising + 1)
+            if accepted:
+                changed, kept = comparison.updated, replace(kept, disagreement=0.0, repeats=repeat + 1)
+                if not repeat:
+                    kept = replace(kept, since=settled.since, first_ns=measured.stamp_ns)
+            else:
+                changed = replace(kept.drift, surprising=kept.drift.surprising + 1)
+                kept = replace(kept, disagreement=max(kept.disagreement, worst))
             with storing(f"the update of {calibration.id} was not stored in {self.folder}"):
-                write_updates(self._file(calibration.id), calibration.id, self._basis, changed)
-            self._updates = changed
+                write_updates(self._file(calibration.id), calibration.id, kept.basis, changed)
+            self.in_use = replace(kept, drift=changed)
             with suppress(OSError):  # the update itself is stored
                 shown = Check.of(measured.stamp_ns, accepted, comparison, changed)
                 append_check(self._file(calibration.id, LOG_SUFFIX), shown)
-            self._disagreement = 0.0 if accepted else max(self._disagreement, worst)
-            if accepted:
-                if not repeat:
-                    self._since, self._first_ns = settled.since, measured.stamp_ns
-                self._repeat = repeat + 1
-            elif self.mirror_changed:
+            if not accepted and self.mirror_changed:
                 reason = f"{reason}; {changed.surprising} maps in a row did: the mirror has changed: calibrate again"
             return Verdict(accepted, reason, comparison)
 
@@ -235,20 +221,25 @@ class RecalibrationManager:
             StoreError: the file could not be removed; nothing has changed.
         """
         with self._lock:
-            if self._calibration is None or self._filter is None:
-                raise MapNotUsableError("no calibration is in use")
-            with storing(f"updates of {self._calibration.id} were not removed"):
-                self._file(self._calibration.id).unlink(missing_ok=True)
-            self._updates = self._filter.start(self._calibration.stamp_ns)
-            self._forget_repeats()
+            kept = self._kept()
+            with storing(f"updates of {kept.calibration.id} were not removed"):
+                self._file(kept.calibration.id).unlink(missing_ok=True)
+            fresh = kept.filter.start(kept.calibration.stamp_ns)
+            self.in_use = InUse(kept.calibration, kept.filter, kept.basis, fresh)
 
-    def _repeats(self, stamp_ns: int, settled: SettledState) -> int:
-        # Where it is held against creep, the first correction that kept this very shape is not always the same one.
-        same = abs(settled.since - self._since) < SAME_MOVE_S and 1e-9 * (stamp_ns - self._first_ns) < REPEAT_S
-        return self._repeat if same else 0
+    def _kept(self) -> InUse:
+        if self.in_use is None:
+            raise MapNotUsableError("no calibration is in use")
+        return self.in_use
 
     def _file(self, identifier: str, suffix: str = SUFFIX) -> Path:
         return self.folder / f"{identifier}{suffix}"
+
+
+def _repeats(kept: InUse, stamp_ns: int, settled: SettledState) -> int:
+    # Where it is held against creep, the first correction that kept this very shape is not always the same one.
+    same = abs(settled.since - kept.since) < SAME_MOVE_S and 1e-9 * (stamp_ns - kept.first_ns) < REPEAT_S
+    return kept.repeats if same else 0
 
 
 def check_map(measured: Measurement, calibration: Calibration, options: UpdateOptions) -> None:
