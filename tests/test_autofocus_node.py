@@ -62,6 +62,7 @@ class FilmedScene:
         self.node = observer.node
         self.object_curvature = object_curvature
         self.refuse_beyond = HIGH
+        self.dead = False
         self.requests: list[FocusRequest] = []
         self.asked: list[FocusRequest] = []  # by the service `set_focus`
         self.history_known = False
@@ -83,7 +84,7 @@ class FilmedScene:
         self._compressed = self.node.create_publisher(CompressedImage, topic, qos_profile_sensor_data)
         self._state = self.node.create_publisher(FocusState, "focus_state", qos.STATE)
         self._driver = self.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
-        self._capabilities = self.node.create_publisher(Capabilities, "capabilities", qos.LATCHED)
+        self._live()
         self.request = self.node.create_publisher(FocusRequest, "focus_request", qos.COMMAND)
         self.node.create_subscription(FocusRequest, "focus_request", self._on_request, qos.COMMAND)
         WorkerService(self.node, SetFocus, "set_focus", self._on_set_focus)
@@ -96,6 +97,21 @@ class FilmedScene:
         self.aperture(RADIUS)
         self._camera.start()
         return self
+
+    def _live(self) -> None:
+        self._capabilities = self.node.create_publisher(Capabilities, "capabilities", qos.with_lease(qos.LATCHED))
+
+    def die(self) -> None:
+        """The controller answers nothing any more."""
+        self.dead = True
+        self.node.destroy_publisher(self._capabilities)
+
+    def revive(self) -> None:
+        """It is there again, and knows its calibration a little later."""
+        self._live()
+        self.dead = False
+        time.sleep(0.5)
+        self.aperture(RADIUS)
 
     def aperture(self, radius: float, error_bound: float = 0.0) -> None:
         """Publish capabilities with an aperture of this radius and this bound of a move's error, m."""
@@ -134,6 +150,8 @@ class FilmedScene:
         return state
 
     def _on_request(self, request: FocusRequest) -> None:
+        if self.dead:
+            return
         self.requests.append(request)
         state = self._judge(request)
         if state.applied:
@@ -431,6 +449,21 @@ def test_tracking_finds_an_object_that_moved_and_ends_on_cancel(scene: FilmedSce
     wait_until(result.done, what="the end after cancel")
     assert result.result().status == GoalStatus.STATUS_CANCELED
     assert result.result().result.curvature == pytest.approx(-0.03, abs=0.002)
+
+
+def test_tracking_goes_on_when_the_controller_is_back(scene: FilmedScene, observer: Observer) -> None:
+    handle, result = observer.send_goal(Autofocus, "autofocus", Autofocus.Goal(track=True))
+    wait_until(lambda: scene.states[-1].phase == AutofocusState.PHASE_TRACK, 60, "tracking")
+    scene.die()
+    died = "the node focus_controller has died"
+    wait_until(lambda: died in observer.call(GetFocusRange, "get_focus_range").message, what="its name")
+    time.sleep(PARAMETERS["move_timeout"])  # it has tried to move meanwhile
+    requests = len(scene.requests)
+    scene.revive()
+    wait_until(lambda: len(scene.requests) > requests + 3, what="the next trials")
+    assert scene.states[-1].phase == AutofocusState.PHASE_TRACK and not result.done()
+    handle.cancel_goal_async()
+    wait_until(result.done, what="the end after cancel")
 
 
 def test_another_node_that_moves_the_mirror_ends_the_search(scene: FilmedScene, observer: Observer) -> None:

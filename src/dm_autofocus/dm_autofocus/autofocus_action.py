@@ -1,6 +1,7 @@
 """The action `autofocus`: search the sharpest focus, and stay on it when asked to."""
 
 import math
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from dm_autofocus.autofocus_parameters import focus_lens, given_focal_length, se
 from dm_autofocus.focus_probe import SharpnessSample, raw_image
 from dm_autofocus.images import exposure_fault, grey
 from dm_autofocus.optics import depth_of_focus, distance_of
-from dm_autofocus.probe_action import ASKED, ProbeAction, range_of, ready_capabilities
+from dm_autofocus.probe_action import ASKED, START_GRACE_S, ProbeAction, range_of, ready_capabilities
 from dm_autofocus.search.defocus_model import DefocusModel
 from dm_autofocus.search.defocus_search import BEYOND
 from dm_autofocus.search.focus_search import FocusSearch
@@ -25,6 +26,8 @@ from dm_common.optics.zernike import curvature_of_defocus
 from dm_common.ros.worker import WorkerGoal
 from dm_common.values import Fields, reals
 
+#: What moves are refused with while a controller that died is away, and until it has learnt all that it needs.
+_AWAY = (ErrorCode.TIMEOUT, ErrorCode.NODE_INACTIVE, ErrorCode.DRIVER_UNAVAILABLE, ErrorCode.NOT_CALIBRATED)
 #: Uncertainty of a move's curvature with which the mirror stands where it is sent, in depths of focus.
 TRUSTED = 2.0
 
@@ -150,28 +153,33 @@ class AutofocusAction(ProbeAction):
             raise Refusal(ErrorCode.UNREACHABLE, f"{reason}: {error}") from error
 
     def _track(self, goal_handle: WorkerGoal, config: SearchConfig, region: Region, peak: Peak, result: Any) -> None:
-        """Stay on the peak until cancelled or pre-empted: ends by Refusal only."""
+        """Stay on the peak until cancelled or pre-empted: ends by Refusal only, and not for a controller that died."""
         tracker = self._tracker(peak, config, region)
         position = peak.curvature
         while True:
-            wanted = tracker.step.curvature
-            if wanted != position:
-                self._go(goal_handle, wanted)
-                position = wanted
-            sample = self._measure(goal_handle, region)
-            tracker.feed(sample.sharpness, sample.regions, seconds(sample.image.header.stamp))
-            self._report(goal_handle, Phase.TRACK, sample, wanted, 0, 0)
-            if tracker.lost:
-                try:
+            try:
+                wanted = tracker.step.curvature
+                if wanted != position:
+                    self._go(goal_handle, wanted)
+                    position = wanted
+                sample = self._measure(goal_handle, region)
+                tracker.feed(sample.sharpness, sample.regions, seconds(sample.image.header.stamp))
+                self._report(goal_handle, Phase.TRACK, sample, wanted, 0, 0)
+                if tracker.lost:
                     peak, config, _remarks = self._search(goal_handle, config, region)
                     position = peak.curvature
-                except Refusal as error:
-                    if error.error_code != ErrorCode.NOT_CONVERGED:
-                        raise
+                    tracker = self._tracker(peak, config, region)
+            except Refusal as error:
+                if error.error_code == ErrorCode.NOT_CONVERGED:
                     # Nothing to see now: what is seen here from now on is the new normal.
                     peak = Peak(tracker.centre, sample.sharpness, False)
                     position = math.nan
-                tracker = self._tracker(peak, config, region)
+                    tracker = self._tracker(peak, config, region)
+                elif error.error_code in _AWAY and self._probe.controller.changed_within(START_GRACE_S):
+                    self._log.warning(f"tracking waits: {error}", throttle_duration_sec=5.0)
+                    time.sleep(0.1)
+                else:
+                    raise
             self._fill(result, Peak(tracker.centre, tracker.sharpness, peak.at_limit))
 
     def _tracker(self, peak: Peak, config: SearchConfig, region: Region) -> Tracker:

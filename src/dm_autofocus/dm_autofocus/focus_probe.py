@@ -59,7 +59,8 @@ class FocusProbe:
             `settle_time`, `stamp_lead`.
 
     Attributes:
-        capabilities: the latest; None before the first.
+        controller: whether it is there.
+        capabilities: its latest; None before the first.
         curvature: as taken last, whoever asked for it [1/m]; NaN before.
         user: action that holds the mirror; "" = none does.
         target: as asked for by `move` last [1/m]; NaN while nobody holds the mirror.
@@ -74,6 +75,7 @@ class FocusProbe:
         self._values = values
         self._changed = threading.Condition()
         self._gate = SettledGate(values["settle_time"], values["stamp_lead"])
+        self.controller = qos.watch(node, "focus_controller", Capabilities, "capabilities", qos.LATCHED)
         self.capabilities: Capabilities | None = None
         self.curvature = math.nan
         self.newest: Image | CompressedImage | None = None
@@ -214,15 +216,16 @@ class FocusProbe:
             self.answer = None
             self.target = curvature
             self._asked.append(curvature)
-        mode, holder = FocusRequest.MODE_DIRECT, self._hold.holder
+        mode, holder, gone = FocusRequest.MODE_DIRECT, self._hold.holder, self.controller.since_now()
         self._request.publish(FocusRequest(curvature=curvature, mode=mode, holder=holder))
         limit = self._values["move_timeout"]
-        if not self._wait(lambda: self.answer is not None, limit, stop):
-            raise Refusal(
-                ErrorCode.TIMEOUT, f"no answer to a focus request within {limit:g} s: is focus_controller running?"
-            )
+        if not self._wait(lambda: self.answer is not None, limit, lambda: bool(gone()) or stop()):
+            text = f"no answer to a focus request within {limit:g} s: is focus_controller running?"
+            raise Refusal(ErrorCode.TIMEOUT, text)
         answer = self.answer
         if answer is None:
+            if not stop() and (reason := gone()):
+                raise Refusal(ErrorCode.TIMEOUT, reason)
             return
         if not answer.applied:
             raise Refusal(answer.error_code or ErrorCode.INTERNAL, answer.message)

@@ -28,6 +28,8 @@ START_GRACE_S = 5.0
 
 def ready_capabilities(probe: FocusProbe) -> Capabilities:
     """The mirror's capabilities. Raises Refusal when it cannot be focused."""
+    if probe.controller.missing():
+        raise Refusal(ErrorCode.TIMEOUT, probe.controller.text)
     capabilities = probe.capabilities
     if capabilities is None:
         raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")

@@ -216,6 +216,8 @@ class CalibrationNode(ManagedNode):
     def health(self) -> Health:
         calibration, mirror = self._manager.in_use, self._manager.mirror
         values: dict[str, object] = {"calibrating": self._server.busy, "folder": str(self._manager.store.folder)}
+        if died := [node.text for node in self._bench_services.nodes if node.missing()]:
+            return Health(WARN, "; ".join(died), values)
         if mirror is None:
             return Health(WARN, "no mirror_info: is pdm_driver running?", values)
         if calibration is None:

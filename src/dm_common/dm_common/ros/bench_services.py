@@ -46,6 +46,7 @@ class BenchServices:
 
     Attributes:
         hold: of the mirror.
+        nodes: whether those of driver and interferometer are there.
         state: the driver's last state message; None before the first.
         settle_time: s of ROS time between command and map.
         cancelled: asked while waiting.
@@ -62,6 +63,7 @@ class BenchServices:
         self._measure = node.create_client(Measure, "measure")
         self._driver = qos.watch(node, "pdm_driver", MirrorInfo, "mirror_info", qos.LATCHED)
         self._interferometer = qos.watch(node, "interferometer", SurfaceMapInfo, "surface_map_info", qos.STATE)
+        self.nodes = (self._driver, self._interferometer)
         self.hold = MirrorHolder(node, node.get_name(), self._driver.missing)
         self.waiting: Callable[[str], None] = lambda _text: None
         self._said = ""

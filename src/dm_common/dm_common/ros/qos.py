@@ -83,7 +83,7 @@ class Liveliness:
 
     def __init__(self, node: Node, name: str, message_type: Any, topic: str, profile: QoSProfile) -> None:
         self.name, self.lost, self.starts = name, False, 0
-        self._born = self._lost_at = self._heard_at = time.monotonic()
+        self._born = self._changed_at = self._heard_at = time.monotonic()
         node.create_subscription(
             message_type,
             topic,
@@ -119,8 +119,12 @@ class Liveliness:
         """
         now = time.monotonic()
         if self.lost:
-            return now - self._lost_at > SURE_S and now - self._heard_at > LEASE_S
+            return now - self._changed_at > SURE_S and now - self._heard_at > LEASE_S
         return not self.starts and now - self._born > APPEAR_S and not served()
+
+    def changed_within(self, duration_s: float) -> bool:
+        """Whether the node is lost, or came back or came at all within so long."""
+        return self.lost or time.monotonic() - self._changed_at < duration_s
 
     @property
     def text(self) -> str:
@@ -148,7 +152,7 @@ class Liveliness:
         started = info.alive_count_change + info.not_alive_count_change > 0
         self.starts = max(self.starts + started, 1)
         if lost != self.lost:
-            self.lost, self._lost_at = lost, time.monotonic()
+            self.lost, self._changed_at = lost, time.monotonic()
 
 
 _watches: WeakKeyDictionary[Node, dict[str, Liveliness]] = WeakKeyDictionary()
