@@ -83,13 +83,17 @@ def test_a_packages_own_tests_need_that_package_and_below_only(package: str) -> 
 KEYS = {
     **{
         name: f"python3-{name}"
-        for name in ("h5py", "matplotlib", "numpy", "reportlab", "rich", "scipy", "serial", "typer", "yaml")
+        for name in (
+            *("h5py", "hypothesis", "matplotlib", "numpy", "pytest", "reportlab"),
+            *("rich", "scipy", "serial", "typer", "yaml"),
+        )
     },
     "mcap": "mcap-ros2-support",
     "PIL": "python3-pil",
 }
-#: Modules that rosdep does not know; the package's README says how to install them. Starlette comes with NiceGUI.
-WITHOUT_KEY = {"nicegui", "starlette", "statsmodels", "Pyro4"}
+#: Modules that rosdep does not know; the package's README, or the test that needs one, says how to install them.
+#: Starlette comes with NiceGUI.
+WITHOUT_KEY = {"nicegui", "starlette", "statsmodels", "Pyro4", "microscope"}
 
 
 @pytest.mark.parametrize("package", [path.name for path in SOURCE.iterdir() if (path / "package.xml").is_file()])
@@ -99,9 +103,11 @@ def test_packages_declare_what_they_import(package: str) -> None:
     assert tree.findtext("name") == package
     assert tree.findtext("license") == "Apache-2.0"
     used = set()
-    for path in [*(SOURCE / package / package).rglob("*.py"), *(SOURCE / package / "launch").glob("*.py")]:
-        used |= {name.split(".")[0] for name in imported(path)}
-    used -= {package, *WITHOUT_KEY, *sys.stdlib_module_names}
+    for folder in (package, "launch", "test"):
+        for path in (SOURCE / package / folder).rglob("*.py"):
+            used |= {name.split(".")[0] for name in imported(path)}
+    helpers = {path.stem for path in SOURCE.glob("*/test/*.py")}  # which of them: see above
+    used -= {package, *WITHOUT_KEY, *helpers, *sys.stdlib_module_names}
     assert {KEYS.get(name, name) for name in used} <= declared
 
 
