@@ -118,6 +118,23 @@ def test_up_runs_the_nodes_against_other_electronics_and_a_watched_folder(tmp_pa
     assert not re.findall(r".*\b(?:ERROR|FATAL)\b.*", output)
 
 
+def test_a_bench_whose_processes_are_all_interrupted_at_once_ends_in_order(tmp_path: Path) -> None:
+    """As by Ctrl-C on `ros2 launch`, which reaches the emulated hardware too."""
+    config = fast_bench(tmp_path, SEED)
+    config["autofocus"] = {}
+    config["pdm_driver"]["limits.slew_rate"] = 1.0  # so that the way to the safe shape takes longer than to end
+    with own_domain() as domain, ForkedSuite(config, tmp_path, domain) as suite:
+        with DeformableMirrorClient(domain=domain, timeout_s=60.0) as client:
+            client.wait_until_active()
+            client.set_signals([0.3] * 37)
+        for pid in suite.pids.values():
+            os.kill(pid, signal.SIGINT)
+        wait_until(lambda: len(suite.ended()) == len(suite.pids), 30.0, "the end of all nodes")
+        logs = {name: suite.log(name).read_text() for name in suite.pids}
+    assert "end of the process: the mirror stands in the safe shape" in logs["pdm_driver"]
+    assert re.findall(r".*\b(?:WARN|ERROR|FATAL|Traceback)\b.*", "\n".join(logs.values())) == []
+
+
 def test_demo_figures_have_the_agreed_fields(tmp_path: Path) -> None:
     """The demo as a user runs it, with a folder and figures of the test's."""
     figures = tmp_path / "demo.json"
