@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dm_bringup.suite import save_config
-from dm_client import DeformableMirrorClient
+from dm_client import DeformableMirrorClient, DeformableMirrorError
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from dm_tools.verbs.up import configurations, shared_config
@@ -96,6 +96,11 @@ def test_two_mirrors_move_apart(tmp_path: Path, domain: int) -> None:
             left.set_signals([0.3] * 37)
             assert left.wait(lambda: np.allclose(left.latest("actuator_state").applied, 0.3, atol=1e-3), 20.0)
             np.testing.assert_array_equal(right.latest("actuator_state").applied, before)
+            for name, client in (("left", left), ("right", right)):
+                with pytest.raises(DeformableMirrorError, match="calibrat") as refused:
+                    client.focus(0.01)
+                headers = client.latest("capabilities").header, refused.value.response.state.header
+                assert {header.frame_id for header in headers} == {f"{name}/mirror"}
     finally:
         process.send_signal(signal.SIGTERM)  # as systemd stops a service
         assert process.wait(40.0) == 0

@@ -119,6 +119,8 @@ def node_environment(config_folder: Path) -> dict[str, str]:
 #: What launch puts before the command of a node: signals wait until the node can end in order (`run_node` lets them
 #: in), instead of ending in tracebacks of what it imports.
 HELD_SIGNALS = "env --block-signal=INT --block-signal=TERM"
+#: From a frame with x ahead and z up to an optical one, with z ahead and x to the right (REP 103), as in `place`.
+OPTICAL = "0 0 0 -1.5707963 0 -1.5707963"
 #: Value of the launch argument `autostart`: nodes are configured and activated from outside.
 BY_EVENTS = "events"
 #: Arguments of the launch files: name, default (None = `config` must be given) and description.
@@ -170,27 +172,31 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def companions_of(values: Mapping[str, str], aggregation: Path) -> list[dict[str, Any]]:
+def companions_of(values: Mapping[str, str], aggregation: Path, camera: bool = False) -> list[dict[str, Any]]:
     """Keyword arguments of the launch actions that start what others offer beside the suite.
 
     Args:
         values: of LAUNCH_ARGUMENTS, as text.
         aggregation: parameter file of the aggregator.
+        camera: whether the simulation has one.
 
     Raises:
         ValueError: as `arguments_of`.
     """
     found: list[dict[str, Any]] = []
-    if values["place"]:
-        *numbers, frame = values["place"].split()
+    places = {"mirror": values["place"]} if values["place"] else {}
+    prefix = f"{values['namespace'].strip('/')}/".lstrip("/")
+    if camera:
+        places["camera_optical"] = f"{OPTICAL} {prefix}camera_link"
+    for child, place in places.items():
+        *numbers, frame = place.split()
         names = ("x", "y", "z", "yaw", "pitch", "roll")
         if len(numbers) != len(names):
-            raise ValueError(f"place = {values['place']!r}: must be {' '.join(names)} frame")
-        options = dict(zip(names, numbers, strict=True)) | {"frame-id": frame}
-        options["child-frame-id"] = f"{values['namespace'].strip('/')}/mirror".lstrip("/")
+            raise ValueError(f"place = {place!r}: must be {' '.join(names)} frame")
+        options = dict(zip(names, numbers, strict=True)) | {"frame-id": frame, "child-frame-id": prefix + child}
         arguments = [word for name, text in options.items() for word in (f"--{name}", text)]
-        place = {"name": "mirror_place", "namespace": values["namespace"], "arguments": arguments}
-        found.append({"package": "tf2_ros", "executable": "static_transform_publisher", **place})
+        node = {"name": f"{child}_place", "namespace": values["namespace"], "arguments": arguments}
+        found.append({"package": "tf2_ros", "executable": "static_transform_publisher", **node})
     if flag("foxglove", values["foxglove"]):
         found.append({"package": "foxglove_bridge", "executable": "foxglove_bridge"})
     if flag("aggregator", values["aggregator"]):

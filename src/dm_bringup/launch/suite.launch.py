@@ -42,7 +42,8 @@ def start_nodes(context):
     # A debugger or the like that the user puts before the commands comes with a filter of its own.
     prefix = None if LaunchConfiguration("launch-prefix", default="").perform(context) else HELD_SIGNALS
     actions = []
-    for node in nodes_of(load_config(Path(values["config"]))):
+    config = load_config(Path(values["config"]))
+    for node in nodes_of(config):
         action = (LifecycleNode if node.lifecycle else Node)(
             package=node.package,
             executable=node.name,
@@ -56,7 +57,8 @@ def start_nodes(context):
             actions += brought_up(action)
         actions.append(action)
     aggregation = Path(get_package_share_directory("dm_bringup")) / "launch" / "diagnostics.yaml"
-    return actions + [Node(output="screen", **others) for others in companions_of(values, aggregation)]
+    camera = config.get("virtual_bench", {}).get("camera.rate", 0.0) > 0.0
+    return actions + [Node(output="screen", **others) for others in companions_of(values, aggregation, camera)]
 
 
 def brought_up(action):

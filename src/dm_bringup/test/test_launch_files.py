@@ -116,6 +116,9 @@ def test_the_place_of_the_mirror_and_what_others_offer() -> None:
     ]
     assert bridge["package"] == "foxglove_bridge" and Path(aggregator["parameters"][0]).is_file()
     assert companions_of(DEFAULTS, SHARE) == []
+    (optical,) = companions_of(DEFAULTS, SHARE, camera=True)
+    assert optical["arguments"][-4:] == ["--frame-id", "camera_link", "--child-frame-id", "camera_optical"]
+    assert optical["arguments"][6:12] == ["--yaw", "-1.5707963", "--pitch", "0", "--roll", "-1.5707963"]
     with pytest.raises(ValueError, match="place = '1 2 map': must be x y z yaw pitch roll frame"):
         companions_of(DEFAULTS | {"place": "1 2 map"}, SHARE)
 
