@@ -121,6 +121,8 @@ def test_ingested_map_is_published_whole(observer: Observer, start: Start, tmp_p
     np.testing.assert_allclose(samples.sag, expected, atol=0.04 * amplitude)
     stamps = {(m.header.stamp.sec, m.header.frame_id) for m in (image, info, zernike, samples)}
     assert stamps == {(1429905292, "mirror")}
+    late = observer.record(Image, "surface_map", qos.LATCHED)
+    wait_until(lambda: late, what="the map of before")
 
 
 def test_map_of_a_large_fizeau(observer: Observer, start: Start, tmp_path: Path) -> None:

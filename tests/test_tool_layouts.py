@@ -156,15 +156,16 @@ def test_rqt_opens_plugins_that_exist() -> None:
 
 
 def test_rviz_shows_the_map() -> None:
-    """With what the interferometer offers: one that asks for more gets no map, and RViz only counts none."""
+    """As the interferometer offers it, the last one too: one that asks for more gets no map, and RViz counts none."""
     manager = yaml.safe_load((CONFIG / "bench.rviz").read_text())["Visualization Manager"]
     display, *_stack = manager["Displays"]
     topic = display["Topic"]
     assert display["Class"] == "rviz_default_plugins/Image" and display["Enabled"] and display["Normalize Range"]
     assert topic["Value"] in TOPICS and TOPICS[topic["Value"]][0] is Image
-    words = {"Reliable": qos.MAP.reliability.RELIABLE, "Volatile": qos.MAP.durability.VOLATILE}
-    assert words[topic["Reliability Policy"]] == qos.MAP.reliability == qos.MAP.reliability.RELIABLE
-    assert words[topic["Durability Policy"]] == qos.MAP.durability and topic["Depth"] == qos.MAP.depth
+    offered = qos.LATCHED
+    assert (topic["Reliability Policy"], offered.reliability) == ("Reliable", offered.reliability.RELIABLE)
+    assert (topic["Durability Policy"], offered.durability) == ("Transient Local", offered.durability.TRANSIENT_LOCAL)
+    assert topic["Depth"] == offered.depth
     node: Any = SimpleNamespace(get_namespace=lambda: "/")
     assert manager["Global Options"]["Fixed Frame"] == frame_id(node, "")
 

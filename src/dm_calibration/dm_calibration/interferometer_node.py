@@ -79,7 +79,8 @@ class InterferometerNode(ManagedNode):
         self._acquisition = Acquisition(settings, self._read, self._now_ns, self._on_new_file, self._warn_of_file)
         if topic := self._values["zernike_topic"]:
             self._listen_to(topic)
-        self._map_publisher = self.create_lifecycle_publisher(Image, "surface_map", qos.MAP)
+        # Latched: what shows the map is opened after it was taken. Who asks for qos.MAP gets later ones only.
+        self._map_publisher = self.create_lifecycle_publisher(Image, "surface_map", qos.LATCHED)
         self._zernike_publisher = self.create_lifecycle_publisher(ZernikeCoefficients, "zernike", qos.STATE)
         self._samples_publisher = self.create_lifecycle_publisher(SurfaceSamples, "surface_samples", qos.STATE)
         self._publishers_made = True
