@@ -457,7 +457,7 @@ def test_tracking_goes_on_when_the_controller_is_back(scene: FilmedScene, observ
     scene.die()
     died = "the node focus_controller has died"
     wait_until(lambda: died in observer.call(GetFocusRange, "get_focus_range").message, what="its name")
-    time.sleep(PARAMETERS["move_timeout"])  # it has tried to move meanwhile
+    time.sleep(0.5)  # tracking has been refused a move meanwhile
     requests = len(scene.requests)
     scene.revive()
     wait_until(lambda: len(scene.requests) > requests + 3, what="the next trials")

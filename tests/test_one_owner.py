@@ -33,10 +33,11 @@ from support import fast_bench, wait_until
 pytestmark = pytest.mark.processes
 
 #: Within which a missing node is known, s, and what is allowed for it where processes get no time for seconds (CI).
-#: Measured on two cores at a load of 6, 40 kills of all nodes: 0.3 to 1.8 s, the lease and the time to be sure.
+#: Measured on two cores at a load of 6 to 15, 100 kills of all nodes: 0.3 to 1.8 s, the lease and the time to be sure;
+#: once 3.3 s. Diagnostics, which come once a second: 1.1 to 2.1 s.
 KNOWN_S = 2.0
 assert qos.LEASE_S + qos.SURE_S < KNOWN_S
-ALLOWED_S = 4 * KNOWN_S
+ALLOWED_S = 2.5 * KNOWN_S
 
 
 @dataclass
@@ -57,7 +58,7 @@ class Running:
         try:
             self.result = self.client.run_action(self.name, self.goal, self.feedback.append, 300.0)
         except DeformableMirrorError as error:
-            self.result = error.response
+            self.result = error.response or error
 
     def end(self) -> Any:
         self._thread.join(300.0)
@@ -96,10 +97,14 @@ class Bench:
         os.kill(self.suite.pids[node], signal.SIGKILL)
 
     def kill_and_name(self, running: Running, node: str) -> None:
-        """Kill a node; it is started again when the run has named it, which is never if it comes back sooner."""
+        """Kill a node; it is started again when the run has named it, which is never if it comes back sooner.
+
+        A run that was about to take the mirror names it in its result.
+        """
         self.paused = True
         self.kill(node)
-        running.wait_for(lambda feedback: f"the node {node} has died" in feedback.message, ALLOWED_S)
+        named = f"the node {node} has died"
+        wait_until(lambda: named in f"{running.result} {running.feedback[-1:]}", ALLOWED_S, named)
         self.paused = False
 
     def applies(self) -> bool:
@@ -183,6 +188,7 @@ def _all_run_afterwards(bench: Bench) -> Iterator[None]:
     bench.paused = False
     wait_until(lambda: not bench.suite.ended(), 60.0)
     assert bench.client.wait(lambda: bench.client.capabilities.error_code == ErrorCode.OK, 60.0)
+    assert bench.client.wait(lambda: bench.client.actuator_state.holder == "")
 
 
 def test_a_calibration_is_not_harmed_by_requests_and_goes_on_when_the_interferometer_is_back(bench: Bench) -> None:
@@ -332,8 +338,16 @@ def test_a_simulator_that_died_is_electronics_out_of_reach_until_it_is_back(benc
     assert bench.client.wait(bench.all_serve, 60.0)
 
 
-def test_recipes_end_soon_after_the_driver_has_died(bench: Bench) -> None:
-    running = Running(bench.client, "build_recipes", BuildRecipes.Goal(curvatures=[0.01], tolerance=1e-6))
+@pytest.mark.parametrize(
+    ("action", "goal"),
+    [
+        ("build_recipes", BuildRecipes.Goal(curvatures=[0.01], tolerance=1e-6)),
+        ("calibrate", Calibrate.Goal(plan=Calibrate.Goal.PLAN_POKES)),
+        ("converge", Converge.Goal(tolerance=1e-10, max_maps=50)),
+    ],
+)
+def test_a_run_ends_soon_after_the_driver_has_died(bench: Bench, action: str, goal: Any) -> None:
+    running = Running(bench.client, action, goal)
     wait_until(lambda: bench.client.actuator_state.holder != "", 30.0)  # it begins with a degauss
     bench.kill_and_name(running, "pdm_driver")
     began = time.monotonic()
