@@ -41,7 +41,8 @@ def instrument(
     """Find the errors of the interferometer itself from files, as parameters to paste. Needs no nodes."""
     from dm_calibration.influence.poke_cure import parameter_text
     from dm_calibration.map_files import read_map
-    from dm_calibration.optics.phase_steps import PhaseStepError, mend_phase_steps
+    from dm_calibration.optics.aperture import MapRejectedError
+    from dm_calibration.optics.phase_steps import mend_phase_steps
     from dm_common.errors import CodedError
 
     def read(path: Path) -> Any:
@@ -50,8 +51,8 @@ def instrument(
             return surface
         try:
             return replace(surface, sag=mend_phase_steps(surface.sag, 0.5 * surface.wavelength)[0])
-        except PhaseStepError as error:
-            raise PhaseStepError(f"{path}: {error}") from error
+        except MapRejectedError as error:
+            raise MapRejectedError(f"{path}: {error}") from error
 
     if (write is not None) != (procedure is Procedure.FLATS):
         raise typer.BadParameter("--write FILE.fits: flats need it, the others leave no file")
