@@ -187,9 +187,23 @@ def test_it_goes_on_without_actuators_that_stick(bench: SteadyMirror, made: Made
         assert later.accepted, later.reason
     bench.apply(wanted)
     back = updates.take(bench.measure("back"), replace(settled, effective=wanted))
-    assert f"actuator 12 stands at {wanted[11]:+.2f} instead of +0.30" in back.reason
+    assert f"actuator 12 stands at {wanted[11]:+.2f} instead of +0.30, moves again" in back.reason
+    assert back.reason.endswith("; ./dm check --forget takes it back")
     updates.forget()
     assert updates.take(bench.measure("whole"), replace(settled, effective=wanted)).accepted
+
+
+def test_an_actuator_that_was_dead_when_calibrated_and_moves_is_named(tmp_path: Path) -> None:
+    bench = SteadyMirror()
+    moves = bench.plant.influence
+    bench.plant.influence = moves * (np.arange(bench.mirror.actuators) != 6)
+    updates = begun((bench, bench.calibrate()), tmp_path)
+    bench.apply(np.random.default_rng(4).uniform(-0.7, 0.7, bench.mirror.actuators))
+    assert updates.take(bench.measure("dead"), bench.settled()).accepted
+    bench.plant.influence = moves
+    reason = updates.take(bench.measure("back"), bench.settled()).reason
+    assert "actuator 7 moves, which showed no response in the calibration (" in reason
+    assert reason.endswith("%); ./dm calibrate measures it")
 
 
 def test_an_actuator_that_stands_where_it_should_is_not_given_up(

@@ -127,6 +127,11 @@ class InfluenceFit:
     def actuators(self) -> int:
         return int(self.influence_zernike.shape[1])
 
+    @property
+    def silent(self) -> NDArray[np.bool_]:
+        """(N,) which actuators showed no response."""
+        return np.isin(self.grades, (quality.GRADE_DEAD, quality.GRADE_NOT_EXCITED))
+
 
 def fit_influence(
     maps: MapSet,

@@ -18,7 +18,7 @@ from dm_common.figures import in_nanometres, rounded
 from dm_common.geometry import pitch
 from dm_common.mirror import Mirror
 from dm_common.optics.piston_tilt import weighted_fit
-from dm_common.optics.sampling import edge_clustered_points
+from dm_common.optics.sampling import SamplePoints, edge_clustered_points
 from dm_common.optics.zernike import basis
 
 #: A run stands still when so many parts together better it by less than this share.
@@ -89,9 +89,14 @@ def forecast(
 def typical_influence(mirror: Mirror) -> Floats:
     """(21, N) m per unit signal, as the data sheet of a piezo mirror lets expect."""
     points = edge_clustered_points()
-    places = np.asarray((mirror.x + 1j * mirror.y) / mirror.working_radius, dtype=np.complex128)
-    shape, size = bumps(places, TYPICAL_WIDTH * pitch(places.real, places.imag), points)
-    return weighted_fit(TYPICAL_RISE * size[:, None] * shape, basis(points.x, points.y), points.weight).T
+    sag = typical_sag(mirror.x / mirror.working_radius, mirror.y / mirror.working_radius, points)
+    return weighted_fit(sag, basis(points.x, points.y), points.weight).T
+
+
+def typical_sag(x: Floats, y: Floats, points: SamplePoints) -> Floats:
+    """(N, P) m per unit signal of actuators at x, y (N,), in radii of the aperture; piston and tilt removed."""
+    shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), TYPICAL_WIDTH * pitch(x, y), points)
+    return TYPICAL_RISE * size[:, None] * shape
 
 
 class GoodEnough:

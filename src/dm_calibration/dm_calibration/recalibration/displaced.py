@@ -3,31 +3,52 @@
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from dm_calibration.calibration import Calibration
+from dm_calibration.hysteresis.reduction import Reduction
+from dm_calibration.procedure.forecast import typical_sag
 from dm_common import Floats
-from dm_common.optics.zernike import PISTON_TILT
+from dm_common.optics.piston_tilt import weighted_fit
+from dm_common.optics.zernike import PISTON_TILT, basis
 
 #: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
 #: that fits noise best explains about 0.13.
 DISPLACED_MAX, DISPLACED_SHARE = 3, 0.3
 #: How far an actuator that stands elsewhere is from where it should be, normalised.
 DISPLACED_SIGMA = 0.5
-#: Smallest signal that tells a weak actuator from one that is displaced, and what is left of the move of a dead one.
+#: Smallest signal that tells a weak actuator from one that is displaced, and smallest move of one that showed no
+#: response in the calibration; what is left of the move of a dead one.
 TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
 #: Of this probability on it is named how to go on without what does not move.
 SURE = 0.9
 
 
+def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -> Floats:
+    """`gain` (R, N) per unit of effective signal, of actuators without a response as data sheets let expect.
+
+    The fit has nothing but noise of those, by which no map could show that they move.
+    """
+    silent, points = calibration.fit.silent, calibration.fit.points
+    if not silent.any() or silent.size < 2:  # no neighbour whose distance tells the width of a bump
+        return gain
+    radius = calibration.aperture_radius
+    sag = typical_sag(calibration.actuator_x / radius, calibration.actuator_y / radius, points)
+    coefficients = weighted_fit(sag, basis(points.x, points.y), points.weight)
+    return np.where(silent, reduction.reduce(coefficients, sag).T, gain)
+
+
 def displaced_actuators(
-    innovation: Floats, gain: Floats, factor: tuple[Floats, bool]
+    innovation: Floats, gain: Floats, factor: tuple[Floats, bool], silent: NDArray[np.bool_]
 ) -> tuple[dict[int, float], dict[int, float]]:
     """Actuators whose displacement explains `innovation` (R,), one after the other by generalised least squares; and
     the probability of each.
 
     Args:
-        gain: (R, N) per unit of effective signal.
+        gain: (R, N) per unit of effective signal, see :func:`visible_gain`.
         factor: Cholesky factor of the expected covariance (R, R).
+        silent: (N,) whose gain is not known but as data sheets let expect.
     """
     white = solve_triangular(factor[0], np.column_stack((gain, innovation)), trans="T")
     columns, whole = white[:, :-1], white[:, -1]
@@ -41,26 +62,36 @@ def displaced_actuators(
         found.append(best)
         amounts = np.linalg.lstsq(columns[:, found], whole, rcond=None)[0]
         left = whole - columns[:, found] @ amounts
-    order = [int(k) for k in np.argsort(-np.abs(amounts))]
+    size = np.abs(amounts)
+    # One without a response that moved so little is rather another shape than a bump that is not well known.
+    order = [int(k) for k in np.argsort(-size) if size[k] >= TELLING_SIGNAL or not silent[found[k]]]
     probability = {}
     for k in order:
         of_this = left + columns[:, found[k]] * amounts[k]
-        probability[found[k]] = _probability(columns, power, of_this, found[k])
+        probability[found[k]] = float(_probability(columns, power, of_this, silent)[found[k]])
     return {found[k]: float(amounts[k]) for k in order}, probability
 
 
-def _probability(columns: Floats, power: Floats, white: Floats, actuator: int) -> float:
-    """That `actuator` alone makes the difference `white` (R,), and neither another one nor something else.
+def _probability(columns: Floats, power: Floats, white: Floats, silent: NDArray[np.bool_]) -> Floats:
+    """(N,) that each actuator alone makes the difference `white` (R,), and neither another one nor something else.
 
-    An actuator may be anywhere in its range; something else differs everywhere, as much as `white` does. Half of the
-    prior is the actuators', the other half that of something else.
+    An actuator may be anywhere in its range; something else differs everywhere, as much as `white` does, or as much as
+    a `silent` actuator leaves of it, whose bump is not known. Half of the prior is the actuators', the other half that
+    of something else.
     """
-    size, whole = len(white), float(white @ white)
+    size, whole = len(white), white @ white
     precision = 1.0 / DISPLACED_SIGMA**2
-    evidence = 0.5 * np.square(columns.T @ white) / (power + precision) - 0.5 * np.log1p(power / precision)
-    something = 0.5 * (whole - size) - 0.5 * size * np.log(whole / size) if whole > size else 0.0
+    left = whole - np.square(columns.T @ white) / (power + precision)
+    left = np.where(silent, _of_anything(left, size), left)
+    evidence = 0.5 * (whole - left) - 0.5 * np.log1p(power / precision)
+    something = 0.5 * (whole - _of_anything(whole, size))
     all_of_them = np.append(evidence - np.log(evidence.size), something)
-    return float(np.exp(all_of_them[actuator] - np.logaddexp.reduce(all_of_them)))
+    return np.asarray(np.exp(all_of_them - np.logaddexp.reduce(all_of_them)))
+
+
+def _of_anything(square: Floats, size: int) -> Floats:
+    """What a difference of that `square`, white, counts for where its size is not known, in `size` values."""
+    return np.where(square > size, size * (1.0 + np.log(np.maximum(square, size) / size)), square)
 
 
 def displacement(
@@ -75,19 +106,42 @@ def displacement(
     return np.asarray(inverse @ white[:, -1]), np.sqrt(np.square(inverse).sum(axis=1))
 
 
-def described(displaced: Mapping[int, float], probability: Mapping[int, float], expected: Floats) -> str:
-    """What a map that disagrees shows, where actuators should stand at `expected` (N,)."""
+def described(
+    displaced: Mapping[int, float],
+    probability: Mapping[int, float],
+    expected: Floats,
+    given_up: NDArray[np.bool_],
+    silent: NDArray[np.bool_],
+) -> str:
+    """What a map that disagrees shows, where actuators should stand at `expected` (N,).
+
+    Args:
+        given_up: (N,) which have been taken not to move any more.
+        silent: (N,) which showed no response in the calibration.
+    """
     if not displaced:
         return "bad map, or the mirror has changed"
-    faults = {actuator: _fault(expected[actuator], more) for actuator, more in displaced.items()}
-    found = ", ".join(
-        f"actuator {actuator + 1} stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
-        f"{faults[actuator]} ({probability[actuator]:.0%})"
-        for actuator, more in displaced.items()
-    )
-    if any("weakened" in faults[actuator] or probability[actuator] < SURE for actuator in displaced):
+    shown, faults = list[str](), ""
+    for actuator, more in displaced.items():
+        stands = f"stands at {expected[actuator] + more:+.2f} instead of {expected[actuator]:+.2f}"
+        if silent[actuator]:
+            stands = "moves, which showed no response in the calibration"
+        elif given_up[actuator]:
+            stands += ", moves again"
+        else:
+            faults += (fault := _fault(expected[actuator], more))
+            stands += fault
+        shown.append(f"actuator {actuator + 1} {stands} ({probability[actuator]:.0%})")
+    found, numbers = ", ".join(shown), sorted(displaced)
+    if min(probability.values()) < SURE:
         return found
-    without = " ".join(f"--without {actuator + 1}" for actuator in sorted(displaced))
+    if given_up[numbers].any():
+        return f"{found}; ./dm check --forget takes it back"
+    if silent[numbers].any():
+        return f"{found}; ./dm calibrate measures it"
+    if "weakened" in faults:
+        return found
+    without = " ".join(f"--without {actuator + 1}" for actuator in numbers)
     return f"{found}; ./dm check {without} goes on without what does not move"
 
 

@@ -23,13 +23,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps
 from dm_calibration.hysteresis.reduction import Reduction
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.displaced import displaced_actuators, displacement
+from dm_calibration.recalibration.displaced import displaced_actuators, displacement, visible_gain
 from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, surprise_of
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import slow_creep
@@ -81,21 +82,19 @@ class DriftFilter:
     """Follows one mirror's :class:`Drift`.
 
     Args:
-        fit: the influence function, of effective signals when `hysteresis` is known.
-        maps: what it was fitted to: shows how far a map scatters about its prediction.
-        hysteresis: None = not identified.
+        calibration: its maps show how far a map scatters about its prediction.
         signal_sigma: standard deviation of an effective signal where no hysteresis model is identified, normalised.
 
     Raises:
         ValueError: the maps of a hysteresis model have time stamps that run backwards.
     """
 
-    def __init__(
-        self, fit: InfluenceFit, maps: MapSet, hysteresis: HysteresisFit | None, signal_sigma: float, rates: DriftRates
-    ) -> None:
+    def __init__(self, calibration: Calibration, signal_sigma: float, rates: DriftRates) -> None:
+        fit, maps, hysteresis = calibration.fit, calibration.maps, calibration.hysteresis
         self._fit = fit
         self.reduction = Reduction(fit.points, fit.influence_sag, maps.terms)
         self._gain = self.reduction.reduce(fit.influence_zernike.T, fit.influence_sag.T).T
+        self._visible = visible_gain(self._gain, self.reduction, calibration)
         self._offset = self.reduction.reduce(fit.zernike_offset, fit.sag_offset)
         scatter = self._scatter(maps if hysteresis is None else effective_maps(maps, hysteresis.law))
         if hysteresis is not None:
@@ -173,7 +172,7 @@ class DriftFilter:
                 [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
             ),
         )
-        displaced, probability = displaced_actuators(innovation, self._gain, factor)
+        displaced, probability = displaced_actuators(innovation, self._visible, factor, self._fit.silent)
         departure = remove_piston_tilt(seen.sag_error[None], self._fit.points)[0]
         return Comparison(
             max_zernike=float(np.abs(seen.zernike_error)[PISTON_TILT:].max()),

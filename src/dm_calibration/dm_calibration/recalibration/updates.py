@@ -147,9 +147,7 @@ class RecalibrationManager:
             if calibration is None:
                 return ""
             options, basis = self._options(), basis_hash(calibration)
-            drift_filter = DriftFilter(
-                calibration.fit, calibration.maps, calibration.hysteresis, options.signal_sigma, options.rates
-            )
+            drift_filter = DriftFilter(calibration, options.signal_sigma, options.rates)
             drift, remark = drift_filter.start(calibration.stamp_ns), ""
             try:
                 drift = read_updates(self._file(calibration.id), calibration.id, basis, drift) or drift
@@ -191,7 +189,7 @@ class RecalibrationManager:
             worst = max(comparison.max_zernike, worst_elsewhere(*found, calibration.fit.influence_zernike))
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
-                reason += described(*found)
+                reason += described(*found, np.isfinite(updates.stuck), calibration.fit.silent)
             elif without:
                 reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:

@@ -78,7 +78,7 @@ def check(
     names = ("accepted", "max_zernike_nm", "rms_nm", "surprise", "revision", "gain_drift", "offset_drift_nm")
     write_json(json, {"check": figures(response, *names) | {"promised_nm": nanometres(promised)}})
     if not (response.accepted or forget):
-        cure = "as the message says, or ./dm calibrate" if "--without" in response.message else "./dm calibrate"
+        cure = "as the message says, or ./dm calibrate" if "./dm check --" in response.message else "./dm calibrate"
         next_step(f"./dm degauss and ./dm check again; if it still disagrees, {cure}")
         raise typer.Exit(1)
     if not (forget or without or kept(promised, response.max_zernike)):
