@@ -68,6 +68,7 @@ def settings_from(values: dict[str, object]) -> IngestSettings:
         orientation=orientation,
         aperture_radius=float(values["aperture.radius"]),  # type: ignore[arg-type]
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),  # type: ignore[arg-type]
+        aperture_follow=bool(values["aperture.follow"]),
         pitch=float(values.get("pitch", 0.0)),  # type: ignore[arg-type]
     )
 
@@ -120,6 +121,21 @@ def test_maps_that_do_not_tell_their_lateral_resolution_are_not_refused_with_the
     assert cure["pitch"] == pytest.approx(mounted.camera.pitch, rel=0.02)
     again, _ = mounted.check(settings_from(cure), wiring)
     assert again.passed, again.findings
+
+
+def test_an_aperture_that_follows_the_mirror_does_so_with_the_cure() -> None:
+    """Also when the mirror is put back beside its old place."""
+    wiring = np.arange(37)
+    settings = IngestSettings(aperture_radius=RADIUS, aperture_centre=(0.0, 2e-4), aperture_follow=True)
+    camera = replace(CAMERA, mask_diameter=0.024, mount_angle=0.6, mount_mirrored=True, mount_x=5e-4)
+    found, last = MountedMirror(PlateConfig(), camera, wiring).check(settings, wiring)
+    cure = yaml.safe_load(parameter_text(poke_cure(found, MIRROR, last, [])[0]))["/**/interferometer"][
+        "ros__parameters"
+    ]
+    moved = replace(camera, mount_x=-7e-4, mount_y=4e-4)
+    again, _ = MountedMirror(PlateConfig(), moved, wiring).check(settings_from(cure), wiring)
+    assert again.passed and again.registration is not None
+    assert np.hypot(*again.registration.shift) < 1e-4
 
 
 def test_a_mirror_as_configured_passes() -> None:

@@ -34,6 +34,7 @@ class Measurement:
         pitch: m per pixel; 0 = unknown.
         camera: width and height of the map, pixels; zeros = not known.
         centre: of the aperture from the left and top edge of the map, pixels; NaN = not known.
+        followed: centre of the valid region from which that of the aperture counts, as `centre`; zeros = it does not.
         radius_px: of the aperture, pixels; 0 = not known.
         orientation: how the instrument's picture was turned: flips of x and y, then counter-clockwise by degrees.
         label: unique in a calibration, e.g. ``poke+07``, ``p55``, ``reference 3``; "" = not commanded by a run.
@@ -66,6 +67,7 @@ class Measurement:
     pitch: float = 0.0
     camera: tuple[int, int] = (0, 0)
     centre: tuple[float, float] = (float("nan"), float("nan"))
+    followed: tuple[float, float] = (0.0, 0.0)
     radius_px: float = 0.0
     orientation: tuple[bool, bool, float] = (False, False, 0.0)
     label: str = ""

@@ -114,6 +114,7 @@ def measurement_from(response: Any) -> Measurement:
         **taken(info, "file", "sha256", *OF_FILE),
         camera=(info.width, info.height),
         centre=(info.centre_x, info.centre_y),
+        followed=(info.followed_x, info.followed_y),
         radius_px=info.aperture_radius_px,
         orientation=(info.flip_x, info.flip_y, info.rotate_deg),
     )

@@ -153,7 +153,7 @@ class Ingest:
             sag = undistorted(sag, settings.distortion)
         sag = settings.orientation.apply(sag)
         surface = replace(source, sag=sag, pitch=pitch)
-        aperture = self._aperture(surface.valid, pitch, settings)
+        aperture, followed = self._aperture(surface.valid, pitch, settings)
         circle = (aperture.centre_x_px, aperture.centre_y_px, aperture.radius_px)
         if self._fitter is None or not self._fitter.fits(surface.valid, aperture):
             self._fitter = None  # not two workspaces at a time
@@ -190,6 +190,7 @@ class Ingest:
             pitch=pitch or 0.0,
             camera=(sag.shape[1], sag.shape[0]),
             centre=circle[:2],
+            followed=followed,
             radius_px=aperture.radius_px,
             orientation=astuple(settings.orientation),
         )
@@ -198,9 +199,13 @@ class Ingest:
         return surface, measured
 
     @staticmethod
-    def _aperture(valid: NDArray[np.bool_], pitch: float | None, settings: IngestSettings) -> Aperture:
+    def _aperture(
+        valid: NDArray[np.bool_], pitch: float | None, settings: IngestSettings
+    ) -> tuple[Aperture, tuple[float, float]]:
+        """The aperture, and `Measurement.followed`."""
+        nothing = (0.0, 0.0)
         if settings.aperture_radius == 0:
-            return find_aperture(valid)
+            return find_aperture(valid), nothing
         if wrong := too_large(settings.aperture_radius, settings.mirror_radius):
             raise MapRejectedError(wrong)
         if pitch is None:
@@ -210,7 +215,7 @@ class Ingest:
             )
         wanted = configured_aperture(valid.shape, pitch, settings.aperture_radius, *settings.aperture_centre)
         if not settings.aperture_follow:
-            return wanted
+            return wanted, nothing
         seen = find_aperture(valid)
         if seen.radius_px < wanted.radius_px:
             raise MapRejectedError(
@@ -219,4 +224,5 @@ class Ingest:
             )
         height, width = valid.shape
         shift_x, shift_y = seen.centre_x_px - 0.5 * (width - 1), seen.centre_y_px - 0.5 * (height - 1)
-        return replace(wanted, centre_x_px=wanted.centre_x_px + shift_x, centre_y_px=wanted.centre_y_px + shift_y)
+        moved = replace(wanted, centre_x_px=wanted.centre_x_px + shift_x, centre_y_px=wanted.centre_y_px + shift_y)
+        return moved, (seen.centre_x_px, seen.centre_y_px)

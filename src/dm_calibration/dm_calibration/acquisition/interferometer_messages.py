@@ -49,6 +49,8 @@ def info_message(surface: SurfaceMap, measured: Measurement, header: Header) -> 
         height=measured.camera[1],
         centre_x=measured.centre[0],
         centre_y=measured.centre[1],
+        followed_x=measured.followed[0],
+        followed_y=measured.followed[1],
         aperture_radius_px=measured.radius_px,
         aperture_radius=measured.radius,
         **taken(measured, "wavelength", "valid_fraction", *OF_FILE),

@@ -43,10 +43,13 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
         # Without a lateral resolution of its own the valid region counts as the mirror's aperture.
         metres = last.pitch or (mirror.working_radius / last.radius_px if last.radius_px else 0.0)
         middle = 0.5 * (np.array(last.camera) - 1.0)
-        aperture = complex(last.centre[0] - middle[0], middle[1] - last.centre[1]) * metres
-        # From the centre of the map, about which the orientation turns.
-        seen = aperture + complex(*found.shift)
-        centre = seen * complex(np.exp(-1j * found.turn))
+        follow = any(last.followed)
+        # From the centre of the map, about which the orientation turns, and from what the parameters count from.
+        seen, centre = (
+            complex(last.centre[0] - origin[0], origin[1] - last.centre[1]) * metres + complex(*found.shift)
+            for origin in (middle, last.followed if follow else middle)
+        )
+        centre *= complex(np.exp(-1j * found.turn))
         if found.mirrored:
             centre = -centre.conjugate()
         reach = np.abs((seen.real, seen.imag)) + (1.0 - OVERHANG) * mirror.working_radius
@@ -60,7 +63,7 @@ def poke_cure(check: PokeCheck, mirror: Mirror, last: Measurement, channels: Seq
         elif np.isfinite(centre):
             changes["interferometer"] |= {
                 "aperture.radius": mirror.working_radius,
-                "aperture.follow": False,  # this centre counts from that of the map
+                "aperture.follow": follow,
                 "aperture.centre_x": round(centre.real, 6),
                 "aperture.centre_y": round(centre.imag, 6),
             }
