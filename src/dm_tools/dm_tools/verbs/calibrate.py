@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_common.figures import in_nanometres, with_point
+from dm_common.figures import in_nanometres, two_fold, with_point
 from dm_tools.output import (
     JsonOption,
     NamespaceOption,
@@ -106,6 +106,8 @@ def show_result(result: Any, calibration: Any = None) -> None:
             f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{foretold}; hysteresis "
             f"{result.hysteresis_model}"
         )
+    if calibration is not None:
+        console.print(f"when flat: {two_fold(promise_of(calibration), calibration, 0.0)}", soft_wrap=True)
     for entry in result.dropped:
         console.print(f"[yellow]dropped[/] {entry}")
     for entry in result.poke_findings:

@@ -4,8 +4,9 @@ from typing import Annotated, Any
 
 import typer
 
+from dm_common.figures import two_fold
 from dm_tools.output import JsonOption, NamespaceOption, TakeOverOption, console, figures, next_step, write_json
-from dm_tools.running_suite import naming_holder, promise, running_suite
+from dm_tools.running_suite import REPORT_S, naming_holder, promise, running_suite
 
 
 def focus(
@@ -33,7 +34,7 @@ def focus(
                     json, {"focus": [{"curvature": wanted, "error_code": error.error_code, "message": str(error)}]}
                 )
             raise
-        _show(state)
+        _show(state, _calibration(client))
         if not dry_run:
             if wait:
                 result = client.move_focus(wanted, conic, take_over=take_over)
@@ -54,7 +55,7 @@ def flatten(
     """Make the surface as flat as the mirror can: curvature 0, its own figure corrected."""
     with running_suite(namespace) as client, naming_holder(client):
         state = client.flatten(dry_run=dry_run, take_over=take_over)
-    _show(state)
+        _show(state, _calibration(client))
     if state.applied:
         console.print(f"commanded{_held(state)}")
     write_json(json, {"focus": [figures_of(state)]})
@@ -77,14 +78,22 @@ def degauss(take_over: TakeOverOption = False, namespace: NamespaceOption = "", 
     next_step("./dm focus 0.02")
 
 
-def _show(state: Any) -> None:
-    """What a dm_msgs/FocusState promises."""
+def _calibration(client: Any) -> Any:
+    """The calibration in use; None = it is not heard."""
+    client.wait(lambda: "calibration" in client.messages, REPORT_S)
+    return client.messages.get("calibration")
+
+
+def _show(state: Any, calibration: Any) -> None:
+    """What a dm_msgs/FocusState promises, made with this dm_msgs/Calibration, None = not known."""
     console.print(
         f"{state.curvature:+.4f} 1/m ({state.power:+.3f} dioptre): promised "
         f"{promise(state.predicted_max_zernike_upper)} for the largest coefficient; "
         f"reachable {state.curvature_min:+.4f} to {state.curvature_max:+.4f} 1/m",
         soft_wrap=True,
     )
+    if calibration is not None:
+        console.print(two_fold(state.predicted_max_zernike_upper, calibration, state.curvature), soft_wrap=True)
     if state.saturated:
         console.print(f"[yellow]saturated[/]: actuators {', '.join(map(str, state.saturated_actuators))} at a limit")
     if not state.history_known:
