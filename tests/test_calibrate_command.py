@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 import shutil
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from dm_calibration.procedure.forecast import GoodEnough
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_tools import cli
 from dm_tools.parameter_changes import source_of, write_parameters
+from dm_tools.verbs import calibrate as verb
 from dm_tools.verbs.calibrate import REACHED, after_run, figures_of, metres, show_result
 from dm_tools.verbs.up import shared_config
 from example_hysteresis import plays
@@ -116,3 +120,39 @@ def test_what_was_reached_is_one_part_of_a_result_message() -> None:
     for found in (1e-9, 3e-9):
         sentence = enough.sentence(found)
         assert "; " not in sentence and REACHED.search(sentence) and sentence.endswith("(part by part 5, 3 nm)")
+
+
+class FakeClient:
+    """A suite whose run reaches 3.2 nm after a part, and 1.9 nm at its end."""
+
+    def __init__(self, made: CalibrationMsg) -> None:
+        self.messages = {"calibration": made}
+
+    def wait(self, condition: Callable[[], object], _timeout_s: float) -> bool:
+        return bool(condition())
+
+    def calibrate(self, goal: Calibrate.Goal, show: Callable[[Any], None] = lambda _feedback: None) -> Calibrate.Result:
+        if goal.dry_run:
+            return Calibrate.Result(message="110 maps in about 158 s, moves then right to 2.7 nm; nothing was moved")
+        left = {"maps_left": 40, "time_left": 60.0, "expected_max_zernike": 2e-9}
+        for reached, rest in ((0.0, {}), (3.2e-9, left), (3.2e-9, {**left, "maps_left": 39}), (1.9e-9, {})):
+            show(Calibrate.Feedback(phase=Calibrate.Feedback.PHASE_HYSTERESIS, reached_max_zernike=reached, **rest))
+        return Calibrate.Result(id="c1", maps=130, message="2 nm is reached: 1.9 nm", hysteresis_model="Preisach")
+
+
+def test_a_run_says_what_to_expect_and_then_what_is_reached_and_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = CalibrationMsg(
+        id="c1", wavelength=632.8e-9, held_out_max_zernike=2e-9, instrument_error=5e-9, scale_error=1e-9
+    )
+    monkeypatch.setattr(verb, "running_suite", lambda _namespace: nullcontext(FakeClient(made)))
+    done = CliRunner().invoke(cli.app, ["calibrate", "--until", "2nm"])
+    lines = done.output.splitlines()
+    assert lines[0] == "expected: 110 maps in about 158 s, moves then right to 2.7 nm"
+    assert [line for line in lines if "so far" in line] == [
+        "calibration: right to 3.2 nm so far, 2 nm expected after 40 more maps (60 s)",
+        "calibration: right to 1.9 nm so far",
+    ]
+    assert (
+        "when flat: repeatable to 2 nm (λ/316), absolute to 5.4 nm (λ/118), limited by the instrument's own error"
+        in done.output
+    )

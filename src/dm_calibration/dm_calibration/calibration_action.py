@@ -15,7 +15,7 @@ from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import GoodEnough, forecast
+from dm_calibration.procedure.forecast import GoodEnough, forecast, foreseen, step_times
 from dm_calibration.procedure.plan import LAST_PART_ENDS, Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.recorded_run import plan_text
@@ -160,14 +160,11 @@ class CalibrateAction:
         result.expected_duration, result.expected_max_zernike = expected.duration, expected.max_zernike
         if goal.dry_run:
             maps = expected.maps or sum(step.kind is not StepKind.DEGAUSS for step in plan.steps)
-            accuracy = ""
-            if expected.max_zernike > 0.0:
-                source = "" if in_use else ", by typical data sheets"
-                reach = f"{expected.max_zernike * 1e9:.1f} nm"
-                accuracy = f", moves then right to {reach} (largest coefficient, 95 %{source})"
             known = taken or in_use is not None
             guess = "" if known else f" if a map takes {guessed:g} s (none was taken yet)"
-            result.message = f"{maps} maps in about {expected.duration:.0f} s{guess}{accuracy}; nothing was moved"
+            drawn = in_use is None or in_use.hysteresis is None
+            time_text = f"{maps} maps in about {expected.duration:.0f} s{guess}"
+            result.message = f"{time_text}{expected.accuracy(goal.until, drawn)}; nothing was moved"
 
     def _procedure(
         self, handle: WorkerGoal, plan: Plan, options: PlanOptions, mirror: Mirror, run: OpenRun
@@ -175,11 +172,13 @@ class CalibrateAction:
         """The run of `plan`, and a function that reports phase, label and step."""
         feedback = Calibrate.Feedback(steps=len(plan.steps))
         feedback.plan = plan_text(plan.kind, options, handle.request.maps_per_state or 1)
-        sent = -FEEDBACK_PERIOD_S
+        sent, end = -FEEDBACK_PERIOD_S, 0
 
         def report(phase: int, label: str, step: int) -> None:
             nonlocal sent
             feedback.phase, feedback.label, feedback.step = phase, label, step
+            left = step_times(plan.steps[step:end], self._services.settle_time, self._services.map_time)
+            feedback.maps_left, feedback.time_left = len(left), float(left.sum())
             if time.monotonic() - sent >= FEEDBACK_PERIOD_S:
                 sent = time.monotonic()
                 handle.publish_feedback(feedback)
@@ -192,7 +191,9 @@ class CalibrateAction:
         self._services.publish_waits(handle, feedback)
 
         def told(reached: float) -> None:
+            nonlocal end
             feedback.reached_max_zernike = reached
+            end, feedback.expected_max_zernike = foreseen(plan, feedback.step, reached, handle.request.until)
             self._node.get_logger().info(f"{len(run.outcome.records)} maps: right to {reached * 1e9:.2f} nm")
 
         enough = self._enough = GoodEnough(handle.request.until, told)

@@ -131,8 +131,17 @@ def calibration_step(feedback: Any) -> str:
     text = phase if feedback.label in ("", phase) else f"{phase} {feedback.label}"
     if feedback.maps_dropped:
         text += f", {feedback.maps_dropped} dropped"
-    if feedback.reached_max_zernike > 0.0:
-        text += f", right to {in_nanometres(feedback.reached_max_zernike)} so far"
+    return ", ".join(filter(None, (text, reached_so_far(feedback))))
+
+
+def reached_so_far(feedback: Any) -> str:
+    """How good a calibration that may end early is by its feedback, and what is left; "" = it is not known yet."""
+    if not feedback.reached_max_zernike > 0.0:
+        return ""
+    text = f"right to {in_nanometres(feedback.reached_max_zernike)} so far"
+    if feedback.maps_left:
+        expected = in_nanometres(feedback.expected_max_zernike)
+        text += f", {expected} expected after {feedback.maps_left} more maps ({feedback.time_left:.0f} s)"
     return text
 
 

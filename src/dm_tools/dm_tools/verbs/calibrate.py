@@ -39,19 +39,22 @@ class CalibrationPlan(StrEnum):
 
 def run_calibration(client: Any, goal: Any) -> Any:
     """Run a Calibrate goal with a progress bar; returns the action's result."""
-    from dm_tools.long_actions import calibration_step
+    from dm_tools.long_actions import calibration_step, reached_so_far
 
     with progress_bar() as progress:
         task = progress.add_task("calibration", total=None)
 
-        said = ""
+        said, reached = "", 0.0
 
         def show(feedback: Any) -> None:
-            nonlocal said
+            nonlocal said, reached
             text = calibration_step(feedback)
             if not console.is_terminal and text.split()[0] != said:  # no bar is drawn: one line a phase
                 said = text.split()[0]
                 console.print(f"calibration: {said}, step {feedback.step} of {feedback.steps}")
+            if feedback.reached_max_zernike != reached:
+                reached = feedback.reached_max_zernike
+                console.print(f"calibration: {reached_so_far(feedback)}")
             progress.update(
                 task,
                 total=feedback.steps or None,
@@ -62,6 +65,15 @@ def run_calibration(client: Any, goal: Any) -> Any:
         result = client.calibrate(goal, show)
         progress.update(task, description="calibration: done", completed=progress.tasks[0].total or 0)
     return result
+
+
+def foretold(client: Any, goal: Any) -> str:
+    """How long the whole run of a Calibrate goal takes and how good it will be; nothing moves."""
+    goal.dry_run = True
+    try:
+        return str(client.calibrate(goal).message).removesuffix("; nothing was moved")
+    finally:
+        goal.dry_run = False
 
 
 def metres(text: str) -> float:
@@ -234,6 +246,8 @@ def calibrate(
         if fresh and not dry_run:
             start_fresh(client)
         try:
+            if not dry_run and plan == CalibrationPlan.hysteresis:
+                console.print(f"expected: {foretold(client, goal)}", soft_wrap=True)
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
             calibration = made_by(client, result) if activate and not dry_run else None
         except DeformableMirrorError as error:
