@@ -104,8 +104,15 @@ SURFACE_ID, ATTRIBUTES_ID = "{5D0C}", "{A77B}"
 SURFACE_PATH, ATTRIBUTES_PATH = f"/Data/Surface/{SURFACE_ID}", f"/Attributes/{ATTRIBUTES_ID}"
 
 
+def datx_bytes(values: NDArray[Any], unit: str) -> bytes:
+    """A `.datx` file of `values` (height, width), NaN = no data."""
+    buffer = io.BytesIO()
+    write_datx(buffer, np.where(np.isfinite(values), values, 1.7976931348623157e308), unit)
+    return buffer.getvalue()
+
+
 def write_datx(
-    path: Path,
+    path: Path | io.BytesIO,
     values: NDArray[Any],
     unit: str = "Fringes",
     *,

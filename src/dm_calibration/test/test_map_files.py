@@ -104,12 +104,6 @@ def test_dat_of_another_length_is_refused(tmp_path: Path, change: int) -> None:
         read_map(write(tmp_path, "e.dat", content))
 
 
-@pytest.mark.parametrize("length", [0, 3, 100, 833, 834])
-def test_truncated_header_is_refused(tmp_path: Path, length: int) -> None:
-    with pytest.raises(MapFileError):
-        read_map(write(tmp_path, "f.dat", dat_bytes(COUNTS)[:length]))
-
-
 def test_dat_without_phase_data_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match="0 x 0 pixels"):
         read_map(write(tmp_path, "g.dat", dat_bytes(np.empty((0, 0), dtype=int))))

@@ -1,4 +1,4 @@
-"""Readers of FITS files and of 4Sight's against files made from the description of the formats."""
+"""What every reader owes; those of FITS files and of 4Sight's against files made from their description."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ import pytest
 
 from dm_calibration.acquisition.ingest import Ingest, IngestSettings
 from dm_calibration.map_files import MapFileError, read_map
-from map_fixtures import fits_bytes, four_d_bytes, h5_bytes
+from map_fixtures import NO_DATA, asc_bytes, dat_bytes, datx_bytes, fits_bytes, four_d_bytes, h5_bytes, xyz_bytes
 
 #: (height, width) sag in nm, NaN = no data, no two rows alike.
 SAG = np.where(np.hypot(*np.mgrid[-1:1:12j, -1:1:14j]) > 1.1, np.nan, 90.0 + np.arange(168.0).reshape(12, 14))
+
+
+#: The same in counts of the ZYGO formats.
+COUNTS = np.where(np.isfinite(SAG), np.rint(np.nan_to_num(SAG) * 32768 / (0.5 * 632.8)), NO_DATA).astype(int)
 
 
 def write(folder: Path, name: str, content: bytes) -> Path:
@@ -39,17 +43,22 @@ def write(folder: Path, name: str, content: bytes) -> Path:
         ("e.fits", fits_bytes(SAG, BUNIT=None)),
         ("f.h5", h5_bytes(SAG / 632.8)),
         ("g.4D", four_d_bytes(SAG / 632.8)),
+        ("h.dat", dat_bytes(COUNTS)),
+        ("i.asc", asc_bytes(COUNTS)),
+        ("j.xyz", xyz_bytes(SAG)),
+        ("k.datx", datx_bytes(SAG, "NanoMeters")),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_maps_of_other_makers(tmp_path: Path, name: str, content: bytes) -> None:
+def test_maps_of_all_makers(tmp_path: Path, name: str, content: bytes) -> None:
     """What every format owes: m of sag, row 0 = top, NaN = no data, wavelength, pitch; and no half file is a map."""
     found = read_map(write(tmp_path, name, content), xyz_unit="nm")
-    np.testing.assert_allclose(found.sag, 1e-9 * SAG, rtol=1e-6)
+    np.testing.assert_allclose(found.sag, 1e-9 * SAG, rtol=1e-6, atol=5e-12)
     assert found.format == name.partition(".")[2]
     assert found.wavelength == pytest.approx(632.8e-9)
     assert found.pitch == (None if found.format == "4D" else pytest.approx(24e-6))
-    for cut in (30, len(content) // 2, len(content) - 1):
+    whole = len(content.rstrip(b" \n#"))  # behind the last value a text says nothing of the map
+    for cut in (0, 3, 30, whole // 2, whole - 1):
         with pytest.raises(MapFileError):
             read_map(write(tmp_path, "cut", content[:cut]), xyz_unit="nm")
 
