@@ -39,8 +39,6 @@ def test_the_promise_is_kept_within_a_factor_of_two() -> None:
     assert 9e-9 < forecast(shorter, SIMULATION.settle_time, worse, bench.mirror).max_zernike < 12e-9
 
 
-
-
 def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
     """The median of those drawn at random; before, 1.2 nm whatever the number of maps."""
     mirror = SimulatedBench(SIMULATION).mirror
