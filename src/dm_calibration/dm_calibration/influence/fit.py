@@ -1,9 +1,8 @@
 """Fit the influence function to the maps of a calibration, and say how good it is.
 
 The model is ``c = c0 + G s`` for the Zernike coefficients (Eq. 6 in [1]) and ``z = z0 + H s`` for the sag at the
-sampling points. Both are regressions on the same design: the applied signals and a figure that drifts from reference
-frame to reference frame (see :mod:`~dm_calibration.influence.regression`). An interferometer does not know piston and
-tilt, so they are removed, area-weighted, from every sag vector before the fit and from every residual that is reported.
+sampling points: regressions on one design, applied signals and a figure that drifts between reference frames. Piston
+and tilt, which no interferometer knows, are removed, area-weighted, from every sag vector and residual.
 """
 
 from collections.abc import Collection
