@@ -1,8 +1,7 @@
 """Fit the influence function to the maps of a calibration, and say how good it is.
 
 The model is ``c = c0 + G s`` for the Zernike coefficients (Eq. 6 in [1]) and ``z = z0 + H s`` for the sag at the
-sampling points: regressions on one design, applied signals and a figure that drifts between reference frames. Piston
-and tilt, which no interferometer knows, are removed, area-weighted, from every sag vector and residual.
+sampling points, on applied signals and a drifting figure, without the piston and tilt that no interferometer knows.
 """
 
 from collections.abc import Collection

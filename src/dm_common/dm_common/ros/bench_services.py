@@ -42,9 +42,7 @@ _EXIT_WAIT_S = 5.0
 class BenchServices:
     """Driver and interferometer of one calibration; implements :class:`dm_common.measurement.Bench`.
 
-    All methods block and belong into a worker thread.
-
-    Attributes:
+    All methods block and belong into a worker thread. Attributes:
         hold: of the mirror.
         nodes: whether those of driver and interferometer are there.
         state: the driver's last state message; None before the first.
