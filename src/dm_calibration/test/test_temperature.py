@@ -78,6 +78,13 @@ def test_readings_that_are_none_are_left_out(node: Node, log: TemperatureLog) ->
     assert log.now() == 21.0
 
 
+def test_before_simulated_time_has_begun_no_reading_is_judged(node: Node, log: TemperatureLog) -> None:
+    node.seconds = 0.0
+    node.say(21.0, 1e9)
+    node.seconds = 1e9
+    assert log.now() != log.now() and not node.warnings
+
+
 def test_a_late_reading_takes_its_place(node: Node, log: TemperatureLog) -> None:
     for value, seconds in ((20.0, 980.0), (22.0, 1000.0), (21.0, 990.0)):
         node.say(value, seconds)

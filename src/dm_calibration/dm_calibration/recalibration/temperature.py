@@ -34,6 +34,8 @@ class TemperatureLog:
 
     def _on_reading(self, message: Temperature) -> None:
         now = 1e-9 * self._node.get_clock().now().nanoseconds
+        if not now:  # simulated time has not begun here: the stamp cannot be judged
+            return
         stamp, latest = seconds(message.header.stamp) or now, now + self._silent_after()
         while self._readings and self._readings[-1][0] > latest:
             self._readings.pop()  # of before the clock was set back
