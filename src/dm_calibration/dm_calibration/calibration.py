@@ -10,7 +10,7 @@ import numpy as np
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
-from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NAMES, GRADE_NOT_EXCITED
+from dm_calibration.influence.quality import GRADE_NAMES, NO_RESPONSE
 from dm_calibration.store.hdf5_image import Attribute, Column
 from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
 from dm_common import Floats
@@ -115,7 +115,7 @@ class Calibration:
             error_max: m that it must promise.
         """
         reasons = []
-        for grade in (GRADE_DEAD, GRADE_NOT_EXCITED):
+        for grade in NO_RESPONSE:
             numbers = np.flatnonzero(self.fit.grades == grade) + 1
             if numbers.size:
                 reasons.append(f"actuators {', '.join(map(str, numbers))} are {GRADE_NAMES[grade]}")

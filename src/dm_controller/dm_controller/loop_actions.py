@@ -146,9 +146,9 @@ class LoopBench(BenchServices):
         applied = np.array(self.state.applied if self.state is not None else (), dtype=np.float64)
         return applied if applied.size and np.isfinite(applied).all() else None
 
-    def degauss(self) -> None:
+    def degauss(self, steps: int = 0) -> None:
         """The condition that recipes begin with: the driver's own number of steps may be another."""
-        self._run_degauss(int(self.parameters["recipes.degauss_steps"]))
+        super().degauss(steps or int(self.parameters["recipes.degauss_steps"]))
 
     def measure(self, label: str) -> Measurement:
         """One map. Raises MeasurementError after all tries, or Refusal when no other try can succeed."""

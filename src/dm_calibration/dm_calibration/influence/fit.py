@@ -1,7 +1,9 @@
 """Fit the influence function to the maps of a calibration, and say how good it is.
 
 The model is ``c = c0 + G s`` for the Zernike coefficients (Eq. 6 in [1]) and ``z = z0 + H s`` for the sag at the
-sampling points, on applied signals and a drifting figure, without the piston and tilt that no interferometer knows.
+sampling points. Both are regressions on the same design: the applied signals and a figure that drifts from reference
+frame to reference frame (see :mod:`~dm_calibration.influence.regression`). An interferometer does not know piston and
+tilt, so they are removed, area-weighted, from every sag vector before the fit and from every residual that is reported.
 """
 
 from collections.abc import Collection
@@ -124,11 +126,6 @@ class InfluenceFit:
     @property
     def actuators(self) -> int:
         return int(self.influence_zernike.shape[1])
-
-    @property
-    def silent(self) -> NDArray[np.bool_]:
-        """(N,) which actuators showed no response."""
-        return np.isin(self.grades, (quality.GRADE_DEAD, quality.GRADE_NOT_EXCITED))
 
 
 def fit_influence(

@@ -32,6 +32,8 @@ GRADE_WEAK = 1
 GRADE_DEAD = 2
 GRADE_NOT_EXCITED = 3
 GRADE_NAMES = ("good", "weak", "dead", "not excited")
+#: Grades of actuators whose response is not known.
+NO_RESPONSE = (GRADE_DEAD, GRADE_NOT_EXCITED)
 
 
 def grade(

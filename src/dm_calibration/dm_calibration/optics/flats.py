@@ -94,9 +94,7 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
         solution = inverse @ coefficients.T.ravel()
         apart = float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
         squares += apart
-        if (
-            n <= MAX_ORDER
-        ):  # what the bound is for: retrace error and vibration spoil these more than those of higher orders
+        if n <= MAX_ORDER:  # the bound is for these, which retrace error and vibration spoil more than higher orders
             judged += apart
             freedom += (2 if m else 1) * len(tests) - int(np.linalg.matrix_rank(matrix, rtol=DETERMINED))
         worst = max(worst, *np.linalg.norm(inverse[: len(told)], axis=1)[told], 0.0)

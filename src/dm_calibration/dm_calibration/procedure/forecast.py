@@ -51,7 +51,7 @@ class Forecast:
         if not self.max_zernike > 0.0:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
-        source = ", by data sheets and mirrors drawn at random, up to twice that" if drawn else ""
+        source = ", by data sheets and mirrors drawn at random, some of which came to twice that" if drawn else ""
         right = f"moves then right to {in_nanometres(self.max_zernike)} (largest coefficient, 95 %{source})"
         return f",{missed} {right}"
 
@@ -130,14 +130,17 @@ def foreseen(plan: Plan, done: int, reached: float, until: float) -> tuple[int, 
 def typical_influence(mirror: Mirror) -> Floats:
     """(21, N) m per unit signal, as the data sheet of a piezo mirror lets expect."""
     points = edge_clustered_points()
-    sag = typical_sag(mirror.x / mirror.working_radius, mirror.y / mirror.working_radius, points)
-    return weighted_fit(sag, basis(points.x, points.y), points.weight).T
+    return typical_response(mirror.x / mirror.working_radius, mirror.y / mirror.working_radius, points)[0].T
 
 
-def typical_sag(x: Floats, y: Floats, points: SamplePoints) -> Floats:
-    """(N, P) m per unit signal of actuators at x, y (N,), in radii of the aperture; piston and tilt removed."""
+def typical_response(x: Floats, y: Floats, points: SamplePoints) -> tuple[Floats, Floats]:
+    """(N, 21) coefficients and (N, P) sag, m per unit signal, of actuators at x, y (N,), in radii of the aperture.
+
+    Piston and tilt of the sag are removed.
+    """
     shape, size = bumps(np.asarray(x + 1j * y, dtype=np.complex128), TYPICAL_WIDTH * pitch(x, y), points)
-    return TYPICAL_RISE * size[:, None] * shape
+    sag = TYPICAL_RISE * size[:, None] * shape
+    return weighted_fit(sag, basis(points.x, points.y), points.weight), sag
 
 
 class GoodEnough:

@@ -8,10 +8,10 @@ from scipy.linalg import solve_triangular
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.hysteresis.reduction import Reduction
-from dm_calibration.procedure.forecast import typical_sag
+from dm_calibration.influence.quality import NO_RESPONSE
+from dm_calibration.procedure.forecast import typical_response
 from dm_common import Floats
-from dm_common.optics.piston_tilt import weighted_fit
-from dm_common.optics.zernike import PISTON_TILT, basis
+from dm_common.optics.zernike import PISTON_TILT
 
 #: Most actuators that a difference is put down to, and the share of its square that each of them must explain: the one
 #: that fits noise best explains about 0.13.
@@ -25,17 +25,22 @@ TELLING_SIGNAL, DEAD_SHARE = 0.1, 0.15
 SURE = 0.9
 
 
+def without_response(calibration: Calibration) -> NDArray[np.bool_]:
+    """(N,) which actuators showed no response in the calibration."""
+    return np.isin(calibration.fit.grades, NO_RESPONSE)
+
+
 def visible_gain(gain: Floats, reduction: Reduction, calibration: Calibration) -> Floats:
     """`gain` (R, N) per unit of effective signal, of actuators without a response as data sheets let expect.
 
     The fit has nothing but noise of those, by which no map could show that they move.
     """
-    silent, points = calibration.fit.silent, calibration.fit.points
+    silent = without_response(calibration)
     if not silent.any() or silent.size < 2:  # no neighbour whose distance tells the width of a bump
         return gain
     radius = calibration.aperture_radius
-    sag = typical_sag(calibration.actuator_x / radius, calibration.actuator_y / radius, points)
-    coefficients = weighted_fit(sag, basis(points.x, points.y), points.weight)
+    places = calibration.actuator_x / radius, calibration.actuator_y / radius
+    coefficients, sag = typical_response(*places, calibration.fit.points)
     return np.where(silent, reduction.reduce(coefficients, sag).T, gain)
 
 

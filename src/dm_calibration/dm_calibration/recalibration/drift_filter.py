@@ -30,7 +30,7 @@ from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.quality import GRADE_DEAD
 from dm_calibration.procedure.applied_history import MapNotUsableError
-from dm_calibration.recalibration.displaced import displaced_actuators, displacement, visible_gain
+from dm_calibration.recalibration.displaced import displaced_actuators, displacement, visible_gain, without_response
 from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates, surprise_of
 from dm_common import Floats
 from dm_common.hysteresis.creep_record import slow_creep
@@ -95,6 +95,7 @@ class DriftFilter:
         self.reduction = Reduction(fit.points, fit.influence_sag, maps.terms)
         self._gain = self.reduction.reduce(fit.influence_zernike.T, fit.influence_sag.T).T
         self._visible = visible_gain(self._gain, self.reduction, calibration)
+        self._silent = without_response(calibration)
         self._offset = self.reduction.reduce(fit.zernike_offset, fit.sag_offset)
         scatter = self._scatter(maps if hysteresis is None else effective_maps(maps, hysteresis.law))
         if hysteresis is not None:
@@ -172,7 +173,7 @@ class DriftFilter:
                 [next(filter(np.isfinite, known), np.nan), np.fmin.reduce(known), np.fmax.reduce(known)]
             ),
         )
-        displaced, probability = displaced_actuators(innovation, self._visible, factor, self._fit.silent)
+        displaced, probability = displaced_actuators(innovation, self._visible, factor, self._silent)
         departure = remove_piston_tilt(seen.sag_error[None], self._fit.points)[0]
         return Comparison(
             max_zernike=float(np.abs(seen.zernike_error)[PISTON_TILT:].max()),

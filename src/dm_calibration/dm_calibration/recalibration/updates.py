@@ -19,7 +19,7 @@ from dm_calibration.procedure.applied_history import MapNotUsableError, SettledS
 from dm_calibration.procedure.map_acquisition import WAVELENGTH_TOLERANCE
 from dm_calibration.recalibration.check_log import SUFFIX as LOG_SUFFIX
 from dm_calibration.recalibration.check_log import Check, append_check
-from dm_calibration.recalibration.displaced import described, worst_elsewhere
+from dm_calibration.recalibration.displaced import described, without_response, worst_elsewhere
 from dm_calibration.recalibration.drift import Comparison, Drift, DriftRates
 from dm_calibration.recalibration.drift_filter import DriftFilter
 from dm_calibration.recalibration.update_storage import UpdatesFileError, basis_hash, read_updates, write_updates
@@ -189,7 +189,7 @@ class RecalibrationManager:
             worst = max(comparison.max_zernike, worst_elsewhere(*found, calibration.fit.influence_zernike))
             if not accepted:
                 reason += f", more than {options.surprise_max:g}: "
-                reason += described(*found, np.isfinite(updates.stuck), calibration.fit.silent)
+                reason += described(*found, np.isfinite(updates.stuck), without_response(calibration))
             elif without:
                 reason = f"{updates.given_up}; the map then {reason}"
             if dry_run:

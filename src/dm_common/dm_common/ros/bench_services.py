@@ -42,7 +42,9 @@ _EXIT_WAIT_S = 5.0
 class BenchServices:
     """Driver and interferometer of one calibration; implements :class:`dm_common.measurement.Bench`.
 
-    All methods block and belong into a worker thread. Attributes:
+    All methods block and belong into a worker thread.
+
+    Attributes:
         hold: of the mirror.
         nodes: whether those of driver and interferometer are there.
         state: the driver's last state message; None before the first.
@@ -126,13 +128,11 @@ class BenchServices:
                 "pdm_driver no longer knows what the actuators went through: it was restarted or lost its link",
             )
 
-    def degauss(self) -> None:
+    def degauss(self, steps: int = 0) -> None:
+        """As of a bench, of so many half-swings; 0 = as configured in the driver."""
         self._history_known = False
-        self._run_degauss(0)
-
-    def _run_degauss(self, steps: int) -> None:
-        """A degauss of so many half-swings, 0 = as configured in the driver. Raises as `degauss`."""
-        goal, timeout = Degauss.Goal(steps=steps, holder=self.hold.holder), self._values["degauss_timeout"]
+        goal = Degauss.Goal(steps=steps, holder=self.hold.holder)
+        timeout = self._values["degauss_timeout"]
         with self._answered("degauss", self._driver, self._degauss.server_is_ready) as stop:
             result = run_goal(self._degauss, goal, timeout, stop=stop, gone=self._driver.since_now())
             if result.error_code != ErrorCode.OK and stop():
