@@ -51,7 +51,7 @@ class Forecast:
         if not self.max_zernike > 0.0:
             return ""
         missed = f" not expected to reach {in_nanometres(until)}:" if self.max_zernike > until > 0.0 else ""
-        source = ", by data sheets and mirrors drawn at random, some of which came to twice that" if drawn else ""
+        source = ", by data sheets and mirrors drawn at random, some of them twice as far off" if drawn else ""
         right = f"moves then right to {in_nanometres(self.max_zernike)} (largest coefficient, 95 %{source})"
         return f",{missed} {right}"
 
