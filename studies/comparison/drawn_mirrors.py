@@ -12,7 +12,7 @@ from dm_simulation.mirror.plate import PlateConfig
 from studies.comparison.simulated_bench import SimulationConfig
 
 #: Laws to draw from, and how often each comes.
-LAWS = {"drawn_preisach": 0.55, "drawn_mixed": 0.25, "drawn_bouc_wen": 0.2}
+LAWS = {"drawn_preisach": 0.45, "drawn_mixed": 0.2, "drawn_bouc_wen": 0.15, "drawn_jiles_atherton": 0.2}
 #: Largest difference between neighbours as shipped, see pdm_driver's `limits.neighbour_difference`.
 SHIPPED_NEIGHBOUR_DIFFERENCE = 1.0
 #: Creep of few elements: first and last time constant, s, a decade apart.
@@ -57,9 +57,12 @@ class DrawnMirror:
             ("creep with position", piezo.creep_position),
             ("rate", piezo.rate_dependence),
             ("stiffening", piezo.stiffening),
+            ("crosstalk", piezo.crosstalk),
         ):
             if share:
                 parts.append(f"{name} {share:.1%}")
+        if instrument.noise_time:
+            parts.append(f"lasting {instrument.noise_time:.0f} s")
         if piezo.drift:
             parts.append(f"drift {1e9 * piezo.drift:.1f} nm")
         if self.held_before:
@@ -113,4 +116,10 @@ def draw_mirror(seed: int, pixels: int = 236) -> DrawnMirror:
         neighbour_difference=SHIPPED_NEIGHBOUR_DIFFERENCE,
     )
     event = str(rng.choice(list(EVENTS), p=list(EVENTS.values())))
-    return DrawnMirror(simulation, event, bool(rng.random() < 0.5))
+    held_before = bool(rng.random() < 0.5)
+    simulation = replace(
+        simulation,
+        piezo=replace(piezo, crosstalk=sometimes(0.0, 0.01)),
+        instrument=replace(instrument, noise_time=sometimes(1.0, 60.0)),
+    )
+    return DrawnMirror(simulation, event, held_before)

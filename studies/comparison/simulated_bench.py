@@ -184,7 +184,7 @@ class SimulatedBench:
     def take_map(self) -> Floats:
         """One noisy map (pixels, pixels), m, at this moment; row 0 = top, NaN = no data."""
         self.piezo.advance(self.time)
-        return self._interferometer.measure(self.piezo.displacement)
+        return self._interferometer.measure(self.piezo.displacement, self.time)
 
     def true_map(self) -> Floats:
         """The noise-free surface (pixels, pixels), m, at this moment: for judging only."""

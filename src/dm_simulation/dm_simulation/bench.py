@@ -172,11 +172,11 @@ class VirtualBench:
             _check_path(path)
         with self._measuring:
             displacement = self.displacement()
-            stamp = int(self._now())
-            sag = instrument.measure(displacement)
+            now = self._now()
+            sag = instrument.measure(displacement, now)
             if path is None:
                 path = self._next_path()
-            deliver(self._map_file(sag, path.suffix, stamp), path, files.slow_write)
+            deliver(self._map_file(sag, path.suffix, int(now)), path, files.slow_write)
             if files.limit and path.parent == files.folder.absolute():
                 prune(path.parent, files.limit)
             self.maps_written += 1

@@ -118,6 +118,13 @@ def test_pixel_noise_is_white_and_as_large_as_stated(plate: Plate) -> None:
     assert np.nanstd(camera.measure(np.zeros(37)) - noise) == pytest.approx(np.sqrt(2) * 1e-9, rel=0.02)
 
 
+def test_low_order_noise_may_last(plate: Plate) -> None:
+    camera = make(replace(QUIET, low_order_noise=1e-9, noise_time=60.0), plate)
+    first, soon, later = (camera.measure(np.zeros(37), time) for time in (0.0, 0.06, 6e5))
+    assert np.nanstd(soon - first) < 0.2 * np.nanstd(first)
+    assert np.nanstd(later - first) > 0.8e-9
+
+
 def test_low_order_noise_piston_and_tilt(plate: Plate) -> None:
     config = replace(QUIET, low_order_noise=0.3e-9, piston_spread=200e-9, tilt_spread=300e-9, pixels=64)
     camera = make(config, plate)

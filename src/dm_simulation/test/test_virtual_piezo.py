@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, skew_density
+from dm_simulation.mirror.hysteresis import LAWS, Hysteresis, JilesAthertonHysteresis, skew_density
 from dm_simulation.mirror.piezo import DRAWN, ROOM, PiezoActuators, PiezoConfig
 from dm_simulation.mirror.preisach import PreisachOperator, drawn_density
 
@@ -154,7 +154,7 @@ def test_unknown_laws_and_impossible_loops_are_refused() -> None:
         Hysteresis("prandtl_ishlinskii", 0.9, 1)
 
 
-DRAWN_LAWS = ("drawn_preisach", "drawn_bouc_wen", "drawn_mixed")
+DRAWN_LAWS = ("drawn_preisach", "drawn_bouc_wen", "drawn_mixed", "drawn_jiles_atherton")
 
 
 @pytest.mark.parametrize("law", DRAWN_LAWS)
@@ -205,6 +205,24 @@ def rested(config: PiezoConfig, count: int = 1, signal: float = 0.0) -> PiezoAct
 
 
 LINEAR = PiezoConfig(gain_spread=0.0, law="none", hysteresis=0.0, creep=0.01)
+
+
+def test_walls_stay_pinned_until_the_signal_has_passed_where_they_would_be() -> None:
+    one = np.ones(1)
+    law = JilesAthertonHysteresis(1, 0.8 * one, 0.3 * one, 0.0 * one, 0.05 * one)
+    top = law.move(one)
+    assert 0.5 < top[0] < np.tanh(1 / 0.8)  # behind the curve without walls
+    assert law.move(0.9 * one) == top
+    assert law.move(-one)[0] < -0.5
+
+
+def test_crosstalk_lets_an_actuator_follow_the_next_channel() -> None:
+    apart, coupled = (rested(replace(LINEAR, creep=0.0, crosstalk=share), 3) for share in (0.0, 0.01))
+    for actuators in (apart, coupled):
+        actuators.apply(np.array([0.0, 1.0, 0.0]), 0.0)
+    moved = (coupled.displacement - apart.displacement) / apart.displacement[1]
+    assert 1e-3 < abs(moved[0]) < 0.03
+    np.testing.assert_allclose(moved[1:], 0.0, atol=1e-12)
 
 
 def test_stroke_and_gain_spread() -> None:

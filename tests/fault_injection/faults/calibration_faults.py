@@ -231,8 +231,8 @@ def calibration_bumped(runs: _Runs, random: Random) -> None:
     instrument = runs.rig.bench.interferometer
     good = instrument.measure
 
-    def bumped(displacement: Any) -> Any:
-        sag = good(displacement)
+    def bumped(displacement: Any, time: float = 0.0) -> Any:
+        sag = good(displacement, time)
         return sag + BUMP * np.linspace(-1.0, 1.0, len(sag))[:, np.newaxis]
 
     begun = time.monotonic()

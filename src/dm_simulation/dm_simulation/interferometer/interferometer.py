@@ -44,7 +44,10 @@ class InterferometerConfig:
     pixel_noise: float = parameter(real(1e-9, 0.0, 1e-6, "m"), "White noise per pixel, rms.")
     low_order_noise: float = parameter(
         real(0.3e-9, 0.0, 1e-6, "m"),
-        "Noise of all Zernike terms of orders 2-5 together, drawn anew for every map, rms over the field.",
+        "Noise of all Zernike terms of orders 2-5 together, rms over the field.",
+    )
+    noise_time: float = parameter(
+        real(0.0, 0.0, 1e5, "s"), "How long it lasts: its correlation from map to map falls to 1/e; 0 = not at all."
     )
     piston_spread: float = parameter(real(200e-9, 0.0, 1e-4, "m"), "Standard deviation of piston between maps.")
     tilt_spread: float = parameter(
@@ -164,6 +167,7 @@ class Interferometer:
         self._figure = drawn(metres_x / plate.radius, metres_y / plate.radius, config.figure_rms)
         self._error = drawn(x, y, config.instrument_error)
         self._retrace = np.array([drawn(x, y, config.retrace, zernike.terms_to_order(5)[3:]) for _ in range(2)])
+        self._lasting, self._measured = np.zeros(len(self._low_orders) - 3), -np.inf
         # Sag at the edge by tilt, as a sum over coefficients of products: mean of f x over that of x^2.
         inside = np.where(x**2 + y**2 <= 1, 1.0, 0.0)
         products = chebyshev.chebvander(nodes, degree)
@@ -219,13 +223,20 @@ class Interferometer:
         sag[self._outside] = np.nan
         return self._camera(sag)
 
-    def measure(self, displacement: Array) -> Array:
-        """A map of the surface with spring bases at `displacement` (N,), m: (pixels, pixels), m, NaN = no data."""
+    def measure(self, displacement: Array, time: float = 0.0) -> Array:
+        """A map of the surface with spring bases at `displacement` (N,), m: (pixels, pixels), m, NaN = no data.
+
+        Args:
+            time: s, of any clock, for noise that lasts.
+        """
         config, rng = self.config, self._noise
         low = np.empty(len(self._low_orders))
         low[0] = config.piston_spread * rng.standard_normal()
         low[1:3] = config.tilt_spread / 2 * rng.standard_normal(2)  # an orthonormal tilt is 2 at the edge
+        lasts = np.exp(-abs(time - self._measured) / config.noise_time) if config.noise_time else 0.0
         low[3:] = config.low_order_noise / np.sqrt(len(low) - 3) * rng.standard_normal(len(low) - 3)
+        low[3:] = lasts * self._lasting + np.sqrt(1.0 - lasts**2) * low[3:]
+        self._lasting, self._measured = low[3:], time
         seen = self.surface(displacement) + self._error + np.tensordot(low, self._low_orders, 1)
         seen += np.tensordot(np.tensordot(self._tilts, seen, 2), self._retrace, 1)
         sag = self._evaluate(seen)

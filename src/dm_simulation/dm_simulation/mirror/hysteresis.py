@@ -14,8 +14,8 @@ import numpy as np
 from dm_simulation.mirror.preisach import PreisachOperator, drawn_density
 from dm_simulation.mirror.zernike import Array
 
-#: Bouc-Wen laws are integrated in steps of at most so much of a signal.
-BOUC_WEN_STEP = 0.02
+#: Bouc-Wen and Jiles-Atherton laws are integrated in steps of at most so much of a signal.
+BOUC_WEN_STEP, JILES_ATHERTON_STEP = 0.02, 0.005
 #: Points of a sweep and cycles from which the opening of a loop is taken.
 SWEEP_POINTS, SWEEP_CYCLES = 61, 2
 
@@ -86,6 +86,32 @@ class BoucWenHysteresis:
         return -self._z
 
 
+class JilesAthertonHysteresis:
+    """The domain wall law of [36], which [37] carries over to piezo ceramics; tanh is the curve without walls.
+
+    Walls are pinned: m follows that curve only on the way towards it, the slower the stronger they are pinned, and
+    bends reversibly by a share of its slope. Minor loops neither close nor wipe anything out.
+
+    Args:
+        width, pinning, reversible, coupling: of that curve, of a full loop, share, and how m adds to the signal; (N,).
+    """
+
+    def __init__(self, count: int, width: Array, pinning: Array, reversible: Array, coupling: Array) -> None:
+        self._width, self._pinning, self._reversible, self._coupling = width, pinning, reversible, coupling
+        self._m = np.zeros(count)
+        self._u = np.zeros(count)
+
+    def move(self, u: Array) -> Array:
+        steps = max(1, int(np.ceil(np.abs(u - self._u).max() / JILES_ATHERTON_STEP)))
+        step, m = (u - self._u) / steps, self._m
+        for number in range(steps):
+            ideal = np.tanh((self._u + (number + 0.5) * step + self._coupling * m) / self._width)
+            pinned = np.maximum((ideal - m) * np.sign(step), 0.0) / self._pinning
+            m = m + step * ((1.0 - self._reversible) * pinned + self._reversible * (1.0 - ideal**2) / self._width)
+        self._m, self._u = m, np.array(u, float)
+        return m
+
+
 class MixedHysteresis:
     """A weighted sum of two laws."""
 
@@ -101,6 +127,12 @@ def _drawn_bouc_wen(count: int, rng: np.random.Generator) -> HysteresisLaw:
     middle = (rng.uniform(0.8, 3.0), rng.uniform(1.5, 3.0), rng.uniform(1.5, 3.0), rng.uniform(0.3, 1.2))
     own = np.exp(0.1 * rng.standard_normal((4, count)))
     return BoucWenHysteresis(count, *(own * np.array(middle)[:, None]))
+
+
+def _drawn_jiles_atherton(count: int, rng: np.random.Generator) -> HysteresisLaw:
+    """Constants of the mirror, from which those of an actuator differ by a tenth."""
+    middle = (rng.uniform(0.5, 1.2), rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.4), rng.uniform(0.02, 0.1))
+    return JilesAthertonHysteresis(count, *(np.exp(0.1 * rng.standard_normal((4, count))) * np.array(middle)[:, None]))
 
 
 def _drawn_mixed(count: int, rng: np.random.Generator) -> HysteresisLaw:
@@ -135,13 +167,15 @@ def _make(law: str, count: int, rng: np.random.Generator) -> HysteresisLaw:
             return _drawn_bouc_wen(count, rng)
         case "drawn_mixed":
             return _drawn_mixed(count, rng)
+        case "drawn_jiles_atherton":
+            return _drawn_jiles_atherton(count, rng)
     raise ValueError(f"piezo.law = {law!r}: must be one of {', '.join(LAWS)}")
 
 
 #: Laws whose name begins with `drawn` are drawn at random, for each actuator its own; the others are all actuators'.
 LAWS = (
     *("none", "prandtl_ishlinskii", "preisach", "bouc_wen", "mixed"),
-    *("drawn_preisach", "drawn_bouc_wen", "drawn_mixed"),
+    *("drawn_preisach", "drawn_bouc_wen", "drawn_mixed", "drawn_jiles_atherton"),
 )
 
 

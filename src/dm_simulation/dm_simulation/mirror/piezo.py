@@ -44,6 +44,9 @@ class PiezoConfig:
     spectrum_spread: float = parameter(real(0.0, 0.0, 1.0), "Spread of elements, common to all stacks, as a logarithm.")
     creep_position: float = parameter(real(0.0, -0.5, 0.5), "Relative change of creep from mid range to signal 1.")
     rate_dependence: float = parameter(real(0.0, 0.0, 0.1), "Widening of loops per decade of speed.")
+    crosstalk: float = parameter(
+        real(0.0, 0.0, 0.1), "Share of the next channel's signal that an actuator takes up, standard deviation."
+    )
     stiffening: float = parameter(
         real(0.0, 0.0, 0.2), "Share of half the stroke lost at signals -1 and +1, in squares."
     )
@@ -106,6 +109,7 @@ class PiezoActuators:
         self._lagged = np.repeat((self._position - self.signals)[:, None], len(LAG_TIMES_S), axis=1)
         self._time = time
         self._warm, self._noon = config.warm_base * rng.standard_normal(count), rng.uniform(0.0, 2.0 * np.pi)
+        self._crosstalk = config.crosstalk * rng.standard_normal(count)
 
     @property
     def temperature(self) -> float:
@@ -126,6 +130,7 @@ class PiezoActuators:
     def apply(self, signals: Array, time: float) -> None:
         """Take new signals (N,) at `time`."""
         self.advance(time)
+        signals = signals + self._crosstalk * np.roll(signals, -1)
         self.signals = np.where(self.stuck, self.signals, signals)
         self._position = self._hysteresis.move(self.signals)
 
