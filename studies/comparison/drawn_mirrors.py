@@ -63,6 +63,8 @@ class DrawnMirror:
                 parts.append(f"{name} {share:.1%}")
         if instrument.noise_time:
             parts.append(f"lasting {instrument.noise_time:.0f} s")
+        if piezo.swing:
+            parts.append(f"{piezo.swing:.1f} K a day")
         if piezo.drift:
             parts.append(f"drift {1e9 * piezo.drift:.1f} nm")
         if self.held_before:
@@ -119,7 +121,7 @@ def draw_mirror(seed: int, pixels: int = 236) -> DrawnMirror:
     held_before = bool(rng.random() < 0.5)
     simulation = replace(
         simulation,
-        piezo=replace(piezo, crosstalk=sometimes(0.0, 0.01)),
+        piezo=replace(piezo, crosstalk=sometimes(0.0, 0.01), swing=sometimes(0.0, 1.0), warm_gain=5e-4, warm_base=2e-9),
         instrument=replace(instrument, noise_time=sometimes(1.0, 60.0)),
     )
     return DrawnMirror(simulation, event, held_before)
