@@ -21,7 +21,7 @@ CHECK_SHARE = 0.2
 REPEATS = 8
 #: Fewest and most maps of a run, repeats not counted.
 MAPS_MIN, MAPS_MAX = 60, 2000
-#: Swings as a share of the range: with fewer full ones errors in use are larger (docs/accuracy.md, "Few maps").
+#: Swings as a share of the range: with fewer full ones errors in use are larger (studies/comparison/NOTES.md).
 SWINGS = (1.0, 1.0, 0.6, 0.3)
 #: Share of the shapes that are held, and for how long, s.
 HELD_SHARE = 0.1
