@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _FATAL = (ErrorCode.INTERFEROMETER_INACTIVE, ErrorCode.NOT_SUPPORTED, ErrorCode.INVALID_ARGUMENT)
 #: Signals that differ less are the same command.
 _SAME_SIGNAL = 1e-6
+#: Tries of one map with an interferometer that is lost in each and comes back.
+_TRIES = 5
 #: Wall time for a state message to confirm that the mirror still holds the command, s (it comes every 0.5 s).
 _STATE_WAIT_S = 2.0
 #: Longest wait for the driver when the process ends, s.
@@ -158,12 +160,14 @@ class BenchServices:
         return slept
 
     def measure(self, label: str) -> Measurement:
-        while True:
+        for _ in range(_TRIES):
             try:
                 return self._measured(label, self._check_undisturbed)
-            except MeasurementError:
+            except MeasurementError as error:
                 if not self._no_interferometer() or not self._interferometer_returns():
                     raise
+                failure = error
+        raise Refusal(failure.error_code, f"{failure} ({_TRIES} tries)") from failure
 
     def measure_as_it_stands(self, label: str) -> Measurement:
         """One map of whatever stands there; does not wait for an interferometer to return. Raises as `measure`."""
@@ -175,13 +179,11 @@ class BenchServices:
     def _interferometer_returns(self) -> bool:
         """Wait for an interferometer that has died, as long as for a map; whether it is back. Raises Cancelled."""
         deadline = time.monotonic() + self._values["measure_timeout"]
-        while self._no_interferometer():
+        while (missing := self._no_interferometer()) and time.monotonic() < deadline:
             if self._stopping():
                 raise self.hold.lost or Cancelled("cancelled")
-            if time.monotonic() > deadline:
-                return False
             time.sleep(0.02)
-        return True
+        return not missing
 
     def _measured(self, label: str, check: Callable[[], None]) -> Measurement:
         timeout = self._values["measure_timeout"]
@@ -219,10 +221,9 @@ class BenchServices:
                 if self.hold.lost is not None:
                     return f"the mirror is left as it is: {self.hold.lost}"
                 # A degauss or ramp that was cancelled here may still be running there.
-                if error.error_code in (ErrorCode.BUSY, ErrorCode.PREEMPTED) and time.monotonic() < deadline:
-                    time.sleep(0.2)
-                    continue
-                return f"the mirror could NOT be brought back to mid range: {error}"
+                if error.error_code not in (ErrorCode.BUSY, ErrorCode.PREEMPTED) or time.monotonic() > deadline:
+                    return f"the mirror could NOT be brought back to mid range: {error}"
+                time.sleep(0.2)
 
     def rest_at_exit(self, signals: Floats) -> str:
         """The same when this process's ROS context is already shut down: over one of its own."""
@@ -230,14 +231,13 @@ class BenchServices:
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
         node = Node(f"{self._node.get_name()}_exit", context=context, use_global_arguments=False)
         executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
         try:
             client = node.create_client(SetSignals, self._set_signals.srv_name)
             timeout = min(self._values["driver_timeout"], _EXIT_WAIT_S)
             if not client.wait_for_service(timeout_sec=timeout):
                 return "the mirror could NOT be brought back to mid range: the driver does not answer"
             future = client.call_async(SetSignals.Request(signals=doubles(signals), wait=True, holder=self.hold.holder))
-            executor.spin_until_future_complete(future, timeout_sec=timeout)
+            rclpy.spin_until_future_complete(node, future, executor, timeout)
             response = future.result() if future.done() else None
             if response is None or response.error_code != ErrorCode.OK:
                 reason = response.message if response else f"no answer within {timeout:g} s"

@@ -1,0 +1,54 @@
+"""A map and an interferometer that dies meanwhile."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from dm_common.errors import ErrorCode, MeasurementError, Refusal
+from dm_common.ros import bench_services
+from dm_common.ros.bench_services import BenchServices
+
+#: Longest pause before a node that died is started again, s.
+BACK_OFF_S = 30.0
+
+
+class Bench(BenchServices):
+    """An interferometer that dies in so many maps and returns after its back-off; stands in for the time too."""
+
+    def __init__(self, deaths: int) -> None:
+        self.deaths, self.tries, self.now, self.returns_at = deaths, 0, 0.0, 0.0
+        self._values = {"measure_timeout": 60.0}
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        self.now += duration
+
+    def _measured(self, *_arguments: Any) -> Any:
+        self.tries += 1
+        assert self.tries < 20
+        if self.tries <= self.deaths:
+            self.returns_at = self.now + BACK_OFF_S
+            raise MeasurementError(ErrorCode.INTERFEROMETER_UNAVAILABLE, "measure: it has died")
+        return "a map"
+
+    def _no_interferometer(self) -> bool:
+        return self.now < self.returns_at
+
+    def _stopping(self) -> bool:
+        return False
+
+
+def test_a_map_is_taken_again_when_the_interferometer_is_back_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(deaths=4)
+    monkeypatch.setattr(bench_services, "time", bench)
+    assert bench.measure("rest") == "a map"
+    bench = Bench(deaths=100)
+    monkeypatch.setattr(bench_services, "time", bench)
+    with pytest.raises(Refusal, match=r"^measure: it has died \(5 tries\)$") as refused:
+        bench.measure("rest")
+    assert refused.value.error_code == ErrorCode.INTERFEROMETER_UNAVAILABLE and bench.tries == 5
+    assert not isinstance(refused.value, MeasurementError)  # which would be tried again
