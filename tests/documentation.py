@@ -186,7 +186,7 @@ PARSED = {
 ELSEWHERE = {
     "git clone <this repository>": "placeholder",
     "cd <its folder>": "placeholder",
-    "PIP_BREAK_SYSTEM_PACKAGES=1 rosdep install --from-paths src --ignore-src -y": "needs apt and root",
+    "rosdep install --from-paths src --ignore-src -y": "needs apt and root",
     "sudo apt-get install python3-statsmodels": "needs apt and root",
     "colcon build": "needs ROS 2 from apt; ./dm builds with colcon",
     "colcon build --packages-up-to dm_example_cpp": "needs ROS 2 from apt; `test_cpp_example` compiles it",

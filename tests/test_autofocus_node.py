@@ -36,7 +36,7 @@ from dm_autofocus.optics import FocusOptics, depth_of_focus, distance_of
 from dm_client import DeformableMirrorError
 from dm_common.ros import qos
 from dm_common.ros.worker import WorkerService
-from dm_tools.recording.bag_reader import BagReader
+from dm_tools.recording.bag import BagReader
 from dm_tools.recording.player import play
 from dm_tools.recording.recorder import Recorder
 from documentation import unexplained

@@ -11,6 +11,8 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,10 +30,10 @@ from dm_common.ros.domains import own_domain
 from dm_tools import cli, output, running_suite
 from dm_tools.output import NotRunningError, write_json
 from dm_tools.running_suite import SettledShape, holder, naming_holder, settled_shape, verdict
-from dm_tools.verbs import console as verb_console
 from dm_tools.verbs import status as verb_status
 from dm_tools.verbs.console import console
 from dm_tools.verbs.focus import _show
+from dm_tools.verbs.replay import replay
 from dm_tools.verbs.report import folder_with, newest_store
 from dm_tools.verbs.up import end, first_command, lacks, only_suite
 from test_console_external_goals import EXECUTING, FakeNode, Goal
@@ -52,12 +54,25 @@ def parsed(verb: str, *words: str) -> dict[str, Any]:
     return params
 
 
-def test_a_console_without_nicegui_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For which rosdep has no key."""
-    monkeypatch.delitem(sys.modules, "dm_tools.console.page", raising=False)
-    monkeypatch.setitem(sys.modules, "nicegui", None)
-    with pytest.raises(RuntimeError, match="pip install nicegui"):
-        console()
+@pytest.mark.parametrize(
+    ("library", "module", "use", "text"),
+    [
+        ("nicegui", "dm_tools.console.page", console, "the console needs NiceGUI: `pip install nicegui`"),
+        (
+            "rosbags",
+            "dm_tools.recording.bag",
+            partial(replay, Path()),
+            "recordings need rosbags: `pip install ",
+        ),
+    ],
+)
+def test_what_rosdep_has_no_key_for_is_named(
+    monkeypatch: pytest.MonkeyPatch, library: str, module: str, use: Callable[[], None], text: str
+) -> None:
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(RuntimeError, match=text):
+        use()
 
 
 @pytest.mark.parametrize("words", [("-0.02",), ("-0.02", "--dry-run"), ("--conic", "-1", "-2e-2"), ("--", "-.02")])
@@ -335,11 +350,3 @@ def test_it_is_a_command_of_ros2_too(
     shown = capsys.readouterr()
     assert ended.value.code == status
     assert re.search(said, shown.out + shown.err, re.DOTALL)
-
-
-def test_the_console_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """rosdep has no key for NiceGUI."""
-    monkeypatch.setitem(sys.modules, "nicegui", None)
-    monkeypatch.delitem(sys.modules, "dm_tools.console.page", raising=False)
-    with pytest.raises(RuntimeError, match="the console needs NiceGUI: `pip install nicegui`"):
-        verb_console.console(0)

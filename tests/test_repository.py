@@ -88,12 +88,11 @@ KEYS = {
             *("rich", "scipy", "serial", "typer", "yaml"),
         )
     },
-    "mcap": "mcap-ros2-support",
     "PIL": "python3-pil",
 }
 #: Modules that rosdep does not know; the package's README, or the test that needs one, says how to install them.
-#: Starlette comes with NiceGUI.
-WITHOUT_KEY = {"nicegui", "starlette", "statsmodels", "Pyro4", "microscope"}
+#: Starlette comes with NiceGUI, backports.zstd with rosbags.
+WITHOUT_KEY = {"nicegui", "starlette", "rosbags", "backports", "statsmodels", "Pyro4", "microscope"}
 
 
 @pytest.mark.parametrize("package", [path.name for path in SOURCE.iterdir() if (path / "package.xml").is_file()])

@@ -1,32 +1,34 @@
-"""A recording on disk: a folder with one MCAP file and `metadata.yaml`, as rosbag2 of ROS 2 Jazzy writes it.
+"""Recordings on disk, through the library rosbags: a folder as rosbag2 of ROS 2 Jazzy writes it. Knows no node.
 
-So `ros2 bag info`, `ros2 bag play` and Foxglove read it. MCAP profile `ros2`; definitions as `ros2msg`; the quality of
-service that publishers offered in each channel's metadata. Knows no node.
+So `ros2 bag info`, `ros2 bag play` and Foxglove read ours, and we read theirs.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import yaml
-from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
-from mcap.writer import CompressionType, Writer
+try:
+    from backports import zstd
+    from rosbags import interfaces
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+    from rosbags.rosbag2.storage_mcap import McapWriter
+except ModuleNotFoundError as error:  # rosdep has no key for it
+    raise RuntimeError("recordings need rosbags: `pip install rosbags`, see docs/install.md") from error
 
-from dm_common.atomic_write import write_whole
+#: Key of the nodes' parameters in the custom data of a recording.
+PARAMETERS_KEY = "node_parameters"
+#: The library writes no checksums of its own; those of zstd are checked by whoever decompresses.
+CHECKED = {int(zstd.CompressionParameter.checksum_flag): 1}
 
-SUFFIX = ".mcap"
-METADATA_FILE = "metadata.yaml"
-INFORMATION = "rosbag2_bagfile_information"
-#: Version of rosbag2's metadata in ROS 2 Jazzy: quality of service as words.
-METADATA_VERSION = 9
-#: MCAP metadata record that rosbag2 looks for, and ours with the nodes' parameters.
-ROSBAG_RECORD, PARAMETERS_RECORD = "rosbag2", "node_parameters"
-#: Key in a channel's metadata.
-QOS_KEY, HASH_KEY = "offered_qos_profiles", "topic_type_hash"
+
+class BagError(ValueError):
+    """The recording cannot be read; the message says which and why."""
 
 
 @dataclass(frozen=True)
@@ -36,25 +38,23 @@ class Topic:
     Attributes:
         name: absolute.
         type_name: ``package/msg/Type``.
-        qos: one mapping per publisher, in the words of rosbag2 (history, depth, reliability, durability, ...).
-        type_hash: ``RIHS01_...``; "" = not known.
+        qos: what each publisher offered.
+        type_hash: ``RIHS01_...``; anything else = not known.
     """
 
     name: str
     type_name: str
-    qos: Sequence[Mapping[str, Any]]
-    type_hash: str = ""
+    qos: Sequence[interfaces.Qos]
+    type_hash: str
 
 
-class _Dumper(yaml.SafeDumper):
-    """Without anchors for what stands there twice, which no reader of recordings expects."""
+@dataclass(frozen=True)
+class Message:
+    """One recorded message: serialised as CDR, received at `log_time`, ns."""
 
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def _as_yaml(value: Any) -> str:
-    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False))
+    topic: Topic
+    data: bytes
+    log_time: int
 
 
 class BagWriter:
@@ -69,63 +69,36 @@ class BagWriter:
         """
         if folder.exists():
             raise FileExistsError(f"{folder}: exists already; a recording is never overwritten")
-        folder.mkdir(parents=True)
         self.folder = folder
-        self.file = folder / f"{folder.name}_0{SUFFIX}"
-        self._stream = self.file.open("wb")
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
-        self._writer.start(profile=Profile.ROS2)
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-        self._topics: dict[str, Topic] = {}
-        self._counts: dict[str, int] = {}
-        self._first = self._last = 0
-
-    @property
-    def messages(self) -> int:
-        """Messages written so far."""
-        return sum(self._counts.values())
+        self._writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer.open()
+        assert isinstance(self._writer.storage, McapWriter)
+        self._writer.storage.compressor = partial(zstd.compress, options=CHECKED)
+        self._connections: dict[str, interfaces.Connection] = {}
 
     @property
     def counts(self) -> dict[str, int]:
         """Messages of each topic by name."""
-        return dict(self._counts)
+        return {name: self._writer.counts[each.id] for name, each in self._connections.copy().items()}
 
     def add_topic(self, topic: Topic, definition: str) -> None:
-        """Announce a topic with the definition of its type; again = nothing happens."""
-        if topic.name in self._channels:
-            return
-        if topic.type_name not in self._schemas:
-            self._schemas[topic.type_name] = self._writer.register_schema(
-                topic.type_name, SchemaEncoding.ROS2, definition.encode()
-            )
-        metadata = {QOS_KEY: _as_yaml(list(topic.qos)), HASH_KEY: topic.type_hash}
-        self._channels[topic.name] = self._writer.register_channel(
-            topic.name, MessageEncoding.CDR, self._schemas[topic.type_name], metadata
+        """Announce a topic with the definition of its type."""
+        self._connections[topic.name] = self._writer.add_connection(
+            topic.name, topic.type_name, msgdef=definition, rihs01=topic.type_hash, offered_qos_profiles=topic.qos
         )
-        self._topics[topic.name], self._counts[topic.name] = topic, 0
 
-    def write(self, name: str, data: bytes, log_time: int, publish_time: int) -> None:
-        """Write one message of the topic `name`, announced before; times in ns."""
-        self._writer.add_message(self._channels[name], log_time, data, publish_time, self._counts[name])
-        self._counts[name] += 1
-        self._first = min(self._first or log_time, log_time)
-        self._last = max(self._last, log_time)
+    def write(self, name: str, data: bytes, log_time: int) -> None:
+        """Write one message of the topic `name`, announced before; the time in ns."""
+        self._writer.write(self._connections[name], log_time, data)
 
     def add_parameters(self, parameters: Mapping[str, Mapping[str, Any]]) -> None:
         """Keep the parameters of nodes, by node name."""
-        self._writer.add_metadata(
-            PARAMETERS_RECORD, {node: json.dumps(dict(values)) for node, values in parameters.items()}
-        )
+        self._writer.set_custom_data(PARAMETERS_KEY, json.dumps(parameters))
 
     def close(self) -> None:
         """Finish the file and write the metadata."""
-        if self._stream.closed:
-            return
-        self._writer.add_metadata(ROSBAG_RECORD, {"serialized_metadata": _as_yaml(self._metadata())})
-        self._writer.finish()
-        self._stream.close()
-        write_whole(self.folder / METADATA_FILE, _as_yaml({INFORMATION: self._metadata()}).encode())
+        self._writer.close()
 
     def __enter__(self) -> BagWriter:
         return self
@@ -133,38 +106,73 @@ class BagWriter:
     def __exit__(self, *_error: object) -> None:
         self.close()
 
-    def _metadata(self) -> dict[str, Any]:
-        duration, start = {"nanoseconds": self._last - self._first}, {"nanoseconds_since_epoch": self._first}
-        return {
-            "version": METADATA_VERSION,
-            "storage_identifier": "mcap",
-            "duration": duration,
-            "starting_time": start,
-            "message_count": self.messages,
-            "topics_with_message_count": [
-                {
-                    "topic_metadata": {
-                        "name": topic.name,
-                        "type": topic.type_name,
-                        "serialization_format": MessageEncoding.CDR,
-                        "offered_qos_profiles": list(topic.qos),
-                        "type_description_hash": topic.type_hash,
-                    },
-                    "message_count": self._counts[topic.name],
-                }
-                for topic in self._topics.values()
-            ],
-            "compression_format": "",
-            "compression_mode": "",
-            "relative_file_paths": [self.file.name],
-            "files": [
-                {
-                    "path": self.file.name,
-                    "starting_time": start,
-                    "duration": duration,
-                    "message_count": self.messages,
-                }
-            ],
-            "custom_data": None,
-            "ros_distro": "jazzy",
-        }
+
+class BagReader:
+    """Reads a recording, ours or one of `ros2 bag record`: a folder, or a file of it, which stands for all of them.
+
+    Attributes:
+        path: where it is.
+        topics, counts: topics, and numbers of their messages, by name.
+        messages: of all topics.
+        duration_s: from the first message to the last.
+        parameters: of the nodes when the recording began, by node name; empty when it has none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open what is at `path`.
+
+        Raises:
+            BagError: no recording there, or none that can be read.
+        """
+        whole = path.parent if path.with_name("metadata.yaml").is_file() else path
+        self.path = path if path.is_dir() else whole
+        with self._opened() as reader:
+            self.topics = {
+                each.topic: Topic(each.topic, each.msgtype, each.ext.offered_qos_profiles, each.digest)
+                for each in reader.connections
+                if isinstance(each.ext, interfaces.ConnectionExtRosbag2)
+            }
+            self.counts = {each.topic: each.msgcount for each in reader.connections}
+            self.messages = reader.message_count
+            self.duration_s = 1e-9 * max(0, reader.duration - 1)
+            custom = reader.storage.metadata.custom or {}
+            self.parameters: dict[str, dict[str, Any]] = json.loads(custom.get(PARAMETERS_KEY, "{}"))
+
+    def read(self, names: Sequence[str] | None = None) -> Iterator[Message]:
+        """Messages in the order received; `names` = only of these topics.
+
+        Raises:
+            BagError: the file is damaged.
+        """
+        with self._opened() as reader:
+            chosen = [each for each in reader.connections if names is None or each.topic in names]
+            for connection, time, data in reader.messages(chosen) if chosen else ():
+                yield Message(self.topics[connection.topic], data, time)
+
+    @contextmanager
+    def _opened(self) -> Iterator[Reader]:
+        """The recording open; what goes wrong while it is read becomes BagError."""
+        try:
+            with Reader(self.path) as reader:
+                yield reader
+        except Exception as error:  # where a file is damaged, the library fails in many ways
+            raise BagError(f"{self.path}: no recording, not finished or damaged: {error}") from error
+
+
+def offered(profile: Any) -> interfaces.Qos:
+    """What a publisher offers, a `QoSProfile`, as it is recorded."""
+
+    def seconds(duration: Any) -> interfaces.QosTime:
+        return interfaces.QosTime(*divmod(int(duration.nanoseconds), 10**9))
+
+    return interfaces.Qos(
+        history=interfaces.QosHistory[profile.history.name],
+        depth=profile.depth,
+        reliability=interfaces.QosReliability[profile.reliability.name],
+        durability=interfaces.QosDurability[profile.durability.name],
+        deadline=seconds(profile.deadline),
+        lifespan=seconds(profile.lifespan),
+        liveliness=interfaces.QosLiveliness[profile.liveliness.name],
+        liveliness_lease_duration=seconds(profile.liveliness_lease_duration),
+        avoid_ros_namespace_conventions=profile.avoid_ros_namespace_conventions,
+    )

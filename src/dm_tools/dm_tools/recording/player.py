@@ -8,8 +8,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from dm_tools.recording.bag import Topic
-from dm_tools.recording.bag_reader import BagReader
+from dm_tools.recording.bag import BagReader, Topic
 from dm_tools.recording.interfaces import message_class
 
 #: Topics that would move a real mirror; published only when asked for.
@@ -96,10 +95,8 @@ def _has_changed(node: Node, topic: Topic) -> bool:
 def _offer(topic: Topic) -> QoSProfile:
     """The quality of service that the recorded publishers had in common."""
 
-    def all_are(key: str, value: str) -> bool:
-        return bool(topic.qos) and all(profile.get(key) == value for profile in topic.qos)
-
-    loose, latched = all_are("reliability", "best_effort"), all_are("durability", "transient_local")
+    loose = {profile.reliability.name for profile in topic.qos} == {"BEST_EFFORT"}
+    latched = {profile.durability.name for profile in topic.qos} == {"TRANSIENT_LOCAL"}
     return QoSProfile(
         depth=DEPTH,
         reliability=ReliabilityPolicy.BEST_EFFORT if loose else ReliabilityPolicy.RELIABLE,

@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 
 from dm_bringup.nodes import NAMES
-from dm_tools.recording.bag import BagWriter, Topic
+from dm_tools.recording.bag import BagWriter, Topic, offered
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 
 #: How often new topics are looked for, s.
@@ -32,7 +32,7 @@ SPIN_S = 0.1
 #: Topics of the maps themselves, several megabytes each; what is fitted to them is on others.
 MAP_TOPIC = "surface_map"
 
-_Item = tuple[str, bytes, int, int] | tuple[Topic, str]
+_Item = tuple[str, bytes, int] | tuple[Topic, str]
 
 
 class Recorder:
@@ -156,16 +156,15 @@ class Recorder:
             return  # nobody says what it is like yet
         self._subscribed.add(name)
         profiles = [publisher.qos_profile for publisher in publishers]
-        topic = Topic(name, type_name, [_in_words(profile) for profile in profiles], str(publishers[0].topic_type_hash))
+        topic = Topic(name, type_name, [offered(profile) for profile in profiles], str(publishers[0].topic_type_hash))
         try:
             self._queue.put((topic, definition(type_name)))
         except UnknownTypeError as error:
             self.refused[name] = str(error)
             return
 
-        def take(data: bytes, info: Any) -> None:
-            now = time.time_ns()
-            self._queue.put((name, data, now, int(info["source_timestamp"]) or now))
+        def take(data: bytes) -> None:
+            self._queue.put((name, data, time.time_ns()))
 
         self._node.create_subscription(message_class(type_name), name, take, _request(profiles), raw=True)
 
@@ -230,23 +229,3 @@ def _request(offered: Sequence[QoSProfile]) -> QoSProfile:
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
-
-
-def _in_words(profile: QoSProfile) -> dict[str, Any]:
-    """A profile as rosbag2 writes it."""
-    return {
-        "history": profile.history.name.lower(),
-        "depth": profile.depth,
-        "reliability": profile.reliability.name.lower(),
-        "durability": profile.durability.name.lower(),
-        "deadline": _seconds(profile.deadline),
-        "lifespan": _seconds(profile.lifespan),
-        "liveliness": profile.liveliness.name.lower(),
-        "liveliness_lease_duration": _seconds(profile.liveliness_lease_duration),
-        "avoid_ros_namespace_conventions": profile.avoid_ros_namespace_conventions,
-    }
-
-
-def _seconds(duration: Any) -> dict[str, int]:
-    seconds, rest = divmod(int(duration.nanoseconds), 10**9)
-    return {"sec": seconds, "nsec": rest}

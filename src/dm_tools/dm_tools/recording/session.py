@@ -20,7 +20,7 @@ from dm_common.messages import measurement_from, mirror_from, stamp_ns
 from dm_common.mirror import Mirror
 from dm_controller.planning.active_calibration import model_of
 from dm_controller.solvers.base import points_of
-from dm_tools.recording.bag_reader import BagReader, Message
+from dm_tools.recording.bag import BagReader, Message
 from dm_tools.recording.interfaces import message_class
 
 #: Topics that a calibration is made again from; the last part of their names.
@@ -86,14 +86,14 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     if missing:
         hint = " (`ros2 bag record` with --include-hidden-topics)" if FEEDBACK in missing else ""
         raise RecordingError(
-            f"{bag.file}: no topic {', '.join(prefix + name for name in missing)}: record them all{hint}"
+            f"{bag.path}: no topic {', '.join(prefix + name for name in missing)}: record them all{hint}"
         )
     received: dict[str, list[tuple[int, Any]]] = {name: [] for name in TOPICS}
     for message in bag.read([prefix + name for name in TOPICS]):
         received[message.topic.name.removeprefix(prefix)].append((message.log_time, _decode(message)))
     runs = _runs(received[FEEDBACK])
     if not runs:
-        raise RecordingError(f"{bag.file}: no calibration was run in it (no message on {prefix}{FEEDBACK})")
+        raise RecordingError(f"{bag.path}: no calibration was run in it (no message on {prefix}{FEEDBACK})")
     if not 0 <= number <= len(runs):
         raise RecordingError(f"run {number}: the recording has 1 to {len(runs)}; 0 = the last")
     index = (number or len(runs)) - 1
@@ -101,7 +101,7 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     end = runs[index + 1].begun if index + 1 < len(runs) else np.iinfo(np.int64).max
     mirrors = [info for time, info in received["mirror_info"] if time <= chosen.ended]
     if not mirrors:
-        raise RecordingError(f"{bag.file}: no mirror_info before the run ended: begin the recording earlier")
+        raise RecordingError(f"{bag.path}: no mirror_info before the run ended: begin the recording earlier")
     mirror = mirror_from(mirrors[-1])
     maps = _maps(received, chosen.begun, end)
     moves = [move for time, move in _moves(received["actuator_state"], mirror) if chosen.begun <= time < end]

@@ -31,7 +31,7 @@ def replay(
     json: JsonOption = None,
 ) -> None:
     """Publish a recording's topics with their own timing, or make its calibration again, to the last bit."""
-    from dm_tools.recording.bag_reader import BagReader
+    from dm_tools.recording.bag import BagReader
     from dm_tools.recording.player import play, replayed
 
     bag = BagReader(recording)
@@ -51,7 +51,7 @@ def replay(
         )
     count, left_out = sum(counts.values()), sorted(set(names) - counts.keys())
     console.print(f"{count} messages published")
-    figures = {"recording": str(bag.file), "messages": count, "topics": sorted(counts), "left_out": left_out}
+    figures = {"recording": str(bag.path), "messages": count, "topics": sorted(counts), "left_out": left_out}
     write_json(json, figures)
 
 
