@@ -7,14 +7,16 @@ SHELL ["/bin/bash", "-c"]
 WORKDIR /workspace
 
 # Dependencies first: they change less often than the code. rosdep has no key for statsmodels, NiceGUI and rosbags, and
-# brings a typer that does not guess what was mistyped. Pip cannot remove what apt has installed, hence --ignore-installed.
+# brings a typer that does not guess what was mistyped. Pip cannot remove what apt has installed, hence
+# --ignore-installed; and rosbags must not bring a NumPy that the compiled messages do not go with.
 COPY src src
 COPY requirements requirements
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3-pip python3-statsmodels \
     && rosdep update --rosdistro jazzy \
     && rosdep install --from-paths src --ignore-src --rosdistro jazzy -y \
-    && grep -E "^(nicegui|rosbags|typer)==" requirements/python.txt | xargs pip install --no-cache-dir --ignore-installed \
+    && grep -E "^(nicegui|rosbags|typer)==" requirements/python.txt \
+       | xargs pip install --no-cache-dir --ignore-installed -c requirements/sourced-ros.txt \
     && rm -rf /var/lib/apt/lists/*
 
 RUN source /opt/ros/jazzy/setup.bash && colcon build --base-paths src \
