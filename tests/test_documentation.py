@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -257,7 +258,6 @@ class Scene:
     def watch(self, command: str, words: str, domain: int | None = None) -> None:
         """Start, wait for `words`, press Ctrl-C; it must end well, or as a command that was interrupted."""
         log = self.folder / "watched.log"
-        listeners = self.client.node.count_subscribers("actuator_state")
         process = self.start(shlex.split(command), log, domain)
         try:
             wait_until(
@@ -265,7 +265,8 @@ class Scene:
             )
             assert process.poll() is None, log.read_text(errors="replace")
             if command.startswith("./dm record"):  # it fails when there was nothing to record
-                wait_until(lambda: self.client.node.count_subscribers("actuator_state") > listeners, 150.0)
+                heard = partial(self.client.node.get_subscriptions_info_by_topic, "/actuator_state")
+                wait_until(lambda: any(each.node_name.startswith("dm_recorder_") for each in heard()), 150.0)
             time.sleep(2.0)  # a moment of work, not only of starting
             process.send_signal(signal.SIGINT)
             assert process.wait(60.0) in (0, INTERRUPTED), log.read_text(errors="replace")
