@@ -8,15 +8,15 @@ WORKDIR /workspace
 
 # Dependencies first: they change less often than the code. rosdep has no key for statsmodels, NiceGUI and rosbags, and
 # brings a typer that does not guess what was mistyped. Pip cannot remove what apt has installed, hence
-# --ignore-installed; and rosbags must not bring a NumPy that the compiled messages do not go with.
+# --ignore-installed; but rosbags takes the NumPy of apt, which the compiled messages go with.
 COPY src src
 COPY requirements requirements
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3-pip python3-statsmodels \
     && rosdep update --rosdistro jazzy \
     && rosdep install --from-paths src --ignore-src --rosdistro jazzy -y \
-    && grep -E "^(nicegui|rosbags|typer)==" requirements/python.txt \
-       | xargs pip install --no-cache-dir --ignore-installed -c requirements/sourced-ros.txt \
+    && grep -E "^(nicegui|typer)==" requirements/python.txt | xargs pip install --no-cache-dir --ignore-installed \
+    && grep "^rosbags==" requirements/python.txt | xargs pip install --no-cache-dir -c requirements/sourced-ros.txt \
     && rm -rf /var/lib/apt/lists/*
 
 RUN source /opt/ros/jazzy/setup.bash && colcon build --base-paths src \

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import subprocess
 import sys
 import time
@@ -23,19 +24,22 @@ from dm_msgs.msg import (
     SurfaceSamples,
     ZernikeCoefficients,
 )
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from described_mirror import mirror_info_of
 from dm_calibration.calibration_messages import calibration_message
+from dm_calibration.calibration_parameters import PARAMETERS
 from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, PlanOptions
 from dm_calibration.procedure.recorded_run import RecordedRun, RecordingError
 from dm_common.messages import doubles, time_message
 from dm_common.ros import qos
-from dm_tools.recording.bag import BagError, BagReader, BagWriter, Message, Topic, offered
+from dm_tools.recording.bag import PARAMETER_EVENTS, BagError, BagReader, BagWriter, Message, Topic, offered
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 from dm_tools.recording.player import play, replayed
 from dm_tools.recording.recorder import Recorder
@@ -49,23 +53,22 @@ FEEDBACK_TYPE = "dm_msgs/action/Calibrate_FeedbackMessage"
 OTHER_LAYOUT = "RIHS01_" + 64 * "0"
 
 
-def write_bag(folder: Path, messages: list[tuple[str, Any]], parameters: dict[str, Any] | None = None) -> BagReader:
+def write_bag(folder: Path, messages: list[tuple[str, Any]]) -> BagReader:
     """A recording of (topic, message) pairs, a millisecond apart; what is on `/old` had another layout."""
     with BagWriter(folder) as bag:
         for number, (name, message) in enumerate(messages, start=1):
             kind = type(message)
             action = kind.__name__ == "Calibrate_FeedbackMessage"
-            type_name = FEEDBACK_TYPE if action else f"dm_msgs/msg/{kind.__name__}"
+            type_name = FEEDBACK_TYPE if action else f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
             if name not in bag.counts:
                 type_hash = OTHER_LAYOUT if name == "/old" else "INVALID"
                 bag.add_topic(Topic(name, type_name, [offered(qos.STATE)], type_hash), definition(type_name))
             bag.write(name, serialize_message(message), number * 10**6)
-        bag.add_parameters({"/calibration": parameters} if parameters else {})
     return BagReader(folder)
 
 
 def write_rosbag2(folder: Path, messages: list[Message], storage: str) -> None:
-    """A recording of another tool, which asks no node for its parameters."""
+    """A recording of another tool, which asks no node for its parameters; the hashes of types are not known."""
     with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag:
         topics = {message.topic.name: message.topic for message in messages}
         connections = {
@@ -129,7 +132,10 @@ def run_and_bag(tmp_path_factory: pytest.TempPathFactory) -> tuple[RecordedRun, 
     live = calibrate(outcome, mirror=run.mirror, options=FitOptions(), provenance=Provenance("live", 1))
     message = calibration_message(live, None, "mirror", 32e-9)
     folder = tmp_path_factory.mktemp("bag") / "session"
-    bag = write_bag(folder, [*session_messages(run), ("/calibration", message)], {"poke_amplitude": 0.4})
+    values = {parameter.name: parameter.default for parameter in PARAMETERS} | {"poke_amplitude": 0.4}
+    told = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    event = (PARAMETER_EVENTS, ParameterEvent(node="/calibration", new_parameters=told))
+    bag = write_bag(folder, [*session_messages(run), event, ("/calibration", message)])
     return run, message, bag
 
 
@@ -149,14 +155,15 @@ def test_a_recording_of_rosbag2_gives_the_same_calibration(
 ) -> None:
     _run, live, ours = run_and_bag
     folder = tmp_path / "theirs"
-    write_rosbag2(folder, list(ours.read()), storage)
+    names = [name for name in ours.topics if name != PARAMETER_EVENTS]
+    write_rosbag2(folder, list(ours.read(names)), storage)
     theirs = BagReader(folder)
-    assert theirs.counts == ours.counts and theirs.messages == ours.messages
-    assert theirs.duration_s == ours.duration_s and theirs.topics.keys() == ours.topics.keys()
+    assert theirs.counts == {name: ours.counts[name] for name in names}
+    assert theirs.messages == ours.messages - 1 and theirs.duration_s == ours.duration_s
     assert theirs.topics["/zernike"].qos == [offered(qos.STATE)]
     assert [message.data for message in theirs.read(["/zernike"])] == [m.data for m in ours.read(["/zernike"])]
     session = read_session(theirs)
-    assert "does not hold the parameters" in session.remarks[0]  # which rosbag2 does not ask for
+    assert "does not hold all parameters" in session.remarks[0]  # which rosbag2 does not ask for
     session.parameters["poke_amplitude"] = 0.4
     assert differences(recalibrate(session, "again", 2), live) == []
 
@@ -207,7 +214,8 @@ def test_the_command_recalibrates_and_stores(run_and_bag: tuple[RecordedRun, Any
 def test_the_command_takes_parameters_that_a_recording_of_rosbag2_does_not_hold(
     run_and_bag: tuple[RecordedRun, Any, BagReader], tmp_path: Path
 ) -> None:
-    write_rosbag2(tmp_path / "theirs", list(run_and_bag[2].read()), "mcap")
+    held = [message for message in run_and_bag[2].read() if message.topic.name != PARAMETER_EVENTS]
+    write_rosbag2(tmp_path / "theirs", held, "mcap")
     config = tmp_path / "bench.yaml"
     config.write_text("/**/calibration: {ros__parameters: {poke_amplitude: 0.4}}\n")
     figures = _again(BagReader(tmp_path / "theirs"), 0, "", None, config)
@@ -236,30 +244,73 @@ def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
         BagWriter(tmp_path / "bag")
 
 
-@pytest.mark.parametrize("damage", ["cut", "bit", "foreign", "absent"])
+def flipped(content: bytes, at: int) -> bytes:
+    """With another last bit of one byte."""
+    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+
+
+@pytest.mark.parametrize("damage", ["cut", "bit", "index", "foreign", "absent"])
 def test_a_damaged_recording_is_refused(tmp_path: Path, damage: str) -> None:
     noise = np.random.default_rng(1).normal(size=(50, 63))  # which compression keeps as it is
     write_bag(tmp_path / "bag", [("/actuator_state", ActuatorState(applied=doubles(row))) for row in noise])
     (file,) = (tmp_path / "bag").glob("*.mcap")
     content = file.read_bytes()
-    middle = len(content) // 2
+    span = struct.pack("<QQ", 10**6, 50 * 10**6)  # of time: last in the statistics, before that in the index
+    middle, index = len(content) // 2, content.rindex(span, 0, content.rindex(span))
     damaged = {
         "cut": content[:middle],
-        "bit": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+        "bit": flipped(content, middle),
+        "index": flipped(content, index),
         "foreign": b"no recording at all",
     }
     if damage == "absent":
         file.unlink()
     else:
         file.write_bytes(damaged[damage])
-    with pytest.raises(BagError, match="bag: no recording, not finished or damaged: "):
+    with pytest.raises(BagError, match="bag: no recording, or damaged: "):
         list(BagReader(tmp_path / "bag").read())
 
 
-def test_a_file_stands_for_its_recording(run_and_bag: tuple[RecordedRun, Any, BagReader]) -> None:
-    """By itself it knows neither parameters nor the hashes of types."""
-    (file,) = run_and_bag[2].path.glob("*.mcap")
-    assert BagReader(file).parameters == run_and_bag[2].parameters != {}
+def test_what_was_told_of_a_topic_elsewhere_hides_no_message(tmp_path: Path) -> None:
+    """The metadata of genuine recordings may tell another quality of service than the file does."""
+    write_bag(tmp_path / "bag", [("/actuator_state", ActuatorState())])
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    text = metadata.read_text()
+    assert "reliability: reliable" in text
+    metadata.write_text(text.replace("reliability: reliable", "reliability: best_effort"))
+    bag = BagReader(tmp_path / "bag")
+    assert bag.messages == len(list(bag.read())) == 1
+
+
+def test_a_file_by_itself_is_a_recording(tmp_path: Path) -> None:
+    """And stands for the whole, which knows the hashes of types, where it is the only one."""
+    write_bag(tmp_path / "bag", [("/old", ActuatorState())])
+    (file,) = (tmp_path / "bag").glob("*.mcap")
+    assert BagReader(file).topics["/old"].type_hash == OTHER_LAYOUT
+    copied = tmp_path / "copied.mcap"
+    copied.write_bytes(file.read_bytes())
+    assert BagReader(copied).messages == len(list(BagReader(copied).read())) == 1
+
+
+def test_a_recording_that_was_cut_off_replays_what_is_whole_in_it(tmp_path: Path) -> None:
+    """As when the recorder was killed, or power failed while the file was written."""
+    (tmp_path / "cut").mkdir()
+    kind, cut = "dm_msgs/msg/ActuatorState", tmp_path / "cut" / "bag.mcap"
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic(Topic("/actuator_state", kind, [offered(qos.STATE)], "INVALID"), definition(kind))
+        for second in range(30):
+            writer.write("/actuator_state", serialize_message(ActuatorState(sequence=second)), second * 10**9)
+        content = (tmp_path / "bag" / "bag.mcap").read_bytes()
+    for length in range(len(content), 8, -50):
+        cut.write_bytes(content[:length])
+        bag = BagReader(cut.parent)
+        sequences = [deserialize_message(message.data, ActuatorState).sequence for message in bag.read()]
+        assert sequences == list(range(bag.messages)) and bag.unfinished == [str(cut)]
+        assert length < len(content) or bag.messages >= 24, "all but the last seconds"
+        assert bag.duration_s == pytest.approx(max(0, bag.messages - 1))
+    cut.write_bytes(flipped(content, content.rindex(b"zstd") + 40))  # in the last chunk
+    with pytest.raises(BagError, match="cut: no recording, or damaged"):
+        BagReader(cut.parent)
 
 
 def test_commands_are_held_back() -> None:
@@ -317,9 +368,12 @@ def test_parameters_of_the_nodes_are_recorded(
     start: Callable[..., Any], observer: Observer, domain: int, tmp_path: Path
 ) -> None:
     start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path / "store"), "poke_amplitude": 0.31})
-    with Recorder(tmp_path / "bag", domain=domain) as recorder:
-        wait_until(lambda: "weak_share" in recorder.parameters.get("/calibration", {}), 60, "parameters")
-    assert BagReader(tmp_path / "bag").parameters["/calibration"]["poke_amplitude"] == 0.31
+    wait_until(lambda: "/calibration/get_parameters" in dict(observer.node.get_service_names_and_types()), 60, "node")
+    with Recorder(tmp_path / "bag", topics=["nothing"], domain=domain) as recorder:
+        wait_until(lambda: recorder.counts.get(PARAMETER_EVENTS), 60, "parameters")
+    told = [deserialize_message(each.data, ParameterEvent) for each in BagReader(tmp_path / "bag").read()]
+    values = {each.name: each.value.double_value for event in told for each in event.new_parameters}
+    assert values["poke_amplitude"] == 0.31 and values.keys() >= {parameter.name for parameter in PARAMETERS}
 
 
 def test_a_recording_is_published_again(observer: Observer, domain: int, tmp_path: Path) -> None:

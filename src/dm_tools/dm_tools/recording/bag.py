@@ -5,9 +5,9 @@ So `ros2 bag info`, `ros2 bag play` and Foxglove read ours, and we read theirs.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,12 +17,17 @@ try:
     from backports import zstd
     from rosbags import interfaces
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
-    from rosbags.rosbag2.storage_mcap import McapWriter
+    from rosbags.rosbag2.storage_mcap import McapReader, McapWriter
 except ModuleNotFoundError as error:  # rosdep has no key for it
     raise RuntimeError("recordings need rosbags: `pip install rosbags`, see docs/install.md") from error
 
-#: Key of the nodes' parameters in the custom data of a recording.
-PARAMETERS_KEY = "node_parameters"
+METADATA_FILE, SUFFIX = "metadata.yaml", ".mcap"
+#: What an MCAP file begins with, and ends with when it was finished.
+MAGIC = b"\x89MCAP0\r\n"
+#: Topic that tells the parameters of nodes.
+PARAMETER_EVENTS = "/parameter_events"
+#: What was recorded reaches the file at least so often, ns; the rest is lost when the recorder is killed.
+FLUSH_NS = 5 * 10**9
 #: The library writes no checksums of its own; those of zstd are checked by whoever decompresses.
 CHECKED = {int(zstd.CompressionParameter.checksum_flag): 1}
 
@@ -76,6 +81,7 @@ class BagWriter:
         assert isinstance(self._writer.storage, McapWriter)
         self._writer.storage.compressor = partial(zstd.compress, options=CHECKED)
         self._connections: dict[str, interfaces.Connection] = {}
+        self._flushed = 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -91,10 +97,12 @@ class BagWriter:
     def write(self, name: str, data: bytes, log_time: int) -> None:
         """Write one message of the topic `name`, announced before; the time in ns."""
         self._writer.write(self._connections[name], log_time, data)
-
-    def add_parameters(self, parameters: Mapping[str, Mapping[str, Any]]) -> None:
-        """Keep the parameters of nodes, by node name."""
-        self._writer.set_custom_data(PARAMETERS_KEY, json.dumps(parameters))
+        if abs(log_time - self._flushed) > FLUSH_NS:
+            storage = self._writer.storage
+            assert isinstance(storage, McapWriter)
+            storage.close_chunk()
+            storage.bio.flush()
+            self._flushed = log_time
 
     def close(self) -> None:
         """Finish the file and write the metadata."""
@@ -108,14 +116,14 @@ class BagWriter:
 
 
 class BagReader:
-    """Reads a recording, ours or one of `ros2 bag record`: a folder, or a file of it, which stands for all of them.
+    """Reads a recording, ours or one of `ros2 bag record`: a folder, of one or several files, or one file of it.
 
     Attributes:
         path: where it is.
         topics, counts: topics, and numbers of their messages, by name.
         messages: of all topics.
         duration_s: from the first message to the last.
-        parameters: of the nodes when the recording began, by node name; empty when it has none.
+        unfinished: files that have no end (the recorder was killed); what is whole in them is read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,19 +132,20 @@ class BagReader:
         Raises:
             BagError: no recording there, or none that can be read.
         """
-        whole = path.parent if path.with_name("metadata.yaml").is_file() else path
-        self.path = path if path.is_dir() else whole
-        with self._opened() as reader:
-            self.topics = {
-                each.topic: Topic(each.topic, each.msgtype, each.ext.offered_qos_profiles, each.digest)
-                for each in reader.connections
-                if isinstance(each.ext, interfaces.ConnectionExtRosbag2)
-            }
-            self.counts = {each.topic: each.msgcount for each in reader.connections}
-            self.messages = reader.message_count
-            self.duration_s = 1e-9 * max(0, reader.duration - 1)
-            custom = reader.storage.metadata.custom or {}
-            self.parameters: dict[str, dict[str, Any]] = json.loads(custom.get(PARAMETERS_KEY, "{}"))
+        self.path = path
+        self.topics: dict[str, Topic] = {}
+        with self._opened() as readers:
+            for each in [connection for reader in readers for connection in reader.connections]:
+                assert isinstance(each.ext, interfaces.ConnectionExtRosbag2)
+                topic = Topic(each.topic, each.msgtype, each.ext.offered_qos_profiles, each.digest)
+                self.topics.setdefault(each.topic, topic)
+            self.counts = dict.fromkeys(self.topics, 0)
+            for each in [connection for reader in readers for connection in _stored(reader)]:
+                self.counts[each.topic] += each.msgcount
+            self.messages = sum(self.counts.values())
+            lasted = max(reader.end_time for reader in readers) - min(reader.start_time for reader in readers)
+            self.duration_s = 1e-9 * max(0, lasted - 1)
+            self.unfinished = [str(reader.path) for reader in readers if isinstance(reader.storage, _Unfinished)]
 
     def read(self, names: Sequence[str] | None = None) -> Iterator[Message]:
         """Messages in the order received; `names` = only of these topics.
@@ -144,19 +153,77 @@ class BagReader:
         Raises:
             BagError: the file is damaged.
         """
-        with self._opened() as reader:
-            chosen = [each for each in reader.connections if names is None or each.topic in names]
-            for connection, time, data in reader.messages(chosen) if chosen else ():
-                yield Message(self.topics[connection.topic], data, time)
+        missing = sum(count for name, count in self.counts.items() if names is None or name in names)
+        with self._opened() as readers:
+            for reader in readers:  # each begins where the one before ended
+                chosen = [each for each in _stored(reader) if names is None or each.topic in names]
+                for connection, time, data in reader.messages(chosen) if chosen else ():
+                    yield Message(self.topics[connection.topic], data, time)
+                    missing -= 1
+            if missing:  # for no checksum guards the index by which messages are found
+                raise ValueError(f"{missing} messages are missing")
 
     @contextmanager
-    def _opened(self) -> Iterator[Reader]:
-        """The recording open; what goes wrong while it is read becomes BagError."""
+    def _opened(self) -> Iterator[list[Reader]]:
+        """What the recording consists of, open, in order; what goes wrong while it is read becomes BagError."""
         try:
-            with Reader(self.path) as reader:
-                yield reader
+            with ExitStack() as stack:
+                readers = [stack.enter_context(_reader(path)) for path in _parts(self.path)]
+                yield sorted(readers, key=lambda reader: reader.start_time)
         except Exception as error:  # where a file is damaged, the library fails in many ways
-            raise BagError(f"{self.path}: no recording, not finished or damaged: {error}") from error
+            raise BagError(f"{self.path}: no recording, or damaged: {error}") from error
+
+
+class _Unfinished(McapReader):
+    """An MCAP file whose recorder was killed: what is whole in it."""
+
+    messages = McapReader.messages_scan  # there is no index
+
+    def open(self) -> None:
+        """Find the whole records and what is in them."""
+        self.bio, size = self.path.open("rb"), self.path.stat().st_size
+        self.data_start = end = len(MAGIC)
+        while end <= size:
+            self.data_end = self.bio.seek(end)
+            head = self.bio.read(9)  # kind and length
+            end += 9 + (int.from_bytes(head[1:], "little") if len(head) == 9 else size)
+        self.meta_scan()
+        assert self.statistics is not None
+        counts = self.statistics.channel_message_counts
+        self.connections = [each._replace(msgcount=counts.get(each.id, 0)) for each in self.connections]
+        if self.statistics.message_count:
+            start, last = self.statistics.start_time, self.statistics.end_time
+            self.metadata = self.metadata._replace(start_time=start, end_time=last + 1)
+
+
+def _reader(path: Path) -> Reader:
+    """Of a folder with metadata, or of a file."""
+    reader = Reader(path)
+    if path.is_file() and path.suffix == SUFFIX:
+        with path.open("rb") as content:
+            begins = content.read(len(MAGIC)) == MAGIC
+            content.seek(-len(MAGIC), os.SEEK_END)
+            if begins and content.read() != MAGIC:
+                reader.storage = _Unfinished(path)
+    return reader
+
+
+def _stored(reader: Reader) -> list[interfaces.Connection]:
+    """The topics as the files tell them; a folder's metadata may tell another quality of service, or number."""
+    return [each for file in getattr(reader.storage, "storages", [reader.storage]) for each in file.connections]
+
+
+def _parts(path: Path) -> list[Path]:
+    """The folder, if it has metadata, or the files. A file that has a folder to itself is as good as that folder."""
+    if path.is_file():
+        alone = len(list(path.parent.glob(f"*{path.suffix}"))) == 1
+        return [path.parent if alone and path.with_name(METADATA_FILE).is_file() else path]
+    if (path / METADATA_FILE).is_file():
+        return [path]
+    found = [file for suffix in (SUFFIX, ".db3") for file in path.glob(f"*{suffix}")]
+    if not found:
+        raise FileNotFoundError(f"neither {METADATA_FILE} nor a file *{SUFFIX} or *.db3")
+    return found
 
 
 def offered(profile: Any) -> interfaces.Qos:

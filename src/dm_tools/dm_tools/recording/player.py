@@ -8,13 +8,13 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from dm_tools.recording.bag import BagReader, Topic
+from dm_tools.recording.bag import PARAMETER_EVENTS, BagReader, Topic
 from dm_tools.recording.interfaces import message_class
 
 #: Topics that would move a real mirror; published only when asked for.
 COMMANDS = ("actuator_command", "focus_request")
 #: Topics that belong to the nodes of the recording, not to its data.
-HOUSEKEEPING = ("/rosout", "/parameter_events")
+HOUSEKEEPING = ("/rosout", PARAMETER_EVENTS)
 DEPTH = 10
 #: Time for subscribers to find the publishers before the first message, s.
 DISCOVERY_S = 1.0

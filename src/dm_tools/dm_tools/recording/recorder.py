@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rcl_interfaces.msg import Parameter, ParameterEvent
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from dm_bringup.nodes import NAMES
-from dm_tools.recording.bag import BagWriter, Topic, offered
+from dm_tools.recording.bag import PARAMETER_EVENTS, BagWriter, Topic, offered
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 
 #: How often new topics are looked for, s.
@@ -71,7 +72,6 @@ class Recorder:
         rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node(f"dm_recorder_{os.getpid()}", context=self._context)
         self._subscribed: set[str] = set()
-        self._parameters: dict[str, dict[str, Any]] = {}
         self._clients: dict[str, AsyncParameterClient] = {}
         self._discover()
         self._node.create_timer(DISCOVERY_PERIOD_S, self._discover)
@@ -90,11 +90,6 @@ class Recorder:
     def counts(self) -> dict[str, int]:
         """Messages written of each topic so far."""
         return self._bag.counts
-
-    @property
-    def parameters(self) -> dict[str, dict[str, Any]]:
-        """Parameters of the suite's nodes that were found so far."""
-        return dict(self._parameters)
 
     def check(self) -> None:
         """Raise OSError when the recording can no longer be written (disk full, ...)."""
@@ -116,7 +111,6 @@ class Recorder:
         self._context.try_shutdown()
         self._queue.put(None)
         self._writer.join()
-        self._bag.add_parameters(self._parameters)
         self._bag.close()
         self.check()
 
@@ -144,7 +138,7 @@ class Recorder:
 
     def _records(self, name: str) -> bool:
         if self._wanted:
-            return name in self._wanted
+            return name in self._wanted or name == PARAMETER_EVENTS
         if name.rsplit("/", 1)[-1] == MAP_TOPIC and not self._maps:
             return False
         inside = name.startswith(self._namespace) or name.count("/") == 1  # /diagnostics, /rosout, /clock belong to all
@@ -170,6 +164,8 @@ class Recorder:
 
     def _ask_parameters(self) -> None:
         """Ask nodes of the suite for their parameters, once each; answers arrive later."""
+        if PARAMETER_EVENTS not in self._subscribed:
+            return
         for name, namespace in self._node.get_node_names_and_namespaces():
             path = f"{namespace.rstrip('/')}/{name}"
             if name not in NAMES or path in self._clients or not path.startswith(self._namespace):
@@ -182,23 +178,23 @@ class Recorder:
             listed.add_done_callback(lambda future, path=path: self._on_listed(path, future))
 
     def _on_listed(self, path: str, listed: Any) -> None:
-        """Fetch the values of the names listed, one after another.
+        """Fetch the values of the names listed, one after another; they are recorded as if the node began now.
 
         Where one has no value, rclpy leaves out all that follow; and a service keeps ten requests at most.
         """
         names = list(listed.result().result.names)
-        values = self._parameters.setdefault(path, {})
+        event = ParameterEvent(node=path)
 
         def fetch_next() -> None:
             if names:
                 name = names.pop(0)
                 asked = self._clients[path].get_parameters([name])
                 asked.add_done_callback(lambda answer: keep(name, answer.result().values))
+            else:
+                self._queue.put((PARAMETER_EVENTS, serialize_message(event), time.time_ns()))
 
         def keep(name: str, answer: Sequence[Any]) -> None:
-            for parameter in answer:
-                value = parameter_value_to_python(parameter)
-                values[name] = value.tolist() if hasattr(value, "tolist") else value
+            event.new_parameters += [Parameter(name=name, value=value) for value in answer]
             fetch_next()
 
         fetch_next()

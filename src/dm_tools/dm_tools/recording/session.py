@@ -20,13 +20,12 @@ from dm_common.messages import measurement_from, mirror_from, stamp_ns
 from dm_common.mirror import Mirror
 from dm_controller.planning.active_calibration import model_of
 from dm_controller.solvers.base import points_of
-from dm_tools.recording.bag import BagReader, Message
+from dm_tools.recording.bag import PARAMETER_EVENTS, BagReader, Message
 from dm_tools.recording.interfaces import message_class
 
 #: Topics that a calibration is made again from; the last part of their names.
 FEEDBACK = "calibrate/_action/feedback"
 TOPICS = ("mirror_info", "actuator_state", "zernike", "surface_samples", "surface_map_info", "calibration", FEEDBACK)
-PARAMETER_EVENTS = "/parameter_events"
 #: Fields of dm_msgs/Calibration that must agree to the last bit.
 COMPARED = (
     "influence_zernike",
@@ -201,14 +200,14 @@ def _model(calibration: Any) -> Any:
 
 def _parameters(bag: BagReader, node: str, begun: int) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Parameters of `node` when the run began, and what is not known of them."""
-    values = {parameter.name: parameter.default for parameter in PARAMETERS}
-    recorded = bag.parameters.get(node)
-    values |= {name: value for name, value in (recorded or {}).items() if name in values}
-    if PARAMETER_EVENTS in bag.topics:
-        for message in bag.read([PARAMETER_EVENTS]):
-            event = _decode(message)
-            if message.log_time < begun and event.node == node:
-                changed = [*event.new_parameters, *event.changed_parameters]
-                values |= {p.name: parameter_value_to_python(p.value) for p in changed if p.name in values}
-    remarks = () if recorded else (f"The recording does not hold the parameters of {node}; defaults are taken.",)
-    return values, remarks
+    defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
+    told: dict[str, Any] = {}
+    for message in bag.read([PARAMETER_EVENTS]):
+        event, before = _decode(message), message.log_time < begun
+        if event.node == node:
+            for each in [*event.new_parameters, *(event.changed_parameters if before else ())]:
+                if before or each.name not in told:  # the recorder may have been answered during the run
+                    told[each.name] = parameter_value_to_python(each.value)
+    missing = defaults.keys() - told.keys()
+    remarks = (f"The recording does not hold all parameters of {node}; defaults are taken.",) if missing else ()
+    return defaults | {name: value for name, value in told.items() if name in defaults}, remarks

@@ -28,6 +28,7 @@ def record(
 
     Writes a folder with one MCAP file and metadata.yaml, as `ros2 bag record -s mcap` does.
     """
+    from dm_tools.recording.bag import PARAMETER_EVENTS
     from dm_tools.recording.recorder import Recorder
 
     # SIGTERM must finish the file as Ctrl-C does, which a shell lets commands in the background ignore.
@@ -53,7 +54,7 @@ def record(
     for name, reason in recorder.refused.items():
         console.print(f"[yellow]not recorded[/] {name}: {reason}")
     console.print(f"{sum(counts.values())} messages, recording: {os.path.relpath(folder)}")
-    if not sum(counts.values()):
+    if not any(count for name, count in counts.items() if name != PARAMETER_EVENTS):
         raise RuntimeError("nothing was recorded: are the nodes running (./dm up), and in this ROS_DOMAIN_ID?")
     seconds = time.monotonic() - started
     write_json(json, {"folder": str(folder), "messages": counts, "refused": recorder.refused, "seconds": seconds})

@@ -35,6 +35,8 @@ def replay(
     from dm_tools.recording.player import play, replayed
 
     bag = BagReader(recording)
+    for name in bag.unfinished:
+        console.print(f"[yellow]remark[/] {name} was not finished: what is whole in it is read")
     if recalibrate:
         write_json(json, _again(bag, run, namespace, store, config))
         return
