@@ -53,7 +53,6 @@ LONGEST = (
     "test_calibration_faults",
     "test_calibration_watch",
     "test_calibration_node",
-    "test_answers",
     "test_focus_hysteresis",
     "test_calibration_resume",
     "test_registration_on_simulation",
