@@ -99,8 +99,8 @@ def test_the_focus_controller_is_on_its_own() -> None:
 def test_folders_side_by_side_import_in_no_circle(home: str) -> None:
     needs: dict[str, set[str]] = {}
     for module in (name for name in MODULES if name.split(".")[0] == home):
-        here = folder(module)
-        others = {folder(other) for other in imports(module) if other.split(".")[0] == home}
+        here = f"{folder(module)}."  # with the dot it begins the name of what lies in it and of no other
+        others = {f"{folder(other)}." for other in imports(module) if other.split(".")[0] == home}
         needs.setdefault(here, set()).update(x for x in others if not x.startswith(here) and not here.startswith(x))
     TopologicalSorter(needs).prepare()  # raises CycleError, which names the circle
 
