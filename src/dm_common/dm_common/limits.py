@@ -59,8 +59,7 @@ class Limits:
 
     def allow(self, signals: Floats) -> bool:
         """Whether `signals` (N,) break none of the limits but by rounding."""
-        # Half the time of the methods of the same names.
-        inside = np.minimum.reduce(signals) >= self.low - SLACK and np.maximum.reduce(signals) <= self.high + SLACK
+        inside = signals.min() >= self.low - SLACK and signals.max() <= self.high + SLACK
         return bool(inside) and self.allow_neighbours(signals)
 
     def allow_neighbours(self, signals: Floats) -> bool:

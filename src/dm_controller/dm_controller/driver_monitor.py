@@ -19,8 +19,6 @@ from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
 from dm_controller.focus_types import CommandedShape, Order, Progress, PublishState
 
-#: A message's constants are properties of its class, which take longer to look up.
-_ACTIVE = ActuatorState.STATE_ACTIVE
 #: States from which a driver does not come back by itself, as it does from a lost link.
 _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
 #: Longest wait until the driver confirms a command where `driver_timeout` sets none, s.
@@ -97,16 +95,16 @@ class DriverMonitor:
         written = stamp_ns(report.header.stamp)
         seconds = 1e-9 * (written - sent.command.stamp_ns)
         # A driver that was active before the command was sent may have it on the way.
-        sent.lost |= anew and (report.driver_state != _ACTIVE or written > sent.command.stamp_ns)
+        sent.lost |= anew and (report.driver_state != ActuatorState.STATE_ACTIVE or written > sent.command.stamp_ns)
         if not sent.confirmed or not 0.0 <= seconds <= LATENCY_MAX_S:
             return False
         self._latencies.append(seconds)
         return len(self._latencies) == 1
 
     def _trust(self) -> None:
-        report = self.latest
-        is_open = report is not None and report.driver_state == _ACTIVE and not report.holder and not self.gone
-        self.open_until = self._heard + (self._values["driver_timeout"] or math.inf) if is_open else -math.inf
+        report, limit = self.latest, self._values["driver_timeout"] or math.inf
+        is_open = report is not None and report.driver_state == ActuatorState.STATE_ACTIVE and not report.holder
+        self.open_until = self._heard + limit if is_open and not self.gone else -math.inf
 
     def age(self, now: float) -> float:
         """s since the driver's last report."""
@@ -128,7 +126,7 @@ class DriverMonitor:
         if report is None:
             text = "no actuator_state from pdm_driver yet: is the driver running?"
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, text)
-        if report.driver_state != _ACTIVE and not self.gone:
+        if report.driver_state != ActuatorState.STATE_ACTIVE and not self.gone:
             return _not_active(report)
         if silent := self.silent(now):
             return Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent)
@@ -178,7 +176,7 @@ class DriverMonitor:
             return SUPERSEDED
         signals = order.outcome.move.signals
         report = self.latest
-        if report is not None and report.driver_state != _ACTIVE:
+        if report is not None and report.driver_state != ActuatorState.STATE_ACTIVE:
             return Progress(failed=_not_active(report))
         if silent := self.silent(now):
             return Progress(failed=Refusal(ErrorCode.DRIVER_UNAVAILABLE, silent))

@@ -36,8 +36,6 @@ from dm_controller.planning.choice import Degauss, PlanningContext, choose_move,
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import REQUEST, FocusTarget
 
-#: A message's constants are properties of its class, which take longer to look up.
-_ACTIVE, _CONDITIONED = ActuatorState.STATE_ACTIVE, FocusRequest.MODE_CONDITIONED
 #: How often a held shape is checked while no correction can be due sooner, s.
 SLOW_PERIOD_S = 1.0
 
@@ -108,7 +106,7 @@ class FocusController:
         latency_learnt = self.monitor.observe(report, now.steady)
         with suppress(ValueError):  # the observer says so as long as the history is unknown, and begins anew
             self.observer.observe(applied_from(report, now.time))
-        if report.driver_state != _ACTIVE:
+        if report.driver_state != ActuatorState.STATE_ACTIVE:
             self.hold.end("the driver is not active")
         elif self.hold.active:
             self.hold.driver_requested(report.requested, now.time)
@@ -162,7 +160,7 @@ class FocusController:
         estimate = self._at_rest or self.observer.estimate(now.time, active.planner.slew_rate)
         if degaussed is not None:
             degauss = Degauss(degaussed, True, 0.0)
-        elif self.conditioning.run is not None or request.mode == _CONDITIONED or budget:
+        elif self.conditioning.run is not None or request.mode == FocusRequest.MODE_CONDITIONED or budget:
             degauss = self.conditioning.prospect(active, values["condition.degauss_steps"], now.steady)
         else:  # there is no time for one: at once from where the mirror stands
             return active.planner.plan(target, estimate.state, now.time, not estimate.unknown, ahead=settle)

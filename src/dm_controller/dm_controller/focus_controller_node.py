@@ -121,8 +121,7 @@ class FocusControllerNode(ManagedNode):
             yield self._controller, self._now()
 
     def _now(self) -> Moment:
-        clock = self.get_clock()  # without a simulator its time is the system's, which costs a tenth
-        ns = int(clock.now().nanoseconds) if clock.ros_time_is_active else time.time_ns()
+        ns = int(self.get_clock().now().nanoseconds)
         return Moment(ns, 1e-9 * ns, time.monotonic())
 
     # --- what comes in ---

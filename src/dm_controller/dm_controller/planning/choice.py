@@ -13,9 +13,6 @@ from dm_controller.planning.planner import Move
 from dm_controller.planning.recipes import FoundRecipe
 from dm_controller.planning.target import FocusTarget
 
-#: A message's constants are properties of its class, which take longer to look up.
-_DIRECT, _CONDITIONED = FocusRequest.MODE_DIRECT, FocusRequest.MODE_CONDITIONED
-
 
 class Degauss(NamedTuple):
     """The degauss that a move can begin with.
@@ -55,9 +52,9 @@ def choose_move(target: FocusTarget, mode: str, budget: float, context: Planning
     Raises:
         Refusal: no recipe serves the target in the mode conditioned.
     """
-    if mode == _CONDITIONED:
+    if mode == FocusRequest.MODE_CONDITIONED:
         return _conditioned(target, context)
-    if mode == _DIRECT:
+    if mode == FocusRequest.MODE_DIRECT:
         return _unconditioned(target, context)
     return _best(target, budget, context)
 
@@ -91,7 +88,7 @@ def _conditioned(target: FocusTarget, context: PlanningContext) -> Move:
         recipe = context.active.corrections.find(target)
     except RecipeError as error:
         raise Refusal(ErrorCode.OUT_OF_RANGE, f"mode conditioned: {error}") from error
-    return replace(_after_degauss(target, context, recipe), mode=_CONDITIONED)
+    return replace(_after_degauss(target, context, recipe), mode=FocusRequest.MODE_CONDITIONED)
 
 
 def _best(target: FocusTarget, budget: float, context: PlanningContext) -> Move:

@@ -35,8 +35,6 @@ DRAWS = 4000
 RANGE_TOLERANCE = 20e-9
 #: Effective signals that a limit denies count from here on, normalised.
 MISSED_MAX = 1e-6
-#: A message's constants are properties of its class, which take longer to look up.
-_DIRECT = FocusRequest.MODE_DIRECT
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,7 @@ class Move:
     known: bool
     duration: float
     _predict: Callable[[], Plan]
-    mode: str = _DIRECT
+    mode: str = FocusRequest.MODE_DIRECT
     degauss: int | None = None
 
     @cached_property
