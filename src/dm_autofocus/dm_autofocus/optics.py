@@ -27,10 +27,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dm_common.errors import ErrorCode
+from dm_common.errors import CodedError, ErrorCode
 
 
-class OpticsError(ValueError):
+class OpticsError(CodedError, ValueError):
     """A distance, dioptre or optical parameter outside its range; the message names field, value and range."""
 
     error_code = ErrorCode.OUT_OF_RANGE

@@ -14,7 +14,7 @@ from dm_calibration.influence.quality import GRADE_NAMES, NO_RESPONSE
 from dm_calibration.store.hdf5_image import Attribute, Column
 from dm_calibration.store.hysteresis_storage import hysteresis_columns, hysteresis_from, recipe_columns, recipes_from
 from dm_common import Floats
-from dm_common.errors import ErrorCode
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.figures import in_nanometres
 from dm_common.optics.sample_regions import AREA_FRACTIONS
 from dm_common.optics.sampling import SamplePoints
@@ -47,7 +47,7 @@ _ATTRIBUTES: dict[str, type] = {
 _STORED_AS = {"limitations": "known_limitations"}
 
 
-class CalibrationFileError(ValueError):
+class CalibrationFileError(CodedError, ValueError):
     """A calibration file is damaged, foreign, or of an unknown schema; the message says which and where."""
 
     error_code = ErrorCode.CALIBRATION_UNREADABLE

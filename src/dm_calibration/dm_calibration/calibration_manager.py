@@ -8,10 +8,11 @@ from pathlib import Path
 
 from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance
-from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError, raw_hash
+from dm_calibration.store.calibration_store import CalibrationStore, raw_hash
 from dm_common.atomic_write import StoreError
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.mirror import Mirror, mismatch
+from dm_common.names import UnknownNameError
 from dm_common.recipes import RecipeBook, RecipeError
 
 
@@ -103,7 +104,7 @@ class CalibrationManager:
                 return
             try:
                 file = self.store.find(self.in_use.id)
-            except UnknownCalibrationError:  # removed meanwhile; what is in use stays
+            except UnknownNameError:  # removed meanwhile; what is in use stays
                 file = None
             self._publish(self.in_use, file)
 
@@ -112,7 +113,7 @@ class CalibrationManager:
 
         Raises:
             Refusal: no mirror, or the calibration belongs to another; the one in use stays.
-            UnknownCalibrationError, CalibrationFileError: see the store.
+            UnknownNameError, CalibrationFileError: see the store.
         """
         mirror = self.known_mirror()
         if name:
@@ -191,7 +192,7 @@ class CalibrationManager:
         """
         try:
             file = self.store.find(calibration.id)
-        except UnknownCalibrationError:
+        except UnknownNameError:
             file = self.store.save(calibration)
         if raw_hash(self.store.load(calibration.id)) != raw_hash(calibration):
             raise StoreError(f"calibration {calibration.id}: the maps in {file} are not those that were measured")

@@ -16,7 +16,6 @@ from dm_calibration.influence.maps import EXCITATION, SURFACE, MapSet
 from dm_calibration.influence.poke_check import PokeCheck, check_pokes
 from dm_calibration.influence.quality import GRADE_DEAD, GRADE_NOT_EXCITED
 from dm_calibration.influence.region_weighting import weighting_of
-from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome
 from dm_calibration.store.calibration_store import new_id
 from dm_common import Floats
@@ -167,7 +166,7 @@ def _region_weights(maps: MapSet, fit: InfluenceFit, options: FitOptions) -> Flo
         return np.zeros(0)
     try:
         return weighting_of(maps, fit.used, options.folds, options.epsilon).weights
-    except (TooFewMapsError, ValueError):  # a calibration is whole without them
+    except ValueError:  # a calibration is whole without them
         return np.zeros(0)
 
 

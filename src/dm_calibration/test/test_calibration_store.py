@@ -21,7 +21,7 @@ from dm_calibration.influence.fit import FitOptions
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.procedure.outcome import Outcome, Setup
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
-from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError, check_id
+from dm_calibration.store.calibration_store import CalibrationStore, check_id
 from dm_calibration.store.hdf5_image import content_hash, read_image, write_image
 from dm_common.atomic_write import StoreError
 from dm_common.measurement import Measurement
@@ -166,7 +166,7 @@ def test_folder_that_is_a_file(tmp_path: Path, calibration: Calibration) -> None
 def test_names_do_not_leave_the_folder(name: str, tmp_path: Path, calibration: Calibration) -> None:
     (tmp_path / "inner").mkdir()
     CalibrationStore(tmp_path).save(calibration)
-    with pytest.raises(UnknownCalibrationError):
+    with pytest.raises(UnknownNameError):
         CalibrationStore(tmp_path / "inner").load(name)
 
 
@@ -175,7 +175,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path: Path, calibration: C
     inner = tmp_path / "inner"
     inner.mkdir()
     (inner / "PDM_1.h5").symlink_to(file)
-    with pytest.raises(UnknownCalibrationError, match="link out of"):
+    with pytest.raises(UnknownNameError, match="link out of"):
         CalibrationStore(inner).load("PDM_1")
 
 

@@ -18,9 +18,10 @@ from dm_calibration.calibrator import Provenance, calibrate
 from dm_calibration.influence.fit import FitOptions
 from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
-from dm_calibration.store.calibration_store import CalibrationStore, UnknownCalibrationError
+from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.atomic_write import StoreError
 from dm_common.errors import ErrorCode, Refusal, error_code
+from dm_common.names import UnknownNameError
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 from hysteretic_mirror import MIRROR, lagging_bench
 from linear_mirror import make_mirror
@@ -149,6 +150,6 @@ def test_other_raw_data_never_replace_those_of_the_file(stand: Stand, calibratio
     other = replace(calibration, maps=replace(calibration.maps, sag=calibration.maps.sag + 1e-9))
     with pytest.raises(StoreError, match="raw data differ"):
         stand.store.replace(other)
-    with pytest.raises(UnknownCalibrationError):
+    with pytest.raises(UnknownNameError):
         stand.store.replace(replace(calibration, id="never-stored"))
     assert stand.file.read_bytes() == before

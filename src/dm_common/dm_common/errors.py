@@ -52,6 +52,8 @@ class ErrorCode(IntEnum):
 class CodedError(RuntimeError):
     """A failure that is answered with a code and a sentence that a person can act on.
 
+    Of a value, where callers expect a ValueError, it is both.
+
     Attributes:
         error_code: a value of ErrorCode; of the class, where all its failures have the same.
     """
@@ -89,4 +91,4 @@ EXPECTED = (CodedError, ValueError)
 
 def error_code(error: Exception) -> int:
     """The code that answers one of the EXPECTED failures: its own, INVALID_ARGUMENT for a ValueError without."""
-    return int(getattr(error, "error_code", ErrorCode.INVALID_ARGUMENT))
+    return error.error_code if isinstance(error, CodedError) else ErrorCode.INVALID_ARGUMENT

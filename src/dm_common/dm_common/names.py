@@ -3,11 +3,11 @@
 import difflib
 from collections.abc import Iterable
 
-from dm_common.errors import ErrorCode
+from dm_common.errors import CodedError, ErrorCode
 
 
-class UnknownNameError(ValueError):
-    """No such name; the message lists the near ones."""
+class UnknownNameError(CodedError, ValueError):
+    """No such name; the message lists the near ones, or says where it was looked for."""
 
     error_code = ErrorCode.UNKNOWN_NAME
 

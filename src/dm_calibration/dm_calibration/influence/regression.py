@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.influence.maps import MapSet
 from dm_common import Floats
-from dm_common.errors import ErrorCode
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.optics.piston_tilt import fill_gaps, remove_piston_tilt, weighted_fit
 from dm_common.optics.zernike import basis
 
@@ -39,7 +39,7 @@ GAP_ROUNDS = 60
 GAP_TOLERANCE = 1e-11
 
 
-class TooFewMapsError(ValueError):
+class TooFewMapsError(CodedError, ValueError):
     """The maps do not determine the influence function; the message says what is missing."""
 
     error_code = ErrorCode.TOO_FEW_MAPS

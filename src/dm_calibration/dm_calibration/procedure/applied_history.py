@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dm_common import Floats
-from dm_common.errors import ErrorCode
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.hysteresis.model import HysteresisModel
 from dm_common.hysteresis.observer import Applied, HysteresisObserver, Observed
 
@@ -14,7 +14,7 @@ from dm_common.hysteresis.observer import Applied, HysteresisObserver, Observed
 SMALL_MOVE = 2e-4
 
 
-class MapNotUsableError(ValueError):
+class MapNotUsableError(CodedError, ValueError):
     """A map cannot be compared with the calibration; the message says why."""
 
     error_code = ErrorCode.MAP_REJECTED

@@ -9,18 +9,12 @@ from pathlib import Path
 from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
 from dm_calibration.store.hdf5_image import ImageError, content_hash, read_image, write_image
 from dm_common.atomic_write import StoreError, storing, write_whole
-from dm_common.errors import ErrorCode
+from dm_common.names import UnknownNameError
 
 SUFFIX = ".h5"
 #: What was measured, and where: never changed after a calibration was stored.
 _RAW = ("maps/", "points/", "mirror/")
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
-
-
-class UnknownCalibrationError(ValueError):
-    """There is no such calibration in the folder."""
-
-    error_code = ErrorCode.UNKNOWN_NAME
 
 
 @dataclass(frozen=True)
@@ -79,7 +73,7 @@ class CalibrationStore:
 
         Raises:
             StoreError: disk full, read-only, other raw data than in the file, ...; the old file is as it was.
-            UnknownCalibrationError: there is no such file.
+            UnknownNameError: there is no such file.
             CalibrationFileError: the old file is damaged: it is not overwritten.
         """
         target = self.find(calibration.id)
@@ -98,7 +92,7 @@ class CalibrationStore:
         """The calibration with the id `name`, or in the file `name` of this folder.
 
         Raises:
-            UnknownCalibrationError: no such file, or a name that leads out of the folder.
+            UnknownNameError: no such file, or a name that leads out of the folder.
             CalibrationFileError: the file is damaged, foreign, or of another schema.
         """
         return _read(self.find(name))
@@ -107,21 +101,21 @@ class CalibrationStore:
         """The file of the calibration with the id or file name `name`.
 
         Raises:
-            UnknownCalibrationError: no such file, or a name that leads out of the folder.
+            UnknownNameError: no such file, or a name that leads out of the folder.
         """
         path = Path(name).expanduser()
         if path.name != name:  # a path: only one that is a file of this folder
             inside = path.suffix == SUFFIX and path.parent.resolve() == self.folder.resolve()
             if not inside:
-                raise UnknownCalibrationError(f"calibration {name!r}: must be an id or a file of {self.folder}")
+                raise UnknownNameError(f"calibration {name!r}: must be an id or a file of {self.folder}")
         identifier = path.name.removesuffix(SUFFIX)
         if not _ID.fullmatch(identifier):
-            raise UnknownCalibrationError(f"calibration {name!r}: not an id")
+            raise UnknownNameError(f"calibration {name!r}: not an id")
         file = self._file(identifier)
         if not file.is_file():
-            raise UnknownCalibrationError(f"calibration {identifier!r}: no such file in {self.folder}")
+            raise UnknownNameError(f"calibration {identifier!r}: no such file in {self.folder}")
         if file.resolve().parent != self.folder.resolve():
-            raise UnknownCalibrationError(f"calibration {identifier!r}: the file is a link out of {self.folder}")
+            raise UnknownNameError(f"calibration {identifier!r}: the file is a link out of {self.folder}")
         return file
 
     def entries(self) -> list[Entry]:
@@ -136,7 +130,7 @@ class CalibrationStore:
                 age_ns = file.stat().st_mtime_ns
                 calibration = self.load(identifier)
                 listed.append((calibration.created_ns, Entry(identifier, file, calibration, "")))
-            except (CalibrationFileError, UnknownCalibrationError, OSError) as error:
+            except (CalibrationFileError, UnknownNameError, OSError) as error:
                 listed.append((age_ns, Entry(identifier, file, None, str(error))))
         listed.sort(key=lambda item: (item[0], item[1].id), reverse=True)
         return [entry for _, entry in listed]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dm_common import Floats
-from dm_common.errors import ErrorCode
+from dm_common.errors import CodedError, ErrorCode
 from dm_common.optics.sampling import SamplePoints
 
 #: Shares of the aperture's area, 10 % to 100 % (Fig. 4 in [1]).
@@ -23,7 +23,7 @@ AREA_FRACTIONS: tuple[float, ...] = tuple(k / 10 for k in range(1, 11))
 _RADIUS_DECIMALS = 9
 
 
-class EmptyRegionError(ValueError):
+class EmptyRegionError(CodedError, ValueError):
     """A region holds no data; the message names the map and the region."""
 
     error_code = ErrorCode.MAP_INSUFFICIENT

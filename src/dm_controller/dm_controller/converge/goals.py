@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import CodedError, ErrorCode, Refusal
 from dm_common.optics.zernike import TERMS
 from dm_common.recipes import RecipeError, shape_text
 from dm_controller.planning.planner import Planner
@@ -13,7 +13,7 @@ from dm_controller.planning.recipes import SAME_SHAPE
 from dm_controller.planning.target import TARGET, FocusTarget
 
 
-class UnreachableError(RecipeError):
+class UnreachableError(CodedError, RecipeError):
     """The limits of the actuators deny the shape."""
 
     error_code = ErrorCode.UNREACHABLE
