@@ -10,19 +10,17 @@ import numpy as np
 
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.hysteresis.observer import ActuatorEstimate
+from dm_common.hysteresis.observer import ESTIMATES_KEPT, ActuatorEstimate
 from dm_common.messages import estimate_from, hysteresis_model_from, seconds
 
-#: Estimates kept for maps that arrive late.
-ESTIMATES_KEPT = 500
 #: Creep of what was held unseen is told above this standard deviation, in shapes of the whole range.
 CREEP_UNSEEN = 0.05
 #: A move that the controller has not followed after this is one it does not follow, s.
 LATE_S = 1.0
 
 
-class SettledState(NamedTuple):
-    """The mirror at one moment.
+class EffectiveSignals(NamedTuple):
+    """Effective signals at one moment.
 
     Attributes:
         effective: (N,); None = not known.
@@ -32,7 +30,7 @@ class SettledState(NamedTuple):
     effective: Floats | None
     doubt: str
 
-    def same_as(self, other: SettledState) -> bool:
+    def same_as(self, other: EffectiveSignals) -> bool:
         """Whether both say the same."""
         mine, theirs = (np.array(each.effective, dtype=np.float64) for each in (self, other))
         return self.doubt == other.doubt and np.array_equal(mine, theirs, equal_nan=True)
@@ -83,7 +81,7 @@ class StateObserver:
         state = self.latest().state
         return state is not None and bool((state.crept_sigma > CREEP_UNSEEN).any())
 
-    def now(self, time: float) -> SettledState:
+    def now(self, time: float) -> EffectiveSignals:
         """The mirror at `time` (s, ROS time), taken as not before the last estimate."""
         estimate, reported = self.latest(), self._reported
         if estimate.state is not None and not estimate.unknown and reported is not None and not reported.moving:
@@ -93,7 +91,7 @@ class StateObserver:
                 estimate = estimate._replace(unknown="focus_controller has not followed the last move")
         return self._settled(estimate, time)
 
-    def at(self, time: float) -> SettledState:
+    def at(self, time: float) -> EffectiveSignals:
         """The mirror at `time` (s), which may lie before the last estimate."""
         return self._settled(self._before(time), time)
 
@@ -108,10 +106,10 @@ class StateObserver:
         fitting = (estimate for estimate in reversed(own) if estimate.state is None or estimate.state.time <= time)
         return next(fitting, ActuatorEstimate(None, "no estimate of the actuators is as old as this map"))
 
-    def _settled(self, estimate: ActuatorEstimate, time: float) -> SettledState:
+    def _settled(self, estimate: ActuatorEstimate, time: float) -> EffectiveSignals:
         state = estimate.state
         if state is None:
-            return SettledState(None, estimate.unknown)
+            return EffectiveSignals(None, estimate.unknown)
         if (state.play.shape[1], state.crept.shape[1]) != (len(self.law.play_radius), len(self.law.creep_time)):
-            return SettledState(None, "the calibration is being replaced")
-        return SettledState(self.law.effective(self.law.advance(state, time)), estimate.unknown)
+            return EffectiveSignals(None, "the calibration is being replaced")
+        return EffectiveSignals(self.law.effective(self.law.advance(state, time)), estimate.unknown)

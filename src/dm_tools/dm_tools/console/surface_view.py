@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dm_common.messages import stamp_ns
 from dm_tools.console.console_node import Snapshot
-from dm_tools.console.state_observer import SettledState, StateObserver
+from dm_tools.console.state_observer import EffectiveSignals, StateObserver
 from dm_tools.console.surfaces import Surface, SurfaceModel, difference, measured_surface
 from dm_tools.verify import map_of
 
@@ -47,7 +47,7 @@ class SurfaceView:
         self._model: SurfaceModel | None = None
         self._calibration: Any = None
         self._map: tuple[int, Any] = (0, None)
-        self._at_map: SettledState | None = None
+        self._at_map: EffectiveSignals | None = None
         self._effective: NDArray[np.float64] | None = None
 
     @property
