@@ -65,9 +65,9 @@ PARAMETERS = (
         "mirror or of a mask on it.",
     ),
     live(
-        "aperture.minimum_valid_fraction",
+        "aperture.valid_fraction_min",
         real(0.7, 0.0, 1.0),
-        "Smallest share of valid pixels inside the aperture; maps with fewer are refused.",
+        "Least share of valid pixels in the aperture of a map that is published; maps with fewer are refused.",
     ),
     *parameters_of("orientation.", Orientation),
     live(
@@ -130,7 +130,7 @@ def ingest_settings(
         mirror_radius=mirror_radius,
         aperture_centre=(values["aperture.centre_x"], values["aperture.centre_y"]),
         aperture_follow=values["aperture.follow"],
-        minimum_valid_fraction=values["aperture.minimum_valid_fraction"],
+        valid_fraction_min=values["aperture.valid_fraction_min"],
         reference=reference,
     )
 

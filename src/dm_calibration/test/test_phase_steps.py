@@ -64,7 +64,7 @@ def test_another_step_is_refused_by_its_place(sag: NDArray[np.float64]) -> None:
 
 
 def test_maps_are_mended_as_they_are_read(sag: NDArray[np.float64]) -> None:
-    settings = IngestSettings(pitch=1e-4, minimum_valid_fraction=0.5)
+    settings = IngestSettings(pitch=1e-4, valid_fraction_min=0.5)
     right = Ingest().measure(SurfaceMap(sag, WAVELENGTH, None, "array"), settings)[1]
     stepped = SurfaceMap(sag + FRINGE * (X > 0.4), WAVELENGTH, None, "array")
     surface, measured = Ingest().measure(stepped, settings)

@@ -46,7 +46,7 @@ class IngestSettings:
         mirror_radius: m; no aperture_radius is larger. 0 = not known.
         aperture_centre: (x, y) in m from the oriented map's centre, used with aperture_radius.
         aperture_follow: from the centre of the valid region, found anew in each map, instead.
-        minimum_valid_fraction: valid pixels / pixels inside the aperture.
+        valid_fraction_min: valid pixels / pixels inside the aperture.
         reference: the instrument's own error, subtracted from every map before it is turned; None = not known.
     """
 
@@ -58,7 +58,7 @@ class IngestSettings:
     mirror_radius: float = 0.0
     aperture_centre: tuple[float, float] = (0.0, 0.0)
     aperture_follow: bool = False
-    minimum_valid_fraction: float = 0.7
+    valid_fraction_min: float = 0.7
     reference: SurfaceMap | None = None
     # Retrace and distortion are taken off then; see `dm_calibration.optics.instrument`.
     retrace: tuple[float, ...] = parameter(
@@ -158,11 +158,11 @@ class Ingest:
         if self._fitter is None or not self._fitter.fits(surface.valid, aperture):
             self._fitter = None  # not two workspaces at a time
             self._fitter = MapFitter(surface.valid, *circle)
-        if self._fitter.valid_fraction < settings.minimum_valid_fraction:
+        if self._fitter.valid_fraction < settings.valid_fraction_min:
             raise InsufficientDataError(
                 f"valid fraction = {self._fitter.valid_fraction:.3f} of the aperture (radius {aperture.radius_px:.1f} "
-                f"pixels): must be at least {settings.minimum_valid_fraction:g} "
-                "(parameter aperture.minimum_valid_fraction)"
+                f"pixels): must be at least {settings.valid_fraction_min:g} "
+                "(parameter aperture.valid_fraction_min)"
             )
         fit = self._fitter.fit(sag)
         samples = sample_map(sag, *circle, self.points)

@@ -51,7 +51,7 @@ class FitOptions:
     folds: int = 10
     epsilon: float | None = None
     valid_fraction_min: float = live_parameter(
-        real(0.5, 0.0, 1.0), "Least share of valid pixels in the aperture of a map."
+        real(0.5, 0.0, 1.0), "Least share of valid pixels in the aperture of a map that is fitted, whoever measured it."
     )
     outlier_sigmas: float = live_parameter(
         real(6.0, 3.0, 1e3), "Residual of a map, in robust sigmas above the median, beyond which it is dropped."
