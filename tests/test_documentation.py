@@ -36,7 +36,7 @@ from dm_tools.cli import app
 from dm_tools.demo.demo_bench import bench_config
 from dm_tools.doctor.bench import parameters
 from documentation import Block, blocks
-from fault_injection.rigs.parts import quick_trigger
+from fault_injection.rigs.common_steps import quick_trigger
 from studies.documentation.parameters import TABLES
 from support import wait_until
 

@@ -11,8 +11,8 @@ from dm_msgs.srv import SetFocus
 
 from fault_injection.fault import FaultRecord, run_faults
 from fault_injection.faults.registry import GROUPS, OTHERS, select
+from fault_injection.rigs.common_steps import overtaken
 from fault_injection.rigs.focus_rig import FocusRig
-from fault_injection.rigs.parts import overtaken
 
 pytestmark = pytest.mark.processes
 

@@ -190,13 +190,13 @@ class CalibrateAction:
 
         self._services.publish_waits(handle, feedback)
 
-        def told(reached: float) -> None:
+        def report_reached(reached: float) -> None:
             nonlocal end
             feedback.reached_max_zernike = reached
             end, feedback.expected_max_zernike = foreseen(plan, feedback.step, reached, handle.request.until)
             self._node.get_logger().info(f"{len(run.outcome.records)} maps: right to {reached * 1e9:.2f} nm")
 
-        enough = self._enough = GoodEnough(handle.request.until, told)
+        enough = self._enough = GoodEnough(handle.request.until, report_reached)
         in_use = self._manager.in_use
         # A full plan solves its shapes on the pokes of this very run.
         model = in_use.fit if in_use and plan.kind is PlanKind.SURFACES else None
@@ -277,7 +277,7 @@ class CalibrateAction:
             run.journal.remove()
             if not check.passed:
                 raise Refusal(ErrorCode.POKE_CHECK_FAILED, "; ".join(check.findings))
-            result.message = f"wiring and orientation are as configured: {check.standing}"
+            result.message = f"wiring and orientation are as configured: {check.pose}"
             return
         if (hysteresis := calibration.hysteresis) is not None:
             result.hysteresis_model, result.hysteresis_held_out_max_zernike = (

@@ -129,7 +129,7 @@ def test_any_mounting_with_any_numbering(
     assert stands is not None
     found_x, found_y = stand(stands.turn, stands.mirrored, complex(*stands.shift), stands.scale)
     apart = np.hypot(found_x[result.place] - x[order], found_y[result.place] - y[order])
-    assert apart.max() < 1e-4, result.standing
+    assert apart.max() < 1e-4, result.pose
 
 
 @settings(max_examples=40, deadline=None)
@@ -176,7 +176,7 @@ def test_any_mounting_with_any_faults(
     stands = result.registration
     assert stands is not None and stands.mirrored == mirrored
     turned, moved = np.angle(np.exp(1j * (stands.turn - turn))), abs(complex(*stands.shift) - shift_m)
-    assert abs(turned) < 0.01 and moved < 1e-4 and abs(stands.scale - scale) < 0.01, result.standing
+    assert abs(turned) < 0.01 and moved < 1e-4 and abs(stands.scale - scale) < 0.01, result.pose
     assert result.place.tolist() == place.tolist()
     text = "; ".join(result.findings)
     assert all(words in text for words in expected), text

@@ -25,8 +25,8 @@ from dm_calibration.procedure.run_journal import read_run
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.ros.clients import ThreadedActionClient
 from fault_injection.fault import Fault, FaultRecord
+from fault_injection.rigs.common_steps import checked
 from fault_injection.rigs.driver_rig import RigError
-from fault_injection.rigs.parts import checked
 from fault_injection.rigs.process_rig import ProcessRig
 from map_hashes import map_hashes, record_hash
 

@@ -20,9 +20,9 @@ from dm_msgs.msg import ActuatorState, Capabilities, ErrorCode, FocusRequest
 from lifecycle_msgs.msg import Transition
 
 from fault_injection.fault import Fault, FaultRecord
+from fault_injection.rigs.common_steps import checked
 from fault_injection.rigs.driver_rig import RigError
 from fault_injection.rigs.focus_rig import ANSWER_S, DRIVER_TIMEOUT_S, FocusRig
-from fault_injection.rigs.parts import checked
 
 #: Injections per start of the nodes.
 ROUNDS = 3

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from rosgraph_msgs.msg import Clock
 
 from fault_injection.fault import Fault, FaultRecord
+from fault_injection.rigs.common_steps import begin_degauss, checked, other_client
 from fault_injection.rigs.driver_rig import ACTUATORS, DriverRig
-from fault_injection.rigs.parts import begin_degauss, checked, other_client
 
 ROUNDS = 3  # injections per start of a driver, where one driver can take several
 

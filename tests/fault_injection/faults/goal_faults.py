@@ -12,9 +12,9 @@ from dm_msgs.msg import ErrorCode, FocusRequest
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.faults import controller_faults
 from fault_injection.faults.controller_faults import REGISTRY, fault, lost
+from fault_injection.rigs.common_steps import begin_degauss
 from fault_injection.rigs.driver_rig import PATIENCE_S, RigError
 from fault_injection.rigs.focus_rig import ANSWER_S, FocusRig
-from fault_injection.rigs.parts import begin_degauss
 
 
 def _end_somehow(rig: FocusRig, random: Random, handle: Any, result: Any) -> Any:

@@ -21,10 +21,10 @@ from dm_msgs.action import MoveFocus
 from dm_msgs.msg import Capabilities, ErrorCode, FocusRequest, FocusState
 
 from fault_injection.fault import Fault, FaultRecord
+from fault_injection.rigs.common_steps import checked
 from fault_injection.rigs.driver_rig import RigError
 from fault_injection.rigs.focus_rig import ANSWER_S, DRIVER_TIMEOUT_S
 from fault_injection.rigs.network_rig import NetworkRig
-from fault_injection.rigs.parts import checked
 from studies.network_namespaces import NotPermittedError
 
 LOSS, DELAY_S = 0.05, 0.05

@@ -22,8 +22,8 @@ from dm_msgs.srv import IngestFile, Measure
 
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.faults import bench_faults
+from fault_injection.rigs.common_steps import checked
 from fault_injection.rigs.driver_rig import ACTUATORS
-from fault_injection.rigs.parts import checked
 from fault_injection.rigs.process_rig import CURVATURE, ProcessRig, calibrated_rig
 
 #: Longest time for which a node is stopped, s.

@@ -16,8 +16,8 @@ from dm_msgs.srv import SetSignals
 
 from fault_injection.fault import Fault, FaultRecord
 from fault_injection.faults.driver_faults import far_shape, shape
+from fault_injection.rigs.common_steps import checked
 from fault_injection.rigs.driver_rig import ACTUATORS, DriverRig
-from fault_injection.rigs.parts import checked
 from fault_injection.rigs.relays import DatagramRelay, VanishingLink
 
 ROUNDS = 3

@@ -38,9 +38,9 @@ from dm_common.ros.worker import WorkerService
 from dm_controller.planning.mirror_model import CalibratedMirror
 from dm_controller.planning.target import FocusTarget
 from fault_injection.fault import FaultRecord
+from fault_injection.rigs.common_steps import overtaken, same_shape
 from fault_injection.rigs.driver_rig import SERIAL, DriverRig, RigError, end_process
 from fault_injection.rigs.forked_node import Process
-from fault_injection.rigs.parts import overtaken, same_shape
 from studies.benchmarks import stand_in_mirror
 
 LAW = "Prandtl-Ishlinskii"

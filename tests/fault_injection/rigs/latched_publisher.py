@@ -20,7 +20,7 @@ class LatchedPublisher(Node):
     """Does nothing but keep the message for late joiners."""
 
     def __init__(self) -> None:
-        super().__init__("latch", enable_rosout=False, start_parameter_services=False)
+        super().__init__("latched_publisher", enable_rosout=False, start_parameter_services=False)
         content = Path(self.declare_parameter("file", "").value).read_bytes()
         self._publisher = self.create_publisher(Calibration, "calibration", qos.LATCHED)
         self._publisher.publish(deserialize_message(content, Calibration))

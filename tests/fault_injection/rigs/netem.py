@@ -127,8 +127,8 @@ def bad_network(random: Random) -> Iterator[tuple[str, str, Netem]]:
         NotPermittedError: not on this machine.
     """
     with unconnected_hosts() as (left, right):
-        cable = Netem(left, right, random)
+        netem = Netem(left, right, random)
         try:
-            yield left, right, cable
+            yield left, right, netem
         finally:
-            cable.close()
+            netem.close()

@@ -40,7 +40,7 @@ class NetworkRig(FocusRig):
     """
 
     def __init__(self, folder: Path, domain: int, random: Random, **changes: Any) -> None:
-        self._latch: Process | None = None
+        self._publisher: Process | None = None
         self._stack = contextlib.ExitStack()
         try:
             self.left, self.right, self.netem = self._stack.enter_context(bad_network(random))
@@ -83,13 +83,13 @@ class NetworkRig(FocusRig):
     def publish_calibration(self, message: Calibration) -> None:
         """Latch it on the driver's side, in place of the last."""
         self.withdraw_calibration()
-        content, parameters = self.folder / "calibration.cdr", self.folder / "latch.yaml"
+        content, parameters = self.folder / "calibration.cdr", self.folder / "latched.yaml"
         content.write_bytes(serialize_message(message))
         parameters.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"file": str(content)}}}))
-        self._latch = self._start("fault_injection.rigs.latched_publisher", parameters, self.folder / "latch.log")
+        self._publisher = self._start("fault_injection.rigs.latched_publisher", parameters, self.folder / "latched.log")
 
     def withdraw_calibration(self) -> None:
         """Who latches it goes."""
-        latch, self._latch = self._latch, None
-        if latch is not None:
-            end_process(latch, signal.SIGINT, "the latch")
+        publisher, self._publisher = self._publisher, None
+        if publisher is not None:
+            end_process(publisher, signal.SIGINT, "the latched publisher")

@@ -61,7 +61,7 @@ class PokeCheck:
     findings: tuple[str, ...] = field(default=())
 
     @property
-    def standing(self) -> str:
+    def pose(self) -> str:
         """How the mirror stands in the maps, with standard errors."""
         found = self.registration
         if found is None:
@@ -135,8 +135,8 @@ def check_pokes(
         )
         return replace(nothing, findings=(*findings, problem))
     sign = np.sign(found).astype(np.int64)
-    standing, turned = _standing(registration, pitch(x, y))
-    findings += standing + _sign_findings(sign, active) + _place_findings(place)
+    pose, turned = _pose_findings(registration, pitch(x, y))
+    findings += pose + _sign_findings(sign, active) + _place_findings(place)
     for actuator, pair in double.items():
         findings.append(f"actuator {actuator + 1} moves the places of {pair[0] + 1} and {pair[1] + 1} together")
     alone = np.isin(np.arange(count), active) & ~np.isin(np.arange(count), list(double))
@@ -147,7 +147,7 @@ def check_pokes(
     return PokeCheck(registration, place, sign, np.abs(found), turned, tuple(findings))
 
 
-def _standing(found: Registration, step: float) -> tuple[list[str], bool]:
+def _pose_findings(found: Registration, step: float) -> tuple[list[str], bool]:
     """What of `found` stands otherwise than configured: sentences, and whether parameters of the maps cure it."""
     parts = []
     turn, sigma = np.degrees(found.turn), np.degrees(found.turn_sigma)

@@ -148,14 +148,14 @@ class GoodEnough:
 
     Args:
         until: m, as `HysteresisFit.held_out_max_zernike`.
-        tell: called with what each part of the run reached, m.
+        report: called with what each part of the run reached, m.
 
     Attributes:
         reached: m, after each part.
     """
 
-    def __init__(self, until: float, tell: Callable[[float], None] = lambda reached: None) -> None:
-        self._until, self._tell = until, tell
+    def __init__(self, until: float, report: Callable[[float], None] = lambda reached: None) -> None:
+        self._until, self._report = until, report
         self.reached: list[float] = []
 
     def __call__(self, outcome: Outcome) -> bool:
@@ -164,7 +164,7 @@ class GoodEnough:
         except TooFewMapsError:
             return False
         self.reached.append(found)
-        self._tell(found)
+        self._report(found)
         return found <= self._until or self._no_longer_better
 
     @property

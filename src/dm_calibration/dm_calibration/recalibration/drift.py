@@ -49,7 +49,7 @@ class Drift:
         revision: maps taken in.
         checked_ns: stamp of the last of them; 0 = none.
         surprising: maps in a row, the last ones, that disagreed.
-        evidence: (2, 2) sum of squares of the changes that were foretold to maps, in standard deviations, and of their
+        evidence: (2, 2) sum of squares of the changes that were predicted of maps, in standard deviations, and of their
             products with the changes that the maps showed; then the same of the changes by temperature alone.
         stuck: (N,) effective signals at which actuators stand that do not move any more; NaN = it moves.
         temperatures: (3,) degC, that gain and offset hold at, and the lowest and highest of the maps; NaN = not known.
@@ -88,7 +88,7 @@ class Drift:
         """K by which maps were colder or warmer than what gain and offset hold at, at most; 0 where not known."""
         return float(np.nan_to_num(np.abs(self.temperatures - self.temperatures[0]).max()))
 
-    def standing(self, effective: Floats) -> Floats:
+    def reached(self, effective: Floats) -> Floats:
         """Where the actuators stand when `effective` (N,) is asked for."""
         return np.where(np.isnan(self.stuck), effective, self.stuck)
 
@@ -160,6 +160,6 @@ def surprise_of(innovation: Floats, expected: Floats, factor: tuple[Floats, bool
     return float(max(together, single))
 
 
-def _share(foretold: float, borne_out: float) -> float:
+def _share(predicted: float, borne_out: float) -> float:
     """The positive-part estimate of a regression through the origin, less one standard error."""
-    return float(np.clip((borne_out - np.sqrt(foretold)) / foretold, 0.0, 1.0)) if foretold > 0.0 else 0.0
+    return float(np.clip((borne_out - np.sqrt(predicted)) / predicted, 0.0, 1.0)) if predicted > 0.0 else 0.0

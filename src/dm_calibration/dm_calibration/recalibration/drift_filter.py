@@ -8,7 +8,7 @@ gains and figure walk at random, so what is known of them fades with time; each 
 which is recursive least squares with that forgetting (Ljung, System Identification, 2nd ed., section 11.3).
 
 An estimate of drift is noise as well, and on a mirror that stands still nothing else: taken over as it is, it makes the
-calibration worse. So each map is first a test of what the maps before it made out: the change that they foretell,
+calibration worse. So each map is first a test of what the maps before it made out: the change that they predict,
 against the change that it shows. Only the share of the former that this evidence carries is used (the positive-part
 estimate of a regression through the origin, less one standard error), none of it before a second shape was measured.
 Changes by temperature are tested so by themselves.
@@ -57,9 +57,9 @@ class _Innovation(NamedTuple):
 
     Attributes:
         prior: (N + 3 R + 1, N + 3 R + 1) covariance of gains, figure, what temperature does and creep, at its time.
-        crept: (R,) m rms, what creep did by then as the maps before foretell it.
+        crept: (R,) m rms, what creep did by then as the maps before predict it.
         design: (R, N + 3 R + 1) what it shows of them.
-        foretold, warm, shown: (R,) change that the maps before foretell, that they foretell of the temperature, and
+        predicted, warm, shown: (R,) change that the maps before predict, that they predict of the temperature, and
             that it shows, m rms.
         expected: (R, R) covariance of their difference.
         factor: Cholesky factor of that.
@@ -69,7 +69,7 @@ class _Innovation(NamedTuple):
     prior: Floats
     crept: Floats
     design: Floats
-    foretold: Floats
+    predicted: Floats
     warm: Floats
     shown: Floats
     expected: Floats
@@ -141,7 +141,7 @@ class DriftFilter:
         stamp_ns = measured.stamp_ns
         seen = self._innovation(drift, measured, effective, repeat)
         prior, design, factor = seen.prior, seen.design, seen.factor
-        innovation = seen.shown - seen.foretold - seen.warm
+        innovation = seen.shown - seen.predicted - seen.warm
         shared = prior @ design.T
         gain, offset, thermal, crept = self._parts(shared @ cho_solve(factor, innovation))
         # Joseph form: symmetric and positive whatever the rounding.
@@ -151,11 +151,11 @@ class DriftFilter:
         covariance = left @ prior @ left.T + kalman @ noise @ kalman.T
         evidence = drift.evidence.copy()
         if not repeat:  # a repeat shares the error of the law with the map before it
-            weighed, warm = cho_solve(factor, seen.foretold), cho_solve(factor, seen.warm)
-            rest = seen.shown - drift.thermal_trust * seen.warm, seen.shown - drift.trust * seen.foretold
+            weighed, warm = cho_solve(factor, seen.predicted), cho_solve(factor, seen.warm)
+            rest = seen.shown - drift.thermal_trust * seen.warm, seen.shown - drift.trust * seen.predicted
             evidence[0] *= EVIDENCE_KEPT
             evidence[1] *= EVIDENCE_KEPT if seen.warm.any() else 1.0  # a map that is not warmer says nothing of it
-            evidence += (weighed @ seen.foretold, weighed @ rest[0]), (warm @ seen.warm, warm @ rest[1])
+            evidence += (weighed @ seen.predicted, weighed @ rest[0]), (warm @ seen.warm, warm @ rest[1])
         known = np.append(drift.temperatures, measured.temperature)
         updated = replace(
             drift,
@@ -195,8 +195,8 @@ class DriftFilter:
             MapNotUsableError: one stands where it should, as far as the map shows.
         """
         seen = self._innovation(drift, measured, effective, repeat)
-        away, sigma = displacement(seen.shown - seen.foretold - seen.warm, self._gain, seen.factor, actuators)
-        at = drift.standing(effective)
+        away, sigma = displacement(seen.shown - seen.predicted - seen.warm, self._gain, seen.factor, actuators)
+        at = drift.reached(effective)
         stuck = drift.stuck.copy()
         for actuator, more, error in zip(actuators, away, sigma, strict=True):
             if np.isnan(stuck[actuator]) and abs(more) < DISPLACED_SIGMAS * error:
@@ -236,8 +236,8 @@ class DriftFilter:
         predicted_sag = changed.sag_offset + changed.influence_sag @ effective
         zernike_error = measured.coefficients - changed.zernike_offset - changed.influence_zernike @ effective
         sag_error = fill_gaps(measured.sag[None], predicted_sag[None], self._fit.points)[0] - predicted_sag
-        foretold, warm = moved @ drift.gain + drift.figure, warmed @ drift.thermal
-        used = drift.trust * foretold + drift.thermal_trust * warm
+        predicted, warm = moved @ drift.gain + drift.figure, warmed @ drift.thermal
+        used = drift.trust * predicted + drift.thermal_trust * warm
         shown = self.reduction.reduce(zernike_error, sag_error) + used
         # What the calibration itself does not know of its influence function, beyond gains.
         leverage = effective @ self._fit.signal_covariance @ effective
@@ -246,7 +246,7 @@ class DriftFilter:
             unknown = np.column_stack((moved.sum(axis=1), figure)) @ drift.thermal
             expected += (drift.thermal_trust * drift.temperature_range) ** 2 * np.outer(unknown, unknown)
         return _Innovation(
-            prior, drift.crept, design, foretold, warm, shown, expected, cho_factor(expected), zernike_error, sag_error
+            prior, drift.crept, design, predicted, warm, shown, expected, cho_factor(expected), zernike_error, sag_error
         )
 
     def warm_error(self, drift: Drift) -> float:

@@ -67,7 +67,7 @@ def run_calibration(client: Any, goal: Any) -> Any:
     return result
 
 
-def foretold(client: Any, goal: Any) -> str:
+def expected_run(client: Any, goal: Any) -> str:
     """How long the whole run of a Calibrate goal takes and how good it will be; nothing moves."""
     goal.dry_run = True
     try:
@@ -112,10 +112,10 @@ def show_result(result: Any, calibration: Any = None) -> None:
     if result.hysteresis_model:
         promised = promise(promise_of(calibration)) if calibration is not None else "none while it is not in use"
         expected = result.expected_max_zernike
-        foretold = f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
+        beforehand = f" ({in_nanometres(expected)} was expected beforehand)" if expected > 0.0 else ""
         console.print(
             f"promise: {promised} for the largest coefficient, from "
-            f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{foretold}; hysteresis "
+            f"{in_nanometres(result.hysteresis_held_out_max_zernike)} of moves held out{beforehand}; hysteresis "
             f"{result.hysteresis_model}"
         )
     if calibration is not None:
@@ -247,7 +247,7 @@ def calibrate(
             start_fresh(client)
         try:
             if not dry_run and plan == CalibrationPlan.hysteresis:
-                console.print(f"expected: {foretold(client, goal)}", soft_wrap=True)
+                console.print(f"expected: {expected_run(client, goal)}", soft_wrap=True)
             result = client.calibrate(goal) if dry_run else run_calibration(client, goal)
             calibration = made_by(client, result) if activate and not dry_run else None
         except DeformableMirrorError as error:

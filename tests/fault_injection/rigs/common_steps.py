@@ -1,4 +1,4 @@
-"""What several faults do with a rig: judge what reached its electronics, and get in the driver's way."""
+"""Steps that several faults have in common: judge what reached the electronics, and get in the driver's way."""
 
 from __future__ import annotations
 
