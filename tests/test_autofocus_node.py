@@ -378,9 +378,11 @@ def test_images_without_stamps_are_named(scene: FilmedScene, observer: Observer)
 
 @pytest.mark.parametrize(
     ("rate", "code", "text"),
-    [(4.0, ErrorCode.TIMEOUT, r"image_timeout = 0.1 s: .* one in 0.2\d* s; image_timeout must be above 0.5"),
-     (1000.0, ErrorCode.OK, "sharpest at")],
-)  # fmt: skip
+    [
+        (4.0, ErrorCode.TIMEOUT, r"image_timeout = 0.1 s: .* one in 0.2\d* s; image_timeout must be above 0.5"),
+        (1000.0, ErrorCode.OK, "sharpest at"),
+    ],
+)
 def test_a_slow_camera_is_named_and_a_fast_one_is_no_harm(
     start: Start, observer: Observer, rate: float, code: int, text: str
 ) -> None:

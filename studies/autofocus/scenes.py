@@ -171,10 +171,16 @@ class SceneCamera:
         inside = square <= 1
         rng = np.random.default_rng((19, scene.seed))  # the same surface for each wavelength
         shapes = (
-            x**2 - y**2, 2 * x * y, (3 * square - 2) * x, (3 * square - 2) * y, x**3 - 3 * x * y**2,
-            3 * x**2 * y - y**3, 6 * square**2 - 6 * square + 1, (4 * square - 3) * (x**2 - y**2),
+            x**2 - y**2,
+            2 * x * y,
+            (3 * square - 2) * x,
+            (3 * square - 2) * y,
+            x**3 - 3 * x * y**2,
+            3 * x**2 * y - y**3,
+            6 * square**2 - 6 * square + 1,
+            (4 * square - 3) * (x**2 - y**2),
             (4 * square - 3) * 2 * x * y,
-        )  # fmt: skip
+        )
         surface = sum(weight * shape for weight, shape in zip(rng.standard_normal(len(shapes)), shapes, strict=True))
         # Print-through of the actuators: ripples of their pitch.
         surface = surface + 0.5 * np.cos(14 * x + rng.uniform(0, 6)) * np.cos(14 * y + rng.uniform(0, 6))

@@ -39,9 +39,12 @@ TRANSFER_ERROR_NEAR = 0.1
 NOISE_RATIO = 1.1
 #: Power that is none.
 TINY = 1e-18
-#: Factors on the focal length that are tried, images that count by their distance from the focus in steps of the table,
-#: and how much better another focal length must explain them to be named (twice a log ratio).
-SCALES, FITTED, BETTER = (0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0), 48.0, 60.0
+#: Factors on the focal length that are tried.
+SCALES = (0.125, 0.18, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
+#: Images that count by their distance from the focus in steps of the table.
+FITTED = 48.0
+#: How much better another focal length must explain them to be named (twice a log ratio).
+BETTER = 60.0
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,10 @@ STRAY = 0.5
 #: An image so many times as far above the least sharp as all but those within so many depths of focus of it, of which
 #: there are so many, is near the focus.
 OUTSTANDING, HILL, FAR_IMAGES = 3.0, 20.0, 2
-#: Where the last images are, and more of them while the standard error is above so many depths of focus, in steps.
-LAST, MORE, PRECISION = (-1, 1, -2, 2), (-1.5, 1.5, -2.5, 2.5, -0.6, 0.6), 0.25
+#: Where the last images are, and more of them while the standard error is above PRECISION, in steps.
+LAST, MORE = (-1, 1, -2, 2), (-1.5, 1.5, -2.5, 2.5, -0.6, 0.6)
+#: In depths of focus.
+PRECISION = 0.25
 #: Standard error with which no place is found, in depths of focus; how often a place may lead to another.
 WORST, RECENTRED = 1.5, 3
 #: How far from the focus an image is blurred rather than aberrated, in depths of focus; relative error of its transfer.

@@ -19,9 +19,10 @@ RATE_MIN = 1e-3
 
 #: Residual of the solved weights, relative: effective signals are within 1e-7 then.
 SOLVED = 1e-7
-#: Fewest coefficients of a Duhem operator of its own, the step for derivatives by them, their largest change, and the
-#: weight of an operator below which nothing can be said of them.
-DUHEM_ORDERS, SLOPE_STEP, CHANGE_MAX, DUHEM_WEIGHT_MIN = 3, 0.02, 1.0, 0.01
+#: Fewest coefficients of a Duhem operator of its own, and its weight below which nothing can be said of them.
+DUHEM_ORDERS, DUHEM_WEIGHT_MIN = 3, 0.01
+#: The step for derivatives by them, and their largest change.
+SLOPE_STEP, CHANGE_MAX = 0.02, 1.0
 
 
 def play_values(signals: Floats, radius: Floats) -> Floats:

@@ -45,16 +45,19 @@ Rows = NDArray[np.bool_]
 
 #: Patterns that are kept of the prior.
 PATTERNS = 40
-#: Prior of the weights: standard deviation in all, correlation length and decay over the half-width, and the power by
-#: which the variance falls with the order. Held-out errors change by less than a tenth when any is doubled or halved.
-AMPLITUDE, CORRELATION, DECAY, ORDER_POWER = 0.2, 0.5, 0.35, 3.0
+#: Prior of the weights: standard deviation in all, and the power by which the variance falls with the order. Held-out
+#: errors change by less than a tenth when any of these four is doubled or halved.
+AMPLITUDE, ORDER_POWER = 0.2, 3.0
+#: Correlation length and decay of the weights over the half-width.
+CORRELATION, DECAY = 0.5, 0.35
 #: Variance of the loading curve beside that of all play operators together.
 LOADING = 0.3
 #: Prior standard deviations of a Duhem operator's weight, and of that times the change of a coefficient of its slope.
 DUHEM_WEIGHT, DUHEM_CHANGE = 0.3, 0.1
-#: Prior of the creep spectrum: standard deviation relative to the common rate, correlation over elements, and the
-#: spread between actuators relative to that.
-SPECTRUM, SPECTRUM_CORRELATION, SPECTRUM_SPREAD = 0.5, 12.0, 0.3
+#: Prior of the creep spectrum: standard deviation relative to the common rate, and between actuators relative to that.
+SPECTRUM, SPECTRUM_SPREAD = 0.5, 0.3
+#: Its correlation over elements.
+SPECTRUM_CORRELATION = 12.0
 #: Loops are followed otherwise than the rest by elements of up to so many seconds: prior standard deviation of that.
 LAG_S, LAG = 30.0, 0.02
 LAGS = int(np.count_nonzero(CREEP_TIMES <= LAG_S))
@@ -129,7 +132,8 @@ class OwnLaws:
         """
         actuators = self._plain.shape[2]
         if isinstance(start, OwnFit):
-            patterns, creep, scatter, slope = start.patterns, start.creep, start.scatter, start.law.duhem_slope
+            patterns, creep = start.patterns, start.creep
+            scatter, slope = start.scatter, start.law.duhem_slope
         else:
             patterns = np.eye(self._plain.shape[1], 1) * np.ones(actuators)
             # Where the maps show no common creep, no actuator has any.

@@ -84,7 +84,9 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
     seen[:, 0], seen[turning, 1] = measured[: len(orders)], measured[len(orders) :]
     flats = list(dict.fromkeys(name for test in tests for name in (test.reference, test.part)))
     sag, everywhere = np.where(disc, 0.0, np.nan), aperture.places(*np.nonzero(disc))
-    squares, judged, freedom, worst, open_orders = 0.0, 0.0, 0, 0.0, set[int]()
+    squares = judged = worst = 0.0
+    freedom = 0
+    open_orders: set[int] = set()
     for (n, m), coefficients in zip(orders, seen, strict=True):
         if n < 2:  # piston and tilt are those of the mounts
             continue

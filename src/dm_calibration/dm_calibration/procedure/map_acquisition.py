@@ -56,7 +56,8 @@ class MapAcquisition:
     ) -> None:
         """`note` takes each event; `checkpoint` is asked before a map, `guard` after it: their errors end the run."""
         self._bench, self._mirror, self._options = bench, mirror, options
-        self.outcome, self._note, self._checkpoint, self._guard = outcome, note, checkpoint, guard
+        self.outcome = outcome
+        self._note, self._checkpoint, self._guard = note, checkpoint, guard
         self._bump = BumpCheck(options.bump, mirror.rest)
         self._swung = False
         for record, centre in zip(outcome.records, outcome.centres, strict=True):

@@ -71,7 +71,8 @@ class Procedure:
         self._plan, self._mirror, self._bench = plan, mirror, bench
         self._options = options or ProcedureOptions()
         self._model = model
-        self._progress, self._cancelled, self._keep, self._guard = progress, cancelled, keep, guard
+        self._progress, self._keep = progress, keep
+        self._cancelled, self._guard = cancelled, guard
         self._failures = 0
         self._enough = enough
         self._maps = MapAcquisition(bench, mirror, self._options, self.outcome, self._note, self._checkpoint, guard)

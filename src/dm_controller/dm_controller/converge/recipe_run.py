@@ -42,7 +42,8 @@ class RecipeRun:
     """
 
     def __init__(self, bench: LoopBench, store: Client, calibration: Liveliness) -> None:
-        self._values, self._bench, self._store, self._calibration = bench.parameters, bench, store, calibration
+        self._bench, self._values = bench, bench.parameters
+        self._store, self._calibration = store, calibration
 
     def run(self, handle: WorkerGoal) -> tuple[str, Any]:
         """Outcome and result of the goal."""

@@ -117,7 +117,8 @@ class PreparedInverse:
     """
 
     def __init__(self, law: HysteresisModel, state: HysteresisState, limits: Limits) -> None:
-        self.state, self._limits, self._low, self._high = state, limits, limits.low, limits.high
+        self.state, self._limits = state, limits
+        self._low, self._high = limits.low, limits.high
         self._rate = -1.0 / law.creep_time
         self._law, self._share, self._lag = law, np.atleast_2d(law.creep_share), np.atleast_2d(law.lag_share)
         self._rounds = LAG_ROUNDS if law.lag_spectrum.size else 1

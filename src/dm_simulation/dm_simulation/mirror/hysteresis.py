@@ -97,7 +97,8 @@ class JilesAthertonHysteresis:
     """
 
     def __init__(self, count: int, width: Array, pinning: Array, reversible: Array, coupling: Array) -> None:
-        self._width, self._pinning, self._reversible, self._coupling = width, pinning, reversible, coupling
+        self._width, self._pinning = width, pinning
+        self._reversible, self._coupling = reversible, coupling
         self._m = np.zeros(count)
         self._u = np.zeros(count)
 
