@@ -4,29 +4,49 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from contextlib import AbstractContextManager
+from typing import Any
 
 from dm_msgs.action import Degauss, MoveFocus
-from dm_msgs.msg import FocusRequest
+from dm_msgs.msg import FocusRequest, FocusState
 from dm_msgs.srv import Flatten, SetFocus
 from rclpy.node import Node
 
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.ros.clients import ThreadedActionClient
+from dm_common.ros.lifecycle import ManagedNode
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, WorkerService, sleep
 from dm_common.values import without_figures
 from dm_controller.conditioning import Run
 from dm_controller.driver_monitor import CONFIRM_S
+from dm_controller.focus_controller import FocusController
 from dm_controller.focus_parameters import MOVE_FOCUS
-from dm_controller.focus_types import Order, StartDegauss
-
-if TYPE_CHECKING:
-    from dm_controller.focus_controller_node import FocusControllerNode
+from dm_controller.focus_types import Moment, Order, Outcome, StartDegauss
 
 #: How often an order is looked after, s: by an action, by a service, and how often feedback is published.
 POLL_S, SERVICE_POLL_S, FEEDBACK_S = 0.002, 0.001, 0.1
 #: Longest that a confirmation takes beyond the time after which the controller itself gives a command up, s.
 GRACE_S = 1.0
+
+
+class FocusHost(ManagedNode):
+    """The node, as services and actions ask it from their threads."""
+
+    def controller(self) -> AbstractContextManager[tuple[FocusController, Moment]]:
+        """The controller, for one thread at a time, and what time it is."""
+        raise NotImplementedError
+
+    def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
+        """Judge a request and, unless it is refused or a dry run, carry it out."""
+        raise NotImplementedError
+
+    def state(self, outcome: Outcome) -> FocusState:
+        """What came of a request."""
+        raise NotImplementedError
+
+    def stop(self, order: Order) -> bool:
+        """Leave the move of an order where it is; False = another shape was asked for since."""
+        raise NotImplementedError
 
 
 class FocusServices:
@@ -37,7 +57,7 @@ class FocusServices:
         driver_timeout: s, now; 0 = never.
     """
 
-    def __init__(self, node: FocusControllerNode, driver_timeout: Callable[[], float]) -> None:
+    def __init__(self, node: FocusHost, driver_timeout: Callable[[], float]) -> None:
         self._node, self._driver_timeout = node, driver_timeout
         WorkerService(node, SetFocus, "set_focus", self._on_set_focus)
         WorkerService(node, Flatten, "flatten", self._on_flatten)
@@ -72,7 +92,7 @@ class MoveFocusAction:
         settle_time: s, now, for goals that name none.
     """
 
-    def __init__(self, node: FocusControllerNode, settle_time: Callable[[], float]) -> None:
+    def __init__(self, node: FocusHost, settle_time: Callable[[], float]) -> None:
         self._node, self._settle_time = node, settle_time
         self._server = WorkerActionServer(
             node, MoveFocus, "move_focus", self._run, exclusive="preempt", fields=MOVE_FOCUS

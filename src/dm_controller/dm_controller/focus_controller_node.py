@@ -27,10 +27,10 @@ from dm_common.hysteresis.creep_record import CreepRecorder
 from dm_common.messages import doubles, estimate_message, time_message
 from dm_common.ros import qos
 from dm_common.ros.executor import run_node
-from dm_common.ros.lifecycle import Health, ManagedNode
+from dm_common.ros.lifecycle import Health
 from dm_common.ros.parameters import frame_id
 from dm_common.ros.qos import GONE, LEASE_S
-from dm_controller.focus_actions import DegaussClient, FocusServices, MoveFocusAction
+from dm_controller.focus_actions import DegaussClient, FocusHost, FocusServices, MoveFocusAction
 from dm_controller.focus_controller import SLOW_PERIOD_S, FocusController
 from dm_controller.focus_messages import capabilities_message, health, state_message
 from dm_controller.focus_parameters import PARAMETERS
@@ -55,7 +55,7 @@ STEADY_PERIOD_S = 0.5
 RECORD_PERIOD_S = 30.0
 
 
-class FocusControllerNode(ManagedNode):
+class FocusControllerNode(FocusHost):
     """Subscriptions and timers run in the executor, services and actions in threads of their own. See README.
 
     While it is not active it goes on following the actuators, has no calibration in use, and sends no command.
@@ -116,7 +116,6 @@ class FocusControllerNode(ManagedNode):
 
     @contextmanager
     def controller(self) -> Iterator[tuple[FocusController, Moment]]:
-        """The controller, for one thread at a time, and what time it is."""
         with self._lock:
             yield self._controller, self._now()
 
@@ -203,7 +202,6 @@ class FocusControllerNode(ManagedNode):
             self._quick.reset()
 
     def state(self, outcome: Outcome) -> FocusState:
-        """What came of a request."""
         state = state_message(outcome, self._values, self._forecast.share)
         state.header.frame_id = self._frame_id
         return state
@@ -234,14 +232,12 @@ class FocusControllerNode(ManagedNode):
     # --- requests, and what the actions ask for, from any thread ---
 
     def order(self, message: FocusRequest, dry_run: bool = False) -> Order:
-        """Judge a request and, unless it is refused or a dry run, carry it out."""
         with self.controller() as (controller, now):
             order, effects = controller.request(message, now, dry_run)
             self._do(effects, now)
         return order
 
     def stop(self, order: Order) -> bool:
-        """Leave the move of an order where it is; False = another shape was asked for since."""
         with self.controller() as (controller, now):
             effects = controller.stop(order, now)
             self._do(effects or (), now)

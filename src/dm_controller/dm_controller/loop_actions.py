@@ -18,13 +18,13 @@ from dm_common.hysteresis.model import HysteresisState
 from dm_common.ros import qos
 from dm_common.ros.bench_services import BenchServices
 from dm_common.ros.worker import WorkerActionServer, WorkerGoal, wait_for_clock
+from dm_controller.focus_actions import FocusHost
 from dm_controller.focus_parameters import BUILD_RECIPES, CONVERGE
 from dm_controller.planning.active_calibration import ActiveCalibration
 from dm_controller.planning.target import FocusTarget
 
 if TYPE_CHECKING:
     from dm_common.measurement import Measurement
-    from dm_controller.focus_controller_node import FocusControllerNode
 
 #: What requests are told while a goal of an action runs.
 BUSY = {
@@ -38,7 +38,7 @@ OUTCOMES: dict[int, str] = {ErrorCode.OK: "succeed", ErrorCode.CANCELED: "cancel
 class LoopHost:
     """What closed loops ask of the focus controller, from any thread."""
 
-    def __init__(self, node: FocusControllerNode) -> None:
+    def __init__(self, node: FocusHost) -> None:
         self._node = node
 
     def target(self, request: FocusRequest) -> FocusTarget:
