@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from dm_common.names import UnknownNameError
+from dm_common.errors import UnknownNameError
 from dm_controller.converge.closed_loop import LoopOptions
 from studies.comparison.compare import (
     CLOSED,

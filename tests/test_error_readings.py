@@ -12,7 +12,7 @@ from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.regression import TooFewMapsError
 from dm_calibration.regression.stepwise import SelectionOptions
 from dm_calibration.regression.surface_error import MODEL
-from dm_common.names import UnknownNameError
+from dm_common.errors import UnknownNameError
 from hysteretic_mirror import calibrated, calibrated_by_pokes
 from studies.paper.readings import Reading, regress_surface_errors
 from studies.paper.reported import TEST_SURFACES as TEST_SET

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dm_common.errors import UnknownNameError
 from dm_common.limits import Limits
-from dm_common.names import UnknownNameError
 from dm_common.optics.zernike import PISTON_TILT
 from dm_controller.planning.mirror_model import CalibratedMirror, InfluenceModel, target_shape
 from dm_controller.planning.target import FocusTarget

@@ -40,7 +40,7 @@ from dm_calibration.regression.surface_error import (
     surface_errors,
 )
 from dm_common import Floats
-from dm_common.names import unknown_name
+from dm_common.errors import unknown_name
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.zernike import TERM_RMS, basis
 from studies.paper.reported import TEST_SURFACES

@@ -10,9 +10,8 @@ from dm_calibration.calibration import Calibration
 from dm_calibration.calibrator import Provenance
 from dm_calibration.store.calibration_store import CalibrationStore, raw_hash
 from dm_common.atomic_write import StoreError
-from dm_common.errors import ErrorCode, Refusal
+from dm_common.errors import ErrorCode, Refusal, UnknownNameError
 from dm_common.mirror import Mirror, mismatch
-from dm_common.names import UnknownNameError
 from dm_common.recipes import RecipeBook, RecipeError
 
 

@@ -10,7 +10,7 @@ import pytest
 from dm_calibration.hysteresis.excitation import REPEATS
 from dm_calibration.influence.surfaces import MODEL_NAMES, TABLE_1
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, StepKind, check_shape, make_plan
-from dm_common.names import UnknownNameError
+from dm_common.errors import UnknownNameError
 from linear_mirror import make_mirror
 from steady_mirror import SteadyMirror
 

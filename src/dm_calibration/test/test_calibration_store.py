@@ -24,8 +24,8 @@ from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.store.calibration_store import CalibrationStore, check_id
 from dm_calibration.store.hdf5_image import content_hash, read_image, write_image
 from dm_common.atomic_write import StoreError
+from dm_common.errors import UnknownNameError
 from dm_common.measurement import Measurement
-from dm_common.names import UnknownNameError
 from linear_mirror import LinearMirror, make_mirror
 
 MIRROR = make_mirror(rings=1, serial="S 7/é")

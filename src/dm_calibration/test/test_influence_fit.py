@@ -12,9 +12,9 @@ from dm_calibration.influence.fit import FitOptions, InfluenceFit, fit_influence
 from dm_calibration.influence.maps import MapSet
 from dm_calibration.influence.regression import METHODS, TooFewMapsError, drift_columns, make_design
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
+from dm_common.errors import UnknownNameError
 from dm_common.measurement import Measurement
 from dm_common.mirror import Mirror
-from dm_common.names import UnknownNameError
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from linear_mirror import LinearMirror, make_mirror
 

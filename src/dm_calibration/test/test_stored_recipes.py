@@ -20,8 +20,7 @@ from dm_calibration.procedure.plan import PlanKind, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_calibration.store.calibration_store import CalibrationStore
 from dm_common.atomic_write import StoreError
-from dm_common.errors import ErrorCode, Refusal, error_code
-from dm_common.names import UnknownNameError
+from dm_common.errors import ErrorCode, Refusal, UnknownNameError, error_code
 from dm_common.recipes import NO_RECIPES, Recipe, RecipeBook, RecipeError
 from hysteretic_mirror import MIRROR, lagging_bench
 from linear_mirror import make_mirror

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dm_calibration.influence import surfaces
+from dm_common.errors import UnknownNameError
 from dm_common.mirror import Mirror
-from dm_common.names import UnknownNameError
 from dm_common.optics.zernike import NAMES, TERMS
 from linear_mirror import LinearMirror, make_mirror
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dm_msgs.msg import ErrorCode as Message
 
-from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal, error_code
-from dm_common.names import UnknownNameError
+from dm_common.errors import Cancelled, ErrorCode, MeasurementError, Refusal, UnknownNameError, error_code
 
 
 def test_codes_are_those_of_the_interface() -> None:

@@ -27,8 +27,8 @@ from dm_calibration.influence.regression import (
 )
 from dm_calibration.influence.weights import check_epsilon
 from dm_common import Floats
+from dm_common.errors import unknown_name
 from dm_common.limits import Limits
-from dm_common.names import unknown_name
 from dm_common.optics.piston_tilt import rms
 from dm_common.optics.sampling import SamplePoints
 from dm_common.optics.zernike import PISTON_TILT

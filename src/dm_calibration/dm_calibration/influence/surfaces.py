@@ -12,9 +12,9 @@ import numpy as np
 
 from dm_common import Floats
 from dm_common.bounded import BoundedProgramme
+from dm_common.errors import unknown_name
 from dm_common.limits import Limits
 from dm_common.mirror import Mirror
-from dm_common.names import unknown_name
 from dm_common.optics.conic import conic_coefficients
 from dm_common.optics.piston_tilt import remove_piston_tilt, rms
 from dm_common.optics.sampling import SamplePoints

@@ -9,7 +9,7 @@ from pathlib import Path
 from dm_calibration.calibration import Calibration, CalibrationFileError, from_columns, to_columns
 from dm_calibration.store.hdf5_image import ImageError, content_hash, read_image, write_image
 from dm_common.atomic_write import StoreError, storing, write_whole
-from dm_common.names import UnknownNameError
+from dm_common.errors import UnknownNameError
 
 SUFFIX = ".h5"
 #: What was measured, and where: never changed after a calibration was stored.

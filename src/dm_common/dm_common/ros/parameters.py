@@ -17,7 +17,7 @@ from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from dm_common.errors import Refusal
+from dm_common.errors import Refusal, unknown_name
 from dm_common.values import Value, real, reals, switch, text, texts, whole, wholes
 
 __all__ = [
@@ -207,7 +207,7 @@ def declare(
         """As `Parameter.check` does; what is wrong stays as it is, to be refused."""
         for change in changes:
             if not node.has_parameter(change.name):
-                raise _RefusedParameterError(_unknown(change.name, by_name))
+                raise _RefusedParameterError(str(unknown_name("parameter", change.name, by_name)))
         return [_converted(by_name[item.name], item) if item.name in by_name else item for item in changes]
 
     def validate(changes: list[RosParameter]) -> SetParametersResult:
@@ -281,19 +281,13 @@ def _converted(parameter: Parameter, change: RosParameter) -> RosParameter:
         raise _RefusedParameterError(str(error)) from error  # what rclpy says of another type names no parameter
 
 
-def _unknown(name: str, known: Mapping[str, Parameter]) -> str:
-    from dm_common.names import unknown_name  # few ever ask
-
-    return str(unknown_name("parameter", name, known))
-
-
 def _judge_unknown(node: Node, name: str, known: Mapping[str, Parameter], values: Values) -> None:
     """A parameter that is given but not declared: refused where it can only be meant for this node, else a warning.
 
     A file for all nodes (`/**:`) may well hold what is meant for others.
     """
     groups = {parameter.partition(".")[0] for parameter in known if "." in parameter}
-    text = f"{node.get_name()}: {_unknown(name, known)}"
+    text = f"{node.get_name()}: {unknown_name('parameter', name, known)}"
     if ("." in name and name.partition(".")[0] in groups) or difflib.get_close_matches(name, known, 1, NEAR):
         values.problems[name] = text
     else:

@@ -4,8 +4,8 @@ from collections.abc import Collection
 
 from numpy.typing import ArrayLike
 
+from dm_common.errors import UnknownNameError
 from dm_common.limits import Limits
-from dm_common.names import UnknownNameError
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_controller.solvers.base import Solver
 from dm_controller.solvers.least_squares import AZreg, AZWreg, Bounded, IterativeLearning, PseudoInverse

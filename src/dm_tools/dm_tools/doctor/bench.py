@@ -11,7 +11,7 @@ from typing import Any
 
 from dm_bringup.nodes import NODES, SuiteNode, nodes_of
 from dm_bringup.suite import Config, ConfigError, load_config
-from dm_common.names import unknown_name
+from dm_common.errors import unknown_name
 from dm_common.ros.domains import held_by, holders
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
 from dm_tools.doctor.finding import Check, Finding
