@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dm_calibration.procedure.forecast import Forecast, GoodEnough, forecast, foreseen
+from dm_calibration.procedure.forecast import Forecast, GoodEnough, expected_end, forecast
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from linear_mirror import make_mirror
@@ -56,10 +56,10 @@ def test_of_a_mirror_never_calibrated_is_said_what_others_reached() -> None:
 def test_what_is_left_follows_from_what_is_reached() -> None:
     plan = make_plan(PlanKind.HYSTERESIS, make_mirror(), PlanOptions(hysteresis_maps=300, until=2e-9))
     first, *ends = sorted(plan.ends)
-    end, expected = foreseen(plan, first - 1, 3e-9, 2e-9)
+    end, expected = expected_end(plan, first - 1, 3e-9, 2e-9)
     assert end in ends and 1.7e-9 < expected <= 2e-9
-    assert all(foreseen(plan, first - 1, 3e-9, 3e-9 * (first / other) ** 0.5)[0] == other for other in ends)
-    end, expected = foreseen(plan, first - 1, 3e-9, 1e-10)
+    assert all(expected_end(plan, first - 1, 3e-9, 3e-9 * (first / other) ** 0.5)[0] == other for other in ends)
+    end, expected = expected_end(plan, first - 1, 3e-9, 1e-10)
     assert end == len(plan.steps) and 1e-9 < expected < 2e-9
 
 

@@ -15,7 +15,7 @@ from dm_calibration.calibrator import Provenance, calibrate, check_fit, dropped_
 from dm_calibration.influence.fit import fit_influence
 from dm_calibration.influence.poke_cure import parameter_text, poke_cure
 from dm_calibration.procedure.event_frames import Storing
-from dm_calibration.procedure.forecast import GoodEnough, forecast, foreseen, step_times
+from dm_calibration.procedure.forecast import GoodEnough, expected_end, forecast, step_times
 from dm_calibration.procedure.plan import LAST_PART_ENDS, Plan, PlanKind, PlanOptions, StepKind, make_plan
 from dm_calibration.procedure.procedure import Procedure, Progress
 from dm_calibration.procedure.recorded_run import plan_text
@@ -193,7 +193,7 @@ class CalibrateAction:
         def report_reached(reached: float) -> None:
             nonlocal end
             feedback.reached_max_zernike = reached
-            end, feedback.expected_max_zernike = foreseen(plan, feedback.step, reached, handle.request.until)
+            end, feedback.expected_max_zernike = expected_end(plan, feedback.step, reached, handle.request.until)
             self._node.get_logger().info(f"{len(run.outcome.records)} maps: right to {reached * 1e9:.2f} nm")
 
         enough = self._enough = GoodEnough(handle.request.until, report_reached)

@@ -92,17 +92,17 @@ def reference_from_flats(tests: Sequence[FlatTest]) -> FlatError:
             continue
         matrix = _equations(tests, flats, m)
         inverse = np.linalg.pinv(matrix, rcond=DETERMINED)
-        told = np.isclose(np.diag(inverse @ matrix), 1.0)[: 2 if m else 1]
+        determined = np.isclose(np.diag(inverse @ matrix), 1.0)[: 2 if m else 1]
         solution = inverse @ coefficients.T.ravel()
         apart = float(np.square(coefficients.T.ravel() - matrix @ solution).sum())
         squares += apart
         if n <= MAX_ORDER:  # the bound is for these, which retrace error and vibration spoil more than higher orders
             judged += apart
             freedom += (2 if m else 1) * len(tests) - int(np.linalg.matrix_rank(matrix, rtol=DETERMINED))
-        worst = max(worst, *np.linalg.norm(inverse[: len(told)], axis=1)[told], 0.0)
-        if not told.all():
+        worst = max(worst, *np.linalg.norm(inverse[: len(determined)], axis=1)[determined], 0.0)
+        if not determined.all():
             open_orders.add(m)
-        known = complex(*np.where(told, solution[: len(told)], 0.0))
+        known = complex(*np.where(determined, solution[: len(determined)], 0.0))
         sag[disc] += np.real(known * _term(everywhere, n, m))
     if len(open_orders) == ORDER + 1:
         raise ValueError(f"{len(tests)} maps of {', '.join(flats)} tell no flat from another: exchange or turn them")

@@ -112,7 +112,7 @@ def step_times(steps: Sequence[Step], settle_time: float, map_time: float) -> Fl
     return np.array([map_time + step.settle_share * settle_time + step.dwell for step in steps])
 
 
-def foreseen(plan: Plan, done: int, reached: float, until: float) -> tuple[int, float]:
+def expected_end(plan: Plan, done: int, reached: float, until: float) -> tuple[int, float]:
     """The number of steps of `plan` after which `until` (m) is expected, or all, and what is expected then, m.
 
     It falls as the root of the number of maps.
