@@ -84,8 +84,9 @@ class AutofocusNode(ManagedNode):
             raise Refusal(ErrorCode.TIMEOUT, gone() or f"focus_controller: {error}") from error
         response.state = answer.state
         response.error_code, response.message = answer.error_code, answer.message
-        if answer.error_code == ErrorCode.UNREACHABLE and self._probe.capabilities is not None:
-            response.message += f"; the camera focuses {self._range_text(self._probe.capabilities)}"
+        able = self._probe.capabilities
+        if answer.error_code == ErrorCode.UNREACHABLE and able is not None and able.error_code == ErrorCode.OK:
+            response.message += f"; the camera focuses {self._range_text(able)}"
         return response
 
     def _on_get_focus_range(

@@ -33,7 +33,7 @@ def ready_capabilities(probe: FocusProbe) -> Capabilities:
     capabilities = probe.capabilities
     if capabilities is None:
         raise Refusal(ErrorCode.TIMEOUT, "no capabilities from focus_controller yet: is it running?")
-    if capabilities.quality == Capabilities.UNCALIBRATED:
+    if capabilities.quality == Capabilities.UNCALIBRATED or capabilities.error_code != ErrorCode.OK:
         raise Refusal(capabilities.error_code or ErrorCode.NOT_CALIBRATED, capabilities.message)
     return capabilities
 

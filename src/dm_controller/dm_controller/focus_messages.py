@@ -1,12 +1,14 @@
 """Between the messages of the focus controller's node and the types it works with."""
 
 import array
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from dm_msgs.msg import Calibration, Capabilities, FocusState, MirrorInfo
 
+from dm_common.errors import ErrorCode
 from dm_common.messages import doubles, time_message
 from dm_common.ros.lifecycle import OK, WARN, Health
 from dm_common.values import without_figures
@@ -73,12 +75,20 @@ def remarks(active: ActiveCalibration, unknown: str, values: Mapping[str, Any], 
     return "; ".join(filter(None, (history if active.planner.hysteresis is not None else "", stale)))
 
 
+def nowhere(active: ActiveCalibration, tolerance: float) -> str:
+    """That no sphere is reachable within `tolerance` (m), as a sentence; "" = some are."""
+    flat = FocusTarget(0.0)
+    reachable = active.reachable_range(flat, tolerance)
+    return flat.denied(active.certain.command(flat)[1], tolerance, reachable) if math.isnan(reachable[0]) else ""
+
+
 def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment) -> str:
     """The reason why requests are refused, or predictions worse than they could be; "" = all is well."""
     if (refusal := controller.unavailable(now)) is not None:
         return str(refusal)
     assert controller.active is not None
-    return remarks(controller.active, controller.observer.unknown, values, now.ns)
+    remark = remarks(controller.active, controller.observer.unknown, values, now.ns)
+    return "; ".join(filter(None, (nowhere(controller.active, values["reachable_tolerance"]), remark)))
 
 
 def health(controller: FocusController, values: Mapping[str, Any], now: Moment) -> Health:
@@ -130,6 +140,8 @@ def capabilities_message(
     assert active is not None
     low, high = active.reachable_range(FocusTarget(0.0), tolerance)
     sentences = [f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
+    if empty := nowhere(active, tolerance):
+        message.error_code, sentences = ErrorCode.UNREACHABLE, [empty]
     if unknown and active.planner.hysteresis is not None:
         sentences.append(f"wider error bound: {unknown}")
     dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == Calibration.GRADE_DEAD]

@@ -296,6 +296,23 @@ def test_it_goes_on_without_an_actuator_that_does_not_move_and_says_so(bench: Be
     assert abs(move.effective[5]) < 1e-9
 
 
+def test_where_nothing_is_reachable_capabilities_say_so(bench: Bench) -> None:
+    bent = calibration("bent")
+    figure = np.zeros(21)
+    figure[10] = 1e-3
+    bent.zernike_offset = doubles(figure)
+    bent.sag_offset = doubles(basis(np.asarray(bent.sample_x), np.asarray(bent.sample_y)) @ figure)
+    bench.do(bench.controller.use(bent, MIRROR))
+    message = capabilities_message(bench.controller, MIRROR, VALUES, bench.now)
+    assert message.error_code == ErrorCode.UNREACHABLE and "nan" not in message.message
+    assert "no curvature is reachable: the initial figure takes more than the limits permit" in message.message
+    assert health(bench.controller, VALUES, bench.now).message.startswith(message.message)
+    bench.ask(0.01)
+    assert "no curvature is reachable: the initial figure" in str(bench.refusal())
+    bench.ask(0.01, zernike=[0.0] * 12 + [1e-3] + [0.0] * 8)
+    assert str(bench.refusal()).endswith("no curvature is reachable with these added Zernike terms")
+
+
 def test_a_closed_loop_begins_only_where_the_mirror_can_go(bench: Bench) -> None:
     host = LoopHost(cast(Any, SimpleNamespace(order=lambda message, dry_run: bench.ask(message.curvature, dry_run))))
     assert host.target(FocusRequest(curvature=0.01)).curvature == 0.01

@@ -120,7 +120,12 @@ class FocusTarget:
         """
         low, high = reachable
         if math.isnan(low):
-            text = "no curvature is reachable with these added Zernike terms"
+            text = "no curvature is reachable" + (
+                " with these added Zernike terms"
+                if any(self.zernike)
+                else ": the initial figure takes more than the limits permit; check limits.signal_min, "
+                "limits.signal_max and limits.neighbour_difference of pdm_driver, or allow a larger error"
+            )
         else:
             text = f"reachable: {low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"
         return (
