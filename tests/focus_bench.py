@@ -139,7 +139,7 @@ def hysteresis_message(law: HysteresisModel) -> ActuatorHysteresis:
     return ActuatorHysteresis(
         law="known",
         play_radius=doubles(law.play_radius),
-        powers=law.play_weight.shape[1],
+        powers=law.play_weight.shape[-1],
         play_weight=doubles(law.play_weight),
         creep_rate=law.creep_rate,
         creep_time=doubles(law.creep_time),
