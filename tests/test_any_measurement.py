@@ -83,6 +83,13 @@ def test_more_numbers_than_measurements_change_nothing() -> None:
     np.testing.assert_allclose(whole.predict(commands, times).shape, measured.shape)
 
 
+def test_an_actuator_that_never_moves_is_named() -> None:
+    commands, measured, times = record(True)
+    commands = np.where(np.arange(19) == 2, 0.0, commands)
+    found = identify_response(commands, measured, times, candidates=STATIC[:1])
+    assert "actuator 3 is that of the others" in str(found) and np.isfinite(found.influence).all()
+
+
 def test_the_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     commands, measured, times = record(False, 1e-7, 80)
     np.savez(tmp_path / "record.npz", commands=commands, measured=measured, times=times)
@@ -114,4 +121,4 @@ def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="nothing in it changes"):
         identify_response(commands, np.ones_like(measured), times)
     with pytest.raises(ExcitationError, match="actuator 3 turned"):
-        identify_response(np.where(np.arange(19) == 2, 0.0, commands), measured, times)
+        identify_response(np.where(np.isin(np.arange(19), (2, 3)), 0.0, commands), measured, times)

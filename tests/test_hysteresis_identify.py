@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dm_calibration.hysteresis.accuracy import expected_accuracy
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, Run
 from dm_calibration.hysteresis.excitation import excitation
+from dm_calibration.hysteresis.hysteresis_fit import _remarks
 from dm_calibration.hysteresis.identify import ExcitationError, Identification, _begun, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_common.hysteresis.inverse import invert
@@ -29,13 +30,23 @@ PLAYS = next(candidate for candidate in CANDIDATES if candidate.name == "Prandtl
 
 
 def simulated_run(
-    law: str, maps: int = 150, noise: float = 2e-10, creep: float = 0.01, seed: int = 3, more: PiezoConfig = PLAIN
+    law: str,
+    maps: int = 150,
+    noise: float = 2e-10,
+    creep: float = 0.01,
+    seed: int = 3,
+    more: PiezoConfig = PLAIN,
+    third: float = 1.0,
 ) -> tuple[Run, NDArray[np.bool_]]:
-    """A run of the excitation on seven of the simulation's actuators, seen through a random matrix, and its checks."""
+    """A run of the excitation on seven of the simulation's actuators, seen through a random matrix, and its checks.
+
+    The third actuator moves by the share `third` of what is asked.
+    """
     mirror = make_mirror(rings=1)
     rng = np.random.default_rng(seed)
     piezo = PiezoActuators(replace(more, law=law, creep=creep), rng, np.zeros(mirror.actuators))
     commands = excitation(mirror, maps)
+    commands.signals[:, 2] *= third
     mixing = rng.standard_normal((mirror.actuators, 12)) / 4.0
     time = np.cumsum(1.0 + commands.dwell)
     values = []
@@ -148,16 +159,27 @@ def test_too_few_maps_are_refused(rising: Run) -> None:
 
 def test_actuators_that_hardly_turn_are_refused(rising: Run) -> None:
     signals = rising.signals.copy()
-    signals[:, 4] = np.linspace(-1.0, 1.0, len(signals))
+    signals[:, 4:6] = np.linspace(-1.0, 1.0, len(signals))[:, None]
     with pytest.raises(ExcitationError, match="actuator 5 turned 0 times"):
         identify(replace(rising, signals=signals))
 
 
 def test_actuators_that_hardly_move_are_refused(rising: Run) -> None:
     signals = rising.signals.copy()
-    signals[:, 2] *= 0.05
+    signals[:, 2:4] *= 0.05
     with pytest.raises(ExcitationError, match="actuator 3 turned"):
         identify(replace(rising, signals=signals))
+
+
+@pytest.mark.parametrize("third", [0.0, 0.05])
+def test_one_actuator_that_hardly_moves_follows_the_law_of_the_others_and_is_named(third: float) -> None:
+    own = next(candidate for candidate in CANDIDATES if candidate.own and candidate.kind == PREISACH.kind)
+    laws = [LINEAR, PREISACH, own]
+    whole, found = (identify(*simulated_run("preisach", third=share), laws) for share in (1.0, third))
+    assert held_out_rms(found) < 1.2 * held_out_rms(whole)
+    assert slope_min(found.fit.law) > 0.5 and np.isfinite(found.fit.law.play_weight).all()
+    assert not whole.quiet
+    assert "the law of actuator 3 is that of the others" in _remarks(found)[-1]
 
 
 def test_time_that_runs_backwards_is_refused(rising: Run) -> None:

@@ -198,4 +198,5 @@ def _remarks(found: Identification) -> tuple[str, ...]:
     others = ", ".join(f"{name} {score:.2f}" for name, score in found.scores.items() if name != best)
     sentences = [f"Hysteresis: {best} predicts the maps left out best; error of other models relative to it: {others}."]
     sentences += [f"Hysteresis: {name} was not taken: {reason}." for name, reason in found.refused.items()]
+    sentences += filter(None, (found.quiet_remark,))
     return tuple(sentences)

@@ -31,6 +31,9 @@ NEAR = 1.15
 #: each half of the test maps is predicted with the other half in the fit. Without any, moves in use lie far outside
 #: what so few maps show: 5 to 10 nm in the median of mirrors after 100 maps, where the final fit errs by 3.
 FEW = 4
+#: How often an actuator must turn, and over what swing, to show a law, and the share of them, one at least, that may do
+#: less: the others determine the common law, and what is not known of those few follows it.
+TURNS_MIN, SWING_MIN, QUIET_SHARE = 10, 0.3, 0.1
 
 
 class ExcitationError(TooFewMapsError):
@@ -48,12 +51,25 @@ class Identification:
         scores: held-out error of each candidate relative to the best; that of the best before it, of a richer one that
             leaves hardly less in the maps it was fitted to.
         refused: candidates that cannot be inverted, with the reason.
+        quiet: actuators, from 0, that moved or turned too little to show a law of their own.
     """
 
     fit: LawFit
     held_out: Floats
     scores: dict[str, float]
     refused: dict[str, str]
+    quiet: tuple[int, ...] = ()
+
+    @property
+    def quiet_remark(self) -> str:
+        """That the quiet actuators follow the law of the others, as a sentence; "" = there are none."""
+        if not self.quiet:
+            return ""
+        names = ", ".join(str(number + 1) for number in self.quiet)
+        return (
+            f"Hysteresis: the law of actuator{'s' if len(self.quiet) > 1 else ''} {names} is that of the others: "
+            f"{TURNS_MIN} turns over {SWING_MIN:g} are needed in a run to show its own."
+        )
 
 
 def identify(
@@ -80,7 +96,7 @@ def identify(
         ExcitationError: the run does not show hysteresis.
         ValueError: time stamps that run backwards.
     """
-    check_excitation(run)
+    quiet = check_excitation(run)
     usable = run.responses.usable
     test = np.zeros_like(usable) if test is None else test & usable
     early = bool(test[: len(test) // 2].any())
@@ -148,7 +164,7 @@ def identify(
                 if left_out.any():
                     held_out[left_out] = problem.fit(usable & ~left_out, fitted).residual[left_out]
         fitted = problem.fit(usable, fitted)
-    return Identification(fitted, held_out, {name: s / score for name, s in scores.items()}, refused)
+    return Identification(fitted, held_out, {name: s / score for name, s in scores.items()}, refused, quiet)
 
 
 def _begun(
@@ -177,11 +193,11 @@ def _contains(richer: Candidate, simpler: Candidate) -> bool:
     return all(more >= less for more, less in zip(astuple(richer)[1:], astuple(simpler)[1:], strict=True))
 
 
-def check_excitation(run: Run) -> None:
-    """Refuse runs that cannot show hysteresis.
+def check_excitation(run: Run) -> tuple[int, ...]:
+    """The few actuators, from 0, that hardly turn or hardly move; runs that cannot show hysteresis are refused.
 
     Raises:
-        ExcitationError: fewer maps than unknowns, or actuators that hardly turn or hardly move.
+        ExcitationError: fewer maps than unknowns, or many actuators that hardly turn or hardly move.
     """
     usable = int(run.responses.usable.sum())
     actuators = run.signals.shape[1]
@@ -193,13 +209,15 @@ def check_excitation(run: Run) -> None:
     change = np.diff(run.signals, axis=0)
     turns = (change[1:] * change[:-1] < 0.0).sum(axis=0)
     swing = np.ptp(run.signals, axis=0)
-    quiet = np.flatnonzero((turns < 10) | (swing < 0.3))
-    if quiet.size:
+    quiet = np.flatnonzero((turns < TURNS_MIN) | (swing < SWING_MIN))
+    if quiet.size > max(1, int(QUIET_SHARE * actuators)):
         worst = int(quiet[np.argmin(turns[quiet])])
         raise ExcitationError(
             f"actuator {worst + 1} turned {turns[worst]} times over a swing of {swing[worst]:.2f} "
-            f"({quiet.size} of {actuators} actuators like it): 10 turns over 0.3 are needed: use the hysteresis plan"
+            f"({quiet.size} of {actuators} actuators like it): {TURNS_MIN} turns over {SWING_MIN:g} are "
+            "needed: use the hysteresis plan"
         )
+    return tuple(quiet.tolist())
 
 
 def _scatter(rich: CandidateProblem, keep: Rows) -> Floats:

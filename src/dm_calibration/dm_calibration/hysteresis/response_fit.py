@@ -39,6 +39,7 @@ class ResponseFit:
         held_out: error of each law on parts of the record that it was not fitted to, relative to the signal: rms over
             all numbers, divided by their standard deviation over the record.
         measurements: number of rows used.
+        remark: which actuators moved too little to show a law of their own, as a sentence; "" = none.
     """
 
     name: str
@@ -48,6 +49,7 @@ class ResponseFit:
     drift: Floats
     held_out: dict[str, float]
     measurements: int
+    remark: str = ""
 
     def predict(self, commands: ArrayLike, times: ArrayLike | None = None) -> Floats:
         """(M, D) what `commands` (M, N) from a degauss, or from rest, at `times` (M,) s, lead to."""
@@ -55,13 +57,13 @@ class ResponseFit:
         return np.asarray(self.figure + _effective(self.law, signals, _seconds(times, len(signals))) @ self.influence)
 
     def __str__(self) -> str:
-        """The laws side by side, the best marked."""
+        """The laws side by side, the best marked; with the remark, if any."""
         width = max(len(name) for name in self.held_out)
         rows = [f"{'law':<{width}}  held-out error, % of the signal ({self.measurements} measurements)"]
         rows += [
             f"{name:<{width}}  {100 * error:.2f}{' <' * (name == self.name)}" for name, error in self.held_out.items()
         ]
-        return "\n".join(rows)
+        return "\n".join((*rows, *filter(None, (self.remark,))))
 
 
 def identify_response(
@@ -89,7 +91,7 @@ def identify_response(
     Raises
     ------
     ExcitationError
-        Too few measurements, or actuators that hardly move or turn.
+        Too few measurements, or more than a tenth of the actuators, and more than one, that hardly move or turn.
     ValueError
         Arrays that do not belong together, measurements that never change, or times that run backwards.
     """
@@ -130,6 +132,7 @@ def identify_response(
         drift=solution[1],
         held_out={name: error * score for name, score in found.scores.items()},
         measurements=int(usable.sum()),
+        remark=found.quiet_remark,
     )
 
 
