@@ -18,8 +18,9 @@ from dm_calibration.influence.maps import MapSet
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure
 from dm_common.errors import MeasurementError
-from dm_common.hysteresis.observer import Applied, HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
 from dm_common.measurement import Measurement
+from dm_common.mirror import Applied
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 
 pytestmark = pytest.mark.slow

@@ -21,10 +21,9 @@ from dm_calibration.optics.map_fit import MapFitter
 from dm_calibration.procedure.plan import PlanKind, PlanOptions, make_plan
 from dm_calibration.procedure.procedure import Procedure, ProcedureOptions, Progress
 from dm_common import Floats
-from dm_common.hysteresis.observer import Applied
 from dm_common.limits import Limits
 from dm_common.measurement import Measurement
-from dm_common.mirror import Mirror
+from dm_common.mirror import Applied, Mirror
 from dm_common.optics.sampling import edge_clustered_points, sample_map
 from dm_controller.planning.mirror_model import InfluenceModel
 from dm_driver.degauss import degauss_waypoints

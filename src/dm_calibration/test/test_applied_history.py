@@ -10,7 +10,7 @@ import pytest
 from dm_calibration.procedure.applied_history import SMALL_MOVE, AppliedHistory, MapNotUsableError
 from dm_common.hysteresis.inverse import invert
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_common.hysteresis.observer import Applied
+from dm_common.mirror import Applied
 
 #: A signal with a backlash of half-width 0.3 that carries half of it.
 LAW = HysteresisModel(np.array([0.0, 0.3]), np.array([[0.5], [0.5]]), np.zeros(0), 0.0, 0.0, np.zeros(0))

@@ -15,9 +15,9 @@ from dm_msgs.msg import RecipeBook as RecipeBookMsg
 
 from dm_common import Floats
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
-from dm_common.hysteresis.observer import ActuatorEstimate, Applied, HysteresisObserver
+from dm_common.hysteresis.observer import ActuatorEstimate, HysteresisObserver
 from dm_common.limits import Limits
-from dm_common.mirror import Mirror
+from dm_common.mirror import Applied, Mirror
 from dm_common.recipes import Recipe, RecipeBook
 
 if TYPE_CHECKING:

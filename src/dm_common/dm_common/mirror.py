@@ -1,4 +1,4 @@
-"""Geometry and limits of a mirror, and whether a calibration belongs to it."""
+"""Geometry and limits of a mirror, what its driver reports, and whether a calibration belongs to it."""
 
 from dataclasses import dataclass, field
 
@@ -79,3 +79,33 @@ def mismatch(
             f"{mirror.working_radius * 1e3:.3f} mm +-{tolerance:.1%}"
         )
     return ""
+
+
+@dataclass(frozen=True, eq=False)
+class Applied:
+    """What a driver reports; fields as in dm_msgs/ActuatorState.
+
+    Attributes:
+        time: s, stamp of the last write.
+        signals: (N,) applied.
+        turns, turned_at: how often the way has bent since activation, and (N,) where it did last; None = never.
+        degausses: over the full range, since activation.
+        history_known: no write was lost since the last of them.
+        moving: on the way to another shape.
+        requested: (N,) what it moves to; None = not known.
+        active: the electronics follow.
+        linked: the electronics are in reach.
+        heard: s, when the driver said so last; what repeats a report tells that the shape still stands.
+    """
+
+    time: float
+    signals: Floats
+    turns: int
+    turned_at: Floats | None
+    degausses: int
+    history_known: bool
+    moving: bool = False
+    requested: Floats | None = None
+    active: bool = True
+    linked: bool = True
+    heard: float = -np.inf

@@ -21,7 +21,8 @@ from dm_common.hysteresis.creep_record import (
     write_record,
 )
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
-from dm_common.hysteresis.observer import Applied, HysteresisObserver
+from dm_common.hysteresis.observer import HysteresisObserver
+from dm_common.mirror import Applied
 from waiting import wait_until
 
 LAW = replace(HysteresisModel.linear(), creep_rate=0.01, creep_time=CREEP_TIMES)

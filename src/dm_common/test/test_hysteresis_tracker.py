@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dm_common.hysteresis.observer import Applied, HysteresisTracker
+from dm_common.hysteresis.observer import HysteresisTracker
+from dm_common.mirror import Applied
 from example_hysteresis import rich
 
 LAW = rich()

@@ -17,12 +17,14 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common import Floats
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import stamp_ns
-from dm_controller.focus_types import CommandedShape, Order, Progress, PublishState
+from dm_controller.focus_types import CommandedShape, Log, Moment, Order, Progress, PublishState
 
 #: States from which a driver does not come back by itself, as it does from a lost link.
 _STOPPED = (ActuatorState.STATE_UNCONFIGURED, ActuatorState.STATE_INACTIVE, ActuatorState.STATE_SAFING)
 #: Longest wait until the driver confirms a command where `driver_timeout` sets none, s.
 CONFIRM_S = 3.0
+#: A clock that gains so much on the steady one between two reports, s, was set, or the computer slept.
+CLOCK_JUMP_S = 5.0
 #: Moves over which the latency is taken.
 MOVES = 20
 #: A first write later than this is of another clock, or of a report that came too late, s.
@@ -68,7 +70,8 @@ class DriverMonitor:
         self.starts = 0
         self.open_until = -math.inf
         self.gone = ""
-        self._heard = 0.0
+        self._heard = self._gain = 0.0
+        self._clocks: tuple[float, float] | None = None  # s, until when creep was followed, and the steady time then
         self._latencies: deque[float] = deque(maxlen=MOVES)
 
     @property
@@ -100,6 +103,18 @@ class DriverMonitor:
             return False
         self._latencies.append(seconds)
         return len(self._latencies) == 1
+
+    def clock_gain(self, report: ActuatorState, now: Moment) -> float:
+        """s by which this clock, or that of the stamps, has jumped ahead since the last report; a simulator's may."""
+        before, self._clocks = self._clocks, (max(now.time, 1e-9 * stamp_ns(report.header.stamp)), now.steady)
+        gain = 0.0 if before is None or now.simulated else self._clocks[0] - before[0] - (now.steady - before[1])
+        self._gain = gain if gain > CLOCK_JUMP_S else 0.0
+        return self._gain
+
+    def clock_jumped(self) -> list[Log]:
+        """That it did at the last report."""
+        text = f"the clock jumped {self._gain:.0f} s ahead: whether creep went on for so long counts as not known"
+        return [Log("warning", text)] if self._gain else []
 
     def _trust(self) -> None:
         report, limit = self.latest, self._values["driver_timeout"] or math.inf

@@ -105,7 +105,7 @@ class FocusController:
         """Take the driver's next report."""
         latency_learnt = self.monitor.observe(report, now.steady)
         with suppress(ValueError):  # the observer says so as long as the history is unknown, and begins anew
-            self.observer.observe(applied_from(report, now.time))
+            self.observer.observe(applied_from(report, now.time), self.monitor.clock_gain(report, now))
         if report.driver_state != ActuatorState.STATE_ACTIVE:
             self.hold.end("the driver is not active")
         elif self.hold.active:
@@ -114,7 +114,7 @@ class FocusController:
         if self.active is not None and self._at_rest is not None and self._at_rest.state is not None:
             self.active.planner.prepare(self._at_rest.state)
         effects = self._degauss_ended(now, None) if self.conditioning.reported(self.monitor) else []
-        return [*effects, *self.monitor.settled(), *self._news(now, latency_learnt)]
+        return [*effects, *self.monitor.settled(), *self.monitor.clock_jumped(), *self._news(now, latency_learnt)]
 
     def unavailable(self, now: Moment) -> Refusal | None:
         """The reason why requests are refused now, whatever they ask for; None = they are not."""

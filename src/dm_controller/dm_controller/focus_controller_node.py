@@ -120,8 +120,9 @@ class FocusControllerNode(FocusHost):
             yield self._controller, self._now()
 
     def _now(self) -> Moment:
-        ns = int(self.get_clock().now().nanoseconds)
-        return Moment(ns, 1e-9 * ns, time.monotonic())
+        clock = self.get_clock()
+        ns = int(clock.now().nanoseconds)
+        return Moment(ns, 1e-9 * ns, time.monotonic(), clock.ros_time_is_active)
 
     # --- what comes in ---
 

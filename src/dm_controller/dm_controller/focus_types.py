@@ -18,11 +18,13 @@ class Moment(NamedTuple):
         ns: ROS time, that commands, reports and creep go by; a simulator may let it run fast, or stop it.
         time: the same in s.
         steady: s, of a clock that goes on whatever ROS time does: silence and patience go by it.
+        simulated: ROS time is a simulator's, and need not go as fast as the other.
     """
 
     ns: int
     time: float
     steady: float
+    simulated: bool = False
 
 
 @dataclass(frozen=True, eq=False)

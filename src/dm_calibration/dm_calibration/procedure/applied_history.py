@@ -8,7 +8,8 @@ import numpy as np
 from dm_common import Floats
 from dm_common.errors import CodedError, ErrorCode
 from dm_common.hysteresis.model import HysteresisModel
-from dm_common.hysteresis.observer import Applied, HysteresisObserver, Observed
+from dm_common.hysteresis.observer import HysteresisObserver, Observed
+from dm_common.mirror import Applied
 
 #: Signals, or effective signals, that differ less, normalised, are the same shape: below 1 nm.
 SMALL_MOVE = 2e-4

@@ -8,49 +8,19 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from dm_common import Floats
 from dm_common.hysteresis.creep_record import CreepRecord, held_unseen, rested
 from dm_common.hysteresis.model import HysteresisModel, HysteresisState
+from dm_common.mirror import Applied
 
 #: Reports kept for a law that is identified later: a calibration run makes some hundred.
 LOG_LENGTH = 5_000
 #: Estimates kept for maps that arrive late.
 ESTIMATES_KEPT = 500
-
-
-@dataclass(frozen=True, eq=False)
-class Applied:
-    """What a driver reports; fields as in dm_msgs/ActuatorState.
-
-    Attributes:
-        time: s, stamp of the last write.
-        signals: (N,) applied.
-        turns, turned_at: how often the way has bent since activation, and (N,) where it did last; None = never.
-        degausses: over the full range, since activation.
-        history_known: no write was lost since the last of them.
-        moving: on the way to another shape.
-        requested: (N,) what it moves to; None = not known.
-        active: the electronics follow.
-        linked: the electronics are in reach.
-        heard: s, when the driver said so last; what repeats a report tells that the shape still stands.
-    """
-
-    time: float
-    signals: Floats
-    turns: int
-    turned_at: Floats | None
-    degausses: int
-    history_known: bool
-    moving: bool = False
-    requested: Floats | None = None
-    active: bool = True
-    linked: bool = True
-    heard: float = -np.inf
 
 
 class HysteresisTracker:
@@ -188,6 +158,7 @@ class HysteresisObserver:
         self.latest: Applied | None = None
         self._middle, self._identified = 0.0, True
         self._record: CreepRecord | None = None
+        self._doubtful = (-np.inf, 0.0)  # s, until when, and how long
         self._tracker = HysteresisTracker(self.law)
         self._log: deque[Applied] = deque(maxlen=LOG_LENGTH)
         self._observed: deque[Observed] = deque(maxlen=ESTIMATES_KEPT)
@@ -207,34 +178,52 @@ class HysteresisObserver:
             self._record = record
             if another:
                 self._log.clear()
+                self._doubtful = (-np.inf, 0.0)
             self._tracker = HysteresisTracker(self.law, self._middle, record)
             self._observed.clear()
             for report in list(self._log):
                 self._track(report)
+            self._widen()
 
-    def observe(self, report: Applied) -> None:
+    def _widen(self) -> None:
+        state, law, (until, elapsed) = self._tracker.state, self.law, self._doubtful
+        if state is None or not until > law.crept_at:  # what a calibration found later is not in doubt
+            return
+        state = law.advance(state, max(state.time, until))
+        sigma = held_unseen(law, np.zeros(len(law.creep_time)), elapsed) * np.exp((until - state.time) / law.creep_time)
+        self._tracker.state = replace(state, crept_sigma=np.hypot(state.crept_sigma, sigma))
+
+    def observe(self, report: Applied, doubtful: float = 0.0) -> None:
         """Take the driver's next report. One without signals, of a driver that knows none yet, is kept as the latest.
+
+        Args:
+            doubtful: s before it that may not have passed: what stood counts as held unseen for as long.
 
         Raises:
             ValueError: another number of actuators, or numbers that are none; the observer begins anew.
         """
         with self._lock:
             self.latest = report
-            if not report.signals.size:
-                return
-            if self._log and _same(self._log[-1], report):
-                self._log[-1] = self._tracker.last = report
-                return
-            # What a later law must know: where the way bent, and how a move under way began.
-            if len(self._log) >= 2 and _between(self._log[-2], self._log[-1], report):
-                self._log.pop()
-            self._log.append(report)
-            try:
-                self._track(report)
-            except ValueError as error:
-                self.recall(self._record, another=True)
-                self._tracker.unknown = f"actuator_state: {error}"
-                raise
+            if report.signals.size:
+                self._take(report)
+            if doubtful:
+                self._doubtful = (max(report.heard, report.time), max(self._doubtful[1], doubtful))
+                self._widen()
+
+    def _take(self, report: Applied) -> None:
+        if self._log and _same(self._log[-1], report):
+            self._log[-1] = self._tracker.last = report
+            return
+        # What a later law must know: where the way bent, and how a move under way began.
+        if len(self._log) >= 2 and _between(self._log[-2], self._log[-1], report):
+            self._log.pop()
+        self._log.append(report)
+        try:
+            self._track(report)
+        except ValueError as error:
+            self.recall(self._record, another=True)
+            self._tracker.unknown = f"actuator_state: {error}"
+            raise
 
     def _track(self, report: Applied) -> None:
         self._tracker.observe(report)
