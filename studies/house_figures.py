@@ -49,7 +49,7 @@ node.trigger_configure(), node.trigger_activate()
 callbacks = {each.topic_name.rsplit("/", 1)[-1]: each.callback for each in node.subscriptions}
 rest = [0.0] * 37
 callbacks["mirror_info"](focus_bench.mirror_info())
-callbacks["calibration"](focus_bench.remembering_calibration(focus_bench.make_law()))
+callbacks["calibration"](focus_bench.calibration_with_history(focus_bench.make_law()))
 callbacks["actuator_state"](ActuatorState(
     driver_state=ActuatorState.STATE_ACTIVE, requested=rest, applied=rest, history_known=True,
     stamp=node.get_clock().now().to_msg()))

@@ -1,6 +1,6 @@
 """The neighbours of the focus controller, played by the test: calibration, driver, and a mirror that is known exactly.
 
-`Bench` has a driver that follows at once and a mirror without memory; the actuators of `RememberingBench` remember.
+`Bench` has a driver that follows at once and a mirror without hysteresis; `HysteresisBench` has one with it.
 """
 
 from __future__ import annotations
@@ -154,13 +154,13 @@ def recipe(curvature: float, effective: NDArray[np.float64]) -> Recipe:
     return Recipe(curvature, 0.0, effective, effective, max_zernike=5e-10, rms=2e-9, maps=4)
 
 
-def remembering_calibration(law: HysteresisModel, recipes: tuple[Recipe, ...] = (), **fields: Any) -> Calibration:
-    """With the memory `law`, and `recipes` that begin with a degauss of 60 half-swings."""
+def calibration_with_history(law: HysteresisModel, recipes: tuple[Recipe, ...] = (), **fields: Any) -> Calibration:
+    """With the law of hysteresis `law`, and `recipes` that begin with a degauss of 60 half-swings."""
     book = recipe_book_message(RecipeBook(recipes, 60, 1e-10, 0))
     return calibration(hysteresis=hysteresis_message(law), recipes=book, **fields)
 
 
-class RememberingBench(Bench):
+class HysteresisBench(Bench):
     """A driver that counts turns and degausses as the real one does, before a mirror that follows `law`.
 
     Attributes:

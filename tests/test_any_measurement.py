@@ -58,7 +58,7 @@ def test_volts_need_squares_and_volts_squared_do_not() -> None:
     squared = identify_response(*record(True), candidates=STATIC)
     assert squared.held_out["linear"] < 1.2 * squared.held_out["squares"]  # what is left is the gap that narrows
     assert squared.held_out["linear"] < 0.5 * volts.held_out["linear"]
-    assert not squared.law.remembers
+    assert not squared.law.has_history
 
 
 def test_a_zero_that_drifts_is_part_of_the_fit() -> None:

@@ -12,7 +12,7 @@ from dm_controller.focus_parameters import REACHABLE_TOLERANCE
 from dm_controller.planning.active_calibration import ActiveCalibration, active_calibration
 from dm_controller.planning.target import FocusTarget
 from dm_driver.safety_limiter import DriverLimits, SafetyLimiter
-from focus_bench import mirror_info, remembering_calibration
+from focus_bench import calibration_with_history, mirror_info
 from linear_mirror import make_mirror
 
 ACTUATORS = 37
@@ -33,7 +33,7 @@ def law(rng: np.random.Generator) -> HysteresisModel:
 def active(difference: float, rng: np.random.Generator) -> ActiveCalibration:
     mirror = mirror_info()
     mirror.neighbour_difference_max = difference
-    return active_calibration(remembering_calibration(law(rng)), mirror)
+    return active_calibration(calibration_with_history(law(rng)), mirror)
 
 
 def written(signals: Floats) -> Floats:

@@ -22,7 +22,7 @@ from dm_common.errors import Refusal
 from dm_common.hysteresis.creep_record import CreepRecord, record_file, write_record
 from dm_common.hysteresis.model import CREEP_TIMES, HysteresisModel
 from dm_controller.planning.active_calibration import active_calibration
-from focus_bench import RememberingBench, make_law, mirror_info, recipe, remembering_calibration
+from focus_bench import HysteresisBench, calibration_with_history, make_law, mirror_info, recipe
 from support import NodeProcess, Observer, wait_until
 
 Start = Callable[..., NodeProcess]
@@ -38,23 +38,23 @@ def make(
     message: Any = None,
     parameters: Mapping[str, Any] | None = None,
     law: HysteresisModel | None = None,
-) -> RememberingBench:
+) -> HysteresisBench:
     """A controller with a calibration that knows the memory; nothing is known of the history yet."""
-    bench = RememberingBench(observer, law)
+    bench = HysteresisBench(observer, law)
     values = {"settle_time": SETTLE_S, "hold.enable": False, **(parameters or {})}
     bench.controller = start("dm_controller", "focus_controller", values)
-    bench.ready(message or remembering_calibration(bench.law))
+    bench.ready(message or calibration_with_history(bench.law))
     wait_until(lambda: bench.set_focus(dry_run=True).error_code == ErrorCode.OK)
     return bench
 
 
-def degauss(bench: RememberingBench) -> None:
+def degauss(bench: HysteresisBench) -> None:
     count = bench.degausses
     bench.observer.run_goal(Degauss, "degauss", Degauss.Goal())
     wait_until(lambda: bench.degausses > count and bench.set_focus(dry_run=True).state.history_known)
 
 
-def set_parameter(bench: RememberingBench, name: str, value: int) -> None:
+def set_parameter(bench: HysteresisBench, name: str, value: int) -> None:
     parameter = RosParameter(name, value=value).to_parameter_msg()
     request = SetParameters.Request(parameters=[parameter])
     response = bench.observer.call(SetParameters, "focus_controller/set_parameters", request)
@@ -133,7 +133,7 @@ def test_the_history_stays_known_under_a_new_calibration(observer: Observer, sta
     bench = make(observer, start)
     degauss(bench)
     law = make_law(creep_rate=0.02) if other_law else bench.law
-    bench.calibration.publish(remembering_calibration(law, id="newer", revision=3))
+    bench.calibration.publish(calibration_with_history(law, id="newer", revision=3))
     wait_until(lambda: bench.capabilities[-1].calibration_id == "newer")
     assert bench.set_focus(dry_run=True).state.history_known
 
@@ -147,11 +147,11 @@ def test_writes_that_were_lost_make_the_history_unknown(observer: Observer, star
     assert "turns were not seen" in state.message
 
 
-def holding(observer: Observer, start: Start) -> RememberingBench:
+def holding(observer: Observer, start: Start) -> HysteresisBench:
     """A degaussed mirror with much creep, whose shape is corrected often."""
     law = make_law(0.05)
     parameters = {"hold.enable": True, "hold.period": 0.05}
-    bench = make(observer, start, remembering_calibration(law), parameters, law)
+    bench = make(observer, start, calibration_with_history(law), parameters, law)
     degauss(bench)
     return bench
 
@@ -204,7 +204,7 @@ def test_auto_conditions_within_the_time_budget_only(observer: Observer, start: 
 def test_a_recipe_follows_the_degauss_it_was_built_with(observer: Observer, start: Start) -> None:
     random = np.random.default_rng(6)
     ends = [recipe(curvature, random.uniform(-0.5, 0.5, 37)) for curvature in (-0.02, 0.02)]
-    bench = make(observer, start, remembering_calibration(STILL, tuple(ends)), law=STILL)
+    bench = make(observer, start, calibration_with_history(STILL, tuple(ends)), law=STILL)
     bench.command(shapes()[0])
     state = bench.set_focus(curvature=0.02, mode=FocusRequest.MODE_CONDITIONED).state
     assert state.error_code == ErrorCode.OK
@@ -218,7 +218,7 @@ def test_a_recipe_follows_the_degauss_it_was_built_with(observer: Observer, star
 
 def test_recipes_are_not_used_outside_their_range_or_condition(observer: Observer, start: Start) -> None:
     ends = tuple(recipe(curvature, np.zeros(37)) for curvature in (-0.02, 0.02))
-    bench = make(observer, start, remembering_calibration(make_law(), ends), {"condition.degauss_steps": 40})
+    bench = make(observer, start, calibration_with_history(make_law(), ends), {"condition.degauss_steps": 40})
     other = bench.set_focus(curvature=0.01, mode=FocusRequest.MODE_CONDITIONED)
     assert other.error_code == ErrorCode.CALIBRATION_MISMATCH
     assert "60 half-swings" in other.message
@@ -230,7 +230,7 @@ def test_recipes_are_not_used_outside_their_range_or_condition(observer: Observe
     assert bench.begun == []
 
 
-def conditioning(bench: RememberingBench) -> None:
+def conditioning(bench: HysteresisBench) -> None:
     """A degauss has begun on request, and goes on until the test lets it end."""
     bench.degauss_may_end.clear()
     assert bench.set_focus(curvature=0.01, time_budget=60.0).error_code == ErrorCode.OK
@@ -280,7 +280,7 @@ def test_move_focus_waits_for_conditioning(observer: Observer, start: Start) -> 
 
 
 def test_a_stale_calibration_says_so_and_serves(observer: Observer, start: Start) -> None:
-    old = remembering_calibration(make_law())
+    old = calibration_with_history(make_law())
     old.header.stamp = Time(sec=1)
     bench = make(observer, start, old)
     state = bench.set_focus(curvature=0.01).state
@@ -288,14 +288,14 @@ def test_a_stale_calibration_says_so_and_serves(observer: Observer, start: Start
     assert "stale" in state.message
     assert "stale" in bench.capabilities[-1].message
     bench.calibration.publish(
-        remembering_calibration(make_law(), id="checked", checked=observer.node.get_clock().now().to_msg())
+        calibration_with_history(make_law(), id="checked", checked=observer.node.get_clock().now().to_msg())
     )
     wait_until(lambda: bench.capabilities[-1].calibration_id == "checked")
     assert "stale" not in bench.set_focus(curvature=0.01).message
 
 
 def broken(**fields: Any) -> Any:
-    message = remembering_calibration(make_law(), id="broken")
+    message = calibration_with_history(make_law(), id="broken")
     for name, value in fields.items():
         setattr(message.hysteresis, name, value)
     return message
@@ -311,7 +311,7 @@ def broken(**fields: Any) -> Any:
         (broken(creep_rate=3.0), "creep_rate"),
         (broken(zernike_sigma=[1e-9]), "zernike_sigma"),
         (broken(unknown_sigma=-1.0), "unknown_sigma"),
-        (remembering_calibration(make_law(), (recipe(0.0, np.zeros(19)),), id="broken"), "recipes: effective"),
+        (calibration_with_history(make_law(), (recipe(0.0, np.zeros(19)),), id="broken"), "recipes: effective"),
     ],
 )
 def test_a_hysteresis_that_makes_no_sense_is_refused(message: Any, field: str) -> None:

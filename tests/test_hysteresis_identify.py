@@ -132,7 +132,7 @@ def test_a_curved_response_is_found_and_inverted_without_hysteresis(spread: floa
     assert found.fit.candidate.name == name
     assert held_out_rms(found) < 4e-10
     law = found.fit.law
-    assert not law.remembers and not law.is_identity
+    assert not law.has_history and not law.is_identity
     state = law.demagnetised(7, 0.0)
     wanted = rng.uniform(-0.6, 0.6, 7)
     inverted = invert(law, state, law.position_at(state, wanted), -1.0, 1.0)

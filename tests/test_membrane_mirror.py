@@ -155,7 +155,7 @@ def test_no_history_is_found(calibration: Calibration) -> None:
     known = calibration.hysteresis
     assert known is not None
     assert known.name in ("linear", "static", "static, each actuator its own")
-    assert not known.law.remembers
+    assert not known.law.has_history
     assert known.unknown_sigma == 0.0
 
 

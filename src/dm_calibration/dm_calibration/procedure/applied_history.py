@@ -97,7 +97,7 @@ class AppliedHistory:
             raise MapNotUsableError(
                 f"the mirror moved {time - since:.3f} s before the stamp of the map: must stand still for {still:g} s"
             )
-        if estimate.state is None or (law.remembers and estimate.unknown):
+        if estimate.state is None or (law.has_history and estimate.unknown):
             raise MapNotUsableError(
                 f"the history of the actuators is not known: {estimate.unknown}; a degauss over the full range "
                 "(./dm degauss) cures that"

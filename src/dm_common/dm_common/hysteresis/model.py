@@ -130,19 +130,19 @@ class HysteresisModel:
         return cls(np.zeros(1), np.ones((1, 1)), none, 0.0, creep_rate, CREEP_TIMES if creep_rate else none)
 
     @cached_property
-    def remembers(self) -> bool:
+    def has_history(self) -> bool:
         """Whether the effective signal depends on anything but the signal."""
         return bool((self.play_radius > 0.0).any()) or bool(self.duhem_slope.size) or self.creep_rate > 0.0
 
     @property
     def in_use(self) -> float:
         """What the error of held-out moves is multiplied by for what requests are promised."""
-        return IN_USE if self.remembers else 1.0
+        return IN_USE if self.has_history else 1.0
 
     @cached_property
     def is_identity(self) -> bool:
         """Whether the effective signal is the signal."""
-        return not self.remembers and self.play_weight.shape[-1] == 1 and bool((self.play_weight == 1.0).all())
+        return not self.has_history and self.play_weight.shape[-1] == 1 and bool((self.play_weight == 1.0).all())
 
     def same_as(self, other: HysteresisModel) -> bool:
         """Whether two laws are the same, number for number."""

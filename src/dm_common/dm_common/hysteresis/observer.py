@@ -245,7 +245,7 @@ class HysteresisObserver:
         if tracker.state is None or latest is None:
             return tracker.unknown
         lost = "" if latest.history_known else tracker.unknown or "writes were lost, or a degauss is under way"
-        if not self.law.remembers:
+        if not self.law.has_history:
             return "" if self._identified else lost
         return tracker.unknown or lost
 

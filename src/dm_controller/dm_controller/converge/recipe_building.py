@@ -237,7 +237,7 @@ class RecipeBuilder:
     def _hold(self, aim: Floats) -> None:
         """Keep the shape against creep as it is kept in use: what the law misses of that becomes part of the recipe."""
         law = self._loop.law
-        if not law.remembers:
+        if not law.has_history:
             return
         applied = self._plant.apply(self._loop.hold(self.state, self._now(), aim))
         self.state = law.move(self.state, applied, self._now())

@@ -108,7 +108,7 @@ class PreparedInverse:
     ends of a piece. What a request still needs is to look its pieces up and to sum three powers.
 
     Args:
-        law: that remembers.
+        law: one whose effective signals depend on the past.
         state: of a mirror at rest.
         limits: of the signals.
 

@@ -106,7 +106,7 @@ class Planner:
     def prepare(self, state: HysteresisState) -> None:
         """Work out now what plans from exactly this `state`, of a mirror at rest, will need."""
         ready = self._prepared
-        if self.hysteresis is not None and self.law.remembers and (ready is None or ready.state is not state):
+        if self.hysteresis is not None and self.law.has_history and (ready is None or ready.state is not state):
             self._prepared = PreparedInverse(self.law, state, self._limits)
 
     def plan(

@@ -130,7 +130,7 @@ class ActuatorCards:
     def _show_loop(self, snapshot: Snapshot, calibration: Any) -> None:
         session, mirror = self._session, snapshot.mirror_info
         law = session.ros.observer.law
-        if calibration is None or not law.remembers:
+        if calibration is None or not law.has_history:
             fault = session.ros.observer.fault if calibration is not None else ""
             self._loop_text.show(f"The hysteresis in the calibration cannot be used: {fault}" if fault else "")
             self._loop_picture.show(None, "No hysteresis was identified: the plan “Hysteresis” of a calibration does.")
