@@ -18,6 +18,7 @@ from dm_calibration.report.pdf_pages import pdf_pages
 from studies.comparison.simulated_bench import SimulationConfig
 from studies.paper import control, reported, samples
 from studies.paper.f_statistic import adjusted_r2_of_f, p_of_f
+from studies.paper.page.content_control import vertex_shift_left
 from studies.paper.page.page import write_html
 from studies.paper.results import PaperOptions
 from studies.paper.samples import LEVELLED, PIXELS, POINTS, Samples, measure_samples
@@ -86,6 +87,22 @@ def test_regions_and_cancelling_weights(made: tuple[Path, dict[str, Any]]) -> No
         assert len(regions["mean_nm"]) == len(regions["variance_nm2"]) == 10
         assert min(regions["mean_nm"]) > 0.0 and min(regions["variance_nm2"]) > 0.0
     assert 0.0 <= figures["weights_cancel_max_abs"] < 1e-16  # G is of the order of 1e-7 m per unit signal
+
+
+def test_linearity_is_lost_to_hysteresis_alone(made: tuple[Path, dict[str, Any]]) -> None:
+    folder, figures = made
+    for group, line in figures["linearity"].items():
+        ideal = figures["ideal"]["linearity"][group]
+        assert ideal["departure_pct"] < 1.0 and ideal["r2"] > 0.999
+        assert 1.0 < line["departure_pct"] < 10.0 and 0.99 < line["r2"] < 0.999
+        row = re.search(rf"<tr><td>{group}</td>(.*?)</tr>", (folder / "index.html").read_text().split("linearity: ")[1])
+        assert row and f"{line['rate_nm']:.1f}" in row[1] and f"{line['r2']:.5f}" in row[1]
+    # One actuator against the others, and how all differ.
+    assert figures["linearity"]["p46–p54"]["rate_nm"] > 5 * figures["linearity"]["p01–p05"]["rate_nm"]
+
+
+def test_a_shifted_vertex_is_tilt() -> None:
+    assert 0.0 < vertex_shift_left(0.011) < 1e-12  # m, where the tilt is 6 µm
 
 
 def test_hysteresis_costs_what_ideal_actuators_do_not_show(made: tuple[Path, dict[str, Any]]) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,14 @@ from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_ma
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import SURFACE, MapSet
 from dm_calibration.influence.region_weighting import RegionWeighting, weighting_of
+from dm_calibration.influence.surfaces import TABLE_1
 from dm_calibration.influence.weights import region_weights, surface_control_error
 from dm_calibration.procedure.procedure import Progress
 from dm_common import Floats
 from dm_common.measurement import Measurement
 from dm_common.optics.piston_tilt import remove_plane
 from dm_common.optics.sample_regions import regional_rms
-from dm_common.optics.zernike import PISTON_TILT
+from dm_common.optics.zernike import PISTON_TILT, TERM_RMS
 from studies.comparison.simulated_bench import SimulatedBench, SimulationConfig
 from studies.paper.regions import ConcentricRegions, RegionStatistics, figure_5, levelled_rms, residual_map
 from studies.paper.weights_cancel import weights_cancel_max_abs
@@ -29,10 +31,27 @@ from studies.paper.weights_cancel import weights_cancel_max_abs
 #: Ways to read Fig. 5: rms about zero over the sampling points, or over all pixels, each with piston and tilt removed
 #: once over the whole aperture; and over the points with every region levelled on its own.
 POINTS, PIXELS, LEVELLED = "sampling points", "every pixel", "sampling points, each region levelled"
+#: Surfaces that tell “the degree of linearity of control” (section 2.1): the signal of channel 1 differs, and the
+#: others share it (p01–p05) or stay.
+LINEAR = {f"{names[0]}–{names[-1]}": names for names in (TABLE_1[:5], TABLE_1[45:54])}
 #: Maps of a mirror at rest that tell the noise of one.
 REPEATS = 20
 #: Creep has come to rest after so long, s.
 LONG_REST = 1e4
+
+
+class Linearity(NamedTuple):
+    """How straight the sag runs with the signal, in the terms of the maps beyond tilt.
+
+    Attributes:
+        rate: m rms per unit signal, change of the sag along the best straight line.
+        departure: largest rms departure of a surface from that line, as a share of the line's change over the range.
+        r2: share of the change of the sag that the line explains.
+    """
+
+    rate: float
+    departure: float
+    r2: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +117,21 @@ class Samples:
     def effective_maps(self) -> MapSet:
         """The maps of the calibration with effective signals in the place of those applied."""
         return effective_maps(self.calibration.maps, self.hysteresis.law)
+
+    @cached_property
+    def linearity(self) -> dict[str, Linearity]:
+        """By group of LINEAR."""
+        return {group: self._linearity(labels) for group, labels in LINEAR.items()}
+
+    def _linearity(self, labels: Sequence[str]) -> Linearity:
+        maps, rows = self.calibration.maps, [self.row(label) for label in labels]
+        signal, sag = maps.applied[rows, 0], (maps.coefficients[rows] * TERM_RMS)[:, PISTON_TILT:]
+        moved, change = signal - signal.mean(), sag - sag.mean(axis=0)
+        rate = moved @ change / (moved @ moved)
+        left = change - np.outer(moved, rate)
+        steepness = float(np.linalg.norm(rate))
+        departure = np.linalg.norm(left, axis=1).max() / (steepness * np.ptp(signal))
+        return Linearity(steepness, float(departure), float(1.0 - np.square(left).sum() / np.square(change).sum()))
 
     def row(self, label: str) -> int:
         """Row of a surface in the calibration's maps."""

@@ -62,6 +62,10 @@ def _bench(bench: BenchResults) -> dict[str, Any]:
         "shuffled_significant": regressions.shuffled_below(LEVEL),
         "regions": _regions(samples.actuator_surfaces) | {"zernike": _regions(samples.zernike_surfaces)},
         "regions_readings": {name: _regions(panel) for name, panel in samples.readings.items()},
+        "linearity": {
+            group: {"rate_nm": line.rate * NM, "departure_pct": 100.0 * line.departure, "r2": line.r2}
+            for group, line in samples.linearity.items()
+        },
         "weights_cancel_max_abs": samples.weights_cancel,
         "weights": {
             "epsilon_nm2": weighting.epsilon * NM**2,

@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 
 from dm_calibration.report.document import Picture, Section, Table
-from dm_common.optics.conic import conic_sag
+from dm_common.optics.conic import conic_coefficients, conic_sag, disc_coefficients
+from dm_common.optics.zernike import PISTON_TILT
 from studies.paper import reported
 from studies.paper.control import LOOP_HYSTERESIS, LOOP_MAPS, METHODS, OPEN_HYSTERESIS
 from studies.paper.page.content_coefficients import FIGURES, SHOWN, WITH, best, parts
@@ -77,6 +78,7 @@ def conics(results: Results) -> Section:
                 )
     curvature = reported.CURVATURE_RANGE[1]
     difference = float(abs(conic_sag(radius, 0.0, curvature, -1.0) - conic_sag(radius, 0.0, curvature, 0.0)))
+    tilt = curvature * radius**2
     header = ("bench, method, target", "largest coeff. nm", "", "rms sag nm")
     same = [shot for shot in results.standard.aspheres["AZreg"].shots if not shot.target.zernike]
     apart = [abs(a.max_zernike - b.max_zernike) for a, b in pairwise(same) if a.target.curvature == b.target.curvature]
@@ -88,9 +90,19 @@ def conics(results: Results) -> Section:
             "are made by the additive deviation of Eq. (3), here 100 nm of Z₄⁰.",
             "So κ = −1 and κ = −10 ask for the same surface and the same signals. With hysteresis the errors of the "
             f"two differ by up to {max(apart) * NM:.0f} nm all the same, because they came from different surfaces.",
+            "The vertex shift s of Eq. (2) drops out: it lifts a sphere and tilts it by c s, and piston and tilt of a "
+            f"map are those of the alignment. With the vertex at the rim, s = {radius * 1e3:.0f} mm, the tilt is "
+            f"{tilt * 1e6:.1f} µm at the rim, and what s adds beyond tilt {vertex_shift_left(radius) * NM:.1e} nm.",
         ],
         [Table("Conics from p55 / p56, c_ini measured", header, rows)],
     )
+
+
+def vertex_shift_left(radius: float) -> float:
+    """Largest coefficient beyond tilt, m, that the strongest sphere gains with its vertex moved to the rim."""
+    curvature = reported.CURVATURE_RANGE[1]
+    moved = disc_coefficients(lambda x, y: conic_sag(radius * (x + 1.0), radius * y, curvature))
+    return float(np.abs(moved - conic_coefficients(curvature, 0.0, radius))[PISTON_TILT:].max())
 
 
 def readings(results: Results) -> Section:
