@@ -7,7 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_controller.planning.target import FocusTarget
 from studies.comparison import ablation_models
 from studies.comparison.ablation import CONDITIONED, HISTORIES, AblationOptions, ablate, total_steps
@@ -32,7 +32,7 @@ def ablation() -> Ablation:
     steps: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         # The actuators are alike: as `common_laws` for the model without fading hysteresis.
-        patch.setattr(ablation_models, "CANDIDATES", [law for law in CANDIDATES if not law.own])
+        patch.setattr(ablation_models, "CANDIDATES", COMMON)
         result = ablate(OPTIONS, steps.append)
     assert len(steps) == total_steps(OPTIONS)
     return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_common.errors import UnknownNameError
 from dm_controller.converge.closed_loop import LoopOptions
+from studies.comparison import compare as study
 from studies.comparison.compare import (
     CLOSED,
     CURVATURES,
@@ -28,7 +31,16 @@ from studies.verbs.compare import compare as command
 
 pytestmark = pytest.mark.slow
 
+TRIED_LAWS = ("linear", "Prandtl-Ishlinskii")
 SMALL = SimulationConfig(pixels=120, degauss_steps=30)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_laws() -> Iterator[None]:
+    """The choice among all takes most of the time and is tested elsewhere."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "COMMON", [law for law in COMMON if law.name in TRIED_LAWS])
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +91,7 @@ def test_figures_pool_all_seeds_and_leave_curvature_zero_out_of_the_share() -> N
         for seed in (1, 2)
         for curvature, worst in ((0.0, 1e-9), (0.02, 3e-9))
     )
-    row = Comparison(trials, 1e-9, 0.01, 0.01).rows()["bounded"]
+    row = Comparison(trials, 1e-9, 0.01, 0.01, (0.01,)).rows()["bounded"]
     assert row.p50 == pytest.approx(2e-9)
     assert row.rms_share == pytest.approx(2e-9 / (0.02 * 0.01**2 / 2))
 
@@ -103,12 +115,26 @@ def test_the_command_writes_its_figures(tmp_path: Path) -> None:
     app = typer.Typer()
     app.command()(command)
     path = tmp_path / "figures.json"
-    arguments = ["--plant", "preisach", "--seed", "2", "--seed", "3", "--method", "bounded", "--pixels", "100"]
+    arguments = [
+        "--plant",
+        "preisach",
+        "--seed",
+        "2",
+        "--seed",
+        "3",
+        "--method",
+        "bounded",
+        "--pixels",
+        "100",
+        "--creep",
+        "0.03",
+    ]
     result = CliRunner().invoke(app, [*arguments, "--json", str(path)])
     assert result.exit_code == 0, result.output
     figures = json.loads(path.read_text())
     assert figures["plant"] == "preisach"
     assert figures["seeds"] == [2, 3]
+    assert figures["creep_foreseen"] == pytest.approx([0.03, 0.03], rel=0.1)  # from the maps
     assert figures["fitting_limit_nm"] > 0
     assert set(figures["methods"]) == {"bounded", "bounded" + CLOSED}
     for row in figures["methods"].values():
@@ -139,7 +165,6 @@ def test_bad_options_are_refused(fields: dict[str, object], words: str) -> None:
         (["--method", "SVD"], "method = 'SVD': unknown; must be one of pseudo_inverse,"),
         (["--seed", "1", "--seed", "1"], "name each seed once"),
         (["--creep", "nan"], "'--creep'"),
-        (["--foreseen", "nan"], "'--foreseen'"),
         (["--pixels", "10"], "'--pixels'"),
     ],
 )

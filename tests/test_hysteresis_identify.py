@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.accuracy import expected_accuracy
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES, PREISACH, Candidate, Run
+from dm_calibration.hysteresis.candidate_fit import CANDIDATES, COMMON, PREISACH, Candidate, Run
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.hysteresis_fit import _remarks
 from dm_calibration.hysteresis.identify import ExcitationError, Identification, _begun, identify
@@ -25,7 +25,6 @@ pytestmark = pytest.mark.slow
 
 LINEAR, PLAIN = CANDIDATES[0], PiezoConfig()
 #: Of actuators that are alike; laws of each by itself have their tests in `test_own_laws`.
-COMMON = [candidate for candidate in CANDIDATES if not candidate.own]
 PLAYS = next(candidate for candidate in CANDIDATES if candidate.name == "Prandtl-Ishlinskii")
 
 

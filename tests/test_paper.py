@@ -12,7 +12,7 @@ import pytest
 from typer import Typer
 from typer.testing import CliRunner
 
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.report.document import Section, Table
 from dm_calibration.report.pdf_pages import pdf_pages
 from studies.comparison.simulated_bench import SimulationConfig
@@ -42,7 +42,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     folder = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch:
         # The law of the simulation and none: the choice among all takes a third of the time and is tested elsewhere.
-        patch.setattr(samples, "CANDIDATES", [law for law in CANDIDATES if law.name in TRIED_LAWS])
+        patch.setattr(samples, "COMMON", [law for law in COMMON if law.name in TRIED_LAWS])
         result = run("--quick", "--seed", str(SEED), "--out", str(folder), "--json", str(folder / "figures.json"))
     assert result.exit_code == 0, result.output
     return folder, json.loads((folder / "figures.json").read_text())

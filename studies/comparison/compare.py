@@ -3,7 +3,7 @@
 Each seed is a simulation of its own, calibrated once by the full plan. Every method then starts from the same state
 of that simulation, noise to come included, rested by a degauss, and goes through the same spheres in the same random
 order. Open-loop rows take the solver's command as it is; closed-loop rows let the same solver correct it on the
-interferometer.
+interferometer, and foresee creep by the rate that the maps of the calibration show.
 
 Errors are those of the true surface, which only a simulation knows: a loop that stops on its own measurement would
 otherwise be judged by the noise it stopped on. Curvature 0 has no peak to valley and does not count in the relative
@@ -19,6 +19,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dm_calibration.calibration import Calibration
+from dm_calibration.hysteresis.candidate_fit import COMMON
+from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
 from dm_calibration.influence.fit import FitOptions, fit_influence
 from dm_calibration.influence.maps import SURFACE
 from dm_calibration.influence.region_weighting import choose_weighting
@@ -54,7 +56,6 @@ class CompareOptions:
         methods: names of solvers; empty = all.
         curvatures: of the spheres, 1/m.
         loop: of the closed-loop rows; by default wavelength / 1000, and three iterations of measuring and correcting.
-        creep: per decade that the loops foresee; 0 = they do not.
     """
 
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
@@ -62,7 +63,6 @@ class CompareOptions:
     methods: Sequence[str] = ()
     curvatures: Sequence[float] = CURVATURES
     loop: LoopOptions = field(default_factory=lambda: LoopOptions(632.8e-12, 3, correct_last=True))
-    creep: float = 0.01
 
     def __post_init__(self) -> None:
         if not self.seeds:
@@ -120,12 +120,15 @@ class Comparison:
         fitting_limit: rms sag that the ideal command inside the limits leaves of the hardest sphere of the sweep, m;
             median over the seeds.
         fitting_limit_share: the same over PV, median over all spheres.
+        radius: of the working aperture, m.
+        creep_rates: per decade, of each seed, identified from its calibration: what the loops foresee.
     """
 
     trials: tuple[Trial, ...]
     fitting_limit: float
     fitting_limit_share: float
     radius: float
+    creep_rates: tuple[float, ...]
 
     def rows(self) -> dict[str, MethodFigures]:
         """Figures by method, closed-loop rows with CLOSED added to the name."""
@@ -217,7 +220,11 @@ def make_solvers(calibration: Calibration, limits: Limits, methods: Sequence[str
 
 
 def _sweep(
-    bench: SimulatedBench, solver: Solver, closed: bool, order: Sequence[float], options: CompareOptions
+    bench: SimulatedBench,
+    solver: Solver,
+    order: Sequence[float],
+    loop: LoopOptions | None,
+    creep_rate: float,
 ) -> list[Trial]:
     bench.degauss()
     bench.settle()
@@ -227,9 +234,9 @@ def _sweep(
         target = FocusTarget(curvature)
         began, computing = bench.time, time.perf_counter()
         maps = 0
-        if closed:
-            creep = Creep.of_rate(options.creep, before, lambda: bench.time)
-            result = converge(solver, target, bench, options.loop, creep=creep)
+        if loop:
+            creep = Creep.of_rate(creep_rate, before, lambda: bench.time)
+            result = converge(solver, target, bench, loop, creep=creep)
             before, maps = result.signals, result.maps
         else:
             before = solver.solve(target_shape(target, solver.model)).signals
@@ -238,14 +245,14 @@ def _sweep(
         seconds = bench.time - began + time.perf_counter() - computing
         error = true_error(bench, target)
         trials.append(
-            Trial(bench.config.seed, solver.name, closed, curvature, error.max_zernike, error.rms, maps, seconds)
+            Trial(bench.config.seed, solver.name, bool(loop), curvature, error.max_zernike, error.rms, maps, seconds)
         )
     return trials
 
 
 def total_steps(options: CompareOptions) -> int:
     """Steps that `compare` reports."""
-    return len(options.seeds) * (plan_steps() + 2 * len(options.methods or SOLVERS))
+    return len(options.seeds) * (plan_steps() + 1 + 2 * len(options.methods or SOLVERS))
 
 
 def compare(options: CompareOptions, progress: Callable[[str], None] = lambda step: None) -> Comparison:
@@ -256,12 +263,13 @@ def compare(options: CompareOptions, progress: Callable[[str], None] = lambda st
 
     Raises:
         UnknownNameError: an unknown method, listing all.
-        TooFewMapsError, Refusal: the simulation could not be calibrated.
+        TooFewMapsError, Refusal: a simulation could not be calibrated.
     """
     methods = tuple(dict.fromkeys(options.methods)) or tuple(SOLVERS)
     trials: list[Trial] = []
     limits: list[float] = []
     shares: list[float] = []
+    creep_rates: list[float] = []
     radius = 0.0
     for seed in options.seeds:
         bench = SimulatedBench(replace(options.simulation, seed=seed))
@@ -272,13 +280,15 @@ def compare(options: CompareOptions, progress: Callable[[str], None] = lambda st
                 progress(f"seed {seed}: calibration {now.label}")
 
         calibration = bench.calibrate(progress=calibrating)
+        progress(f"seed {seed}: creep")
+        creep_rates.append(fit_hysteresis(calibration.maps, COMMON).law.creep_rate)
         limit = fitting_limits(bench, options.curvatures)
         limits.append(float(limit.max()))
         shares += [r / peak_to_valley(c, radius) for r, c in zip(limit, options.curvatures, strict=True) if c]
         order = [float(c) for c in np.random.default_rng(seed).permutation(options.curvatures)]
         solvers = make_solvers(calibration, bench.limits, methods)
-        for closed in (False, True):
+        for loop in (None, options.loop):
             for name, solver in solvers.items():
-                progress(f"seed {seed}: {name}{', closed loop' if closed else ''}")
-                trials += _sweep(bench.fork(), solver, closed, order, options)
-    return Comparison(tuple(trials), float(np.median(limits)), float(np.median(shares)), radius)
+                progress(f"seed {seed}: {name}{', closed loop' if loop else ''}")
+                trials += _sweep(bench.fork(), solver, order, loop, creep_rates[-1])
+    return Comparison(tuple(trials), float(np.median(limits)), float(np.median(shares)), radius, tuple(creep_rates))

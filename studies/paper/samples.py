@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dm_calibration.calibration import Calibration
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.hysteresis.hysteresis_fit import HysteresisFit, effective_maps, fit_hysteresis
 from dm_calibration.influence.fit import InfluenceFit
 from dm_calibration.influence.maps import SURFACE, MapSet
@@ -110,8 +110,7 @@ class Samples:
         Raises:
             ExcitationError: the maps do not show them.
         """
-        shared = [candidate for candidate in CANDIDATES if not candidate.own]
-        return fit_hysteresis(self.calibration.maps, candidates=shared)
+        return fit_hysteresis(self.calibration.maps, COMMON)
 
     @cached_property
     def effective_maps(self) -> MapSet:

@@ -89,9 +89,6 @@ def compare(
     ] = None,
     method: Annotated[list[str] | None, typer.Option(help="Only these methods; repeat it for several.")] = None,
     creep: Annotated[float, typer.Option(min=0.0, max=0.2, help="Creep of the simulation per decade of time.")] = 0.01,
-    foreseen: Annotated[
-        float, typer.Option(min=0.0, max=0.2, help="Creep that closed loops expect per decade; 0 = none.")
-    ] = 0.01,
     max_maps: Annotated[
         int, typer.Option(min=1, help="Maps that a closed loop may take, each followed by a correction.")
     ] = 3,
@@ -153,7 +150,6 @@ def compare(
         seeds=tuple(seed or (1,)),
         methods=tuple(method or ()),
         loop=replace(CompareOptions().loop, max_maps=max_maps),
-        creep=foreseen,
     )
     with progress_bar() as bar:
         task = bar.add_task("compare", total=total_steps(options))
@@ -168,7 +164,7 @@ def compare(
         "plant": plant.value,
         "seeds": list(options.seeds),
         "creep_per_decade": creep,
-        "creep_foreseen": foreseen,
+        "creep_foreseen": list(comparison.creep_rates),
         "max_maps": max_maps,
         "tolerance_nm": nanometres(options.loop.tolerance),
     } | figures_of(comparison)

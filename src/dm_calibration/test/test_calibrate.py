@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dm_calibration import calibrate, calibrator
 from dm_calibration.acquisition.ingest import IngestSettings
 from dm_calibration.acquisition.map_sources import outcome_of
-from dm_calibration.hysteresis.candidate_fit import CANDIDATES
+from dm_calibration.hysteresis.candidate_fit import COMMON
 from dm_calibration.hysteresis.excitation import excitation
 from dm_calibration.hysteresis.features import follow
 from dm_calibration.hysteresis.hysteresis_fit import fit_hysteresis
@@ -134,8 +134,7 @@ def test_arrays_of_commands_times_and_maps(
         sag=seen(plant, inside, effective),
     )
     # Its actuators are alike; laws of each by itself would take most of the time.
-    common = [law for law in CANDIDATES if not law.own]
-    monkeypatch.setattr(calibrator, "fit_hysteresis", partial(fit_hysteresis, candidates=common))
+    monkeypatch.setattr(calibrator, "fit_hysteresis", partial(fit_hysteresis, candidates=COMMON))
     made = run_example("calibrate_arrays.py", file, monkeypatch)
     known = made["calibration"].hysteresis  # type: ignore[attr-defined]
     assert known.held_out_max_zernike < 3e-9

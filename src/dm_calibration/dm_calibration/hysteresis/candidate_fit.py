@@ -89,6 +89,8 @@ CANDIDATES = (
     Candidate("Preisach, each actuator its own", 30, 5, 0, own=True),
     Candidate("Preisach and Duhem, each actuator its own", 30, 5, 4, own=True),
 )
+#: Those of one law for all actuators.
+COMMON = tuple(candidate for candidate in CANDIDATES if not candidate.own)
 
 
 @dataclass(frozen=True, eq=False)
