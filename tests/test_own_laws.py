@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dm_calibration.hysteresis.candidate_fit import CANDIDATES, Run
 from dm_calibration.hysteresis.excitation import excitation
+from dm_calibration.hysteresis.hysteresis_fit import _remarks
 from dm_calibration.hysteresis.identify import Identification, identify
 from dm_calibration.hysteresis.responses import Responses
 from dm_common import Floats
@@ -76,11 +77,16 @@ def held_out_rms(found: Identification) -> float:
     return float(np.sqrt(np.nanmean(np.square(found.held_out))))
 
 
+def says_alike(found: Identification) -> bool:
+    return any("do not tell the actuators' loops apart" in remark for remark in _remarks(found))
+
+
 @pytest.mark.parametrize("seed", [11, 12])
 def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(seed: int) -> None:
     run, check = relay_run(0.2, seed)
     found, common = identify(run, check, LAWS), identify(run, check, COMMON)
     assert found.fit.candidate.own
+    assert not says_alike(found) and not says_alike(common)
     assert found.fit.law.actuators == 7
     assert slope_min(found.fit.law) > 0.1
     assert held_out_rms(common) > 2.0 * held_out_rms(found)
@@ -89,6 +95,12 @@ def test_actuators_that_differ_are_predicted_much_better_by_laws_of_their_own(se
 def test_actuators_that_are_alike_lose_nothing() -> None:
     run, check = relay_run(0.0, 13)
     assert held_out_rms(identify(run, check, LAWS)) < 1.1 * held_out_rms(identify(run, check, COMMON))
+
+
+def test_maps_too_few_to_tell_the_loops_apart_are_said_to_be() -> None:
+    run, check = relay_run(0.0, 14, 60)
+    found = identify(run, check, LAWS)
+    assert not found.fit.candidate.own and says_alike(found)
 
 
 def test_laws_span_the_same_in_a_full_cycle() -> None:
