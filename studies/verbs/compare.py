@@ -99,7 +99,10 @@ def compare(
     ] = False,
     mirrors: Annotated[
         int,
-        typer.Option(min=0, help="So many mirrors drawn at random, one a seed, from --seed on: open loop, all told."),
+        typer.Option(
+            min=0,
+            help="Judge so many mirrors drawn at random, one a seed from --seed on: errors and bounds in open loop.",
+        ),
     ] = 0,
     maps: Annotated[
         list[int] | None,

@@ -94,7 +94,7 @@ def trouble(controller: FocusController, values: Mapping[str, Any], now: Moment)
 def health(controller: FocusController, values: Mapping[str, Any], now: Moment) -> Health:
     """The health of the node whose parameters are `values`.
 
-    While the shape stands that was asked for: its curvature (1/m), since when (s), the 95 % bound on its error (m).
+    While the shape stands that was asked for: its curvature (1/m), for how long (s), the 95 % bound on its error (m).
     """
     figures: dict[str, object] = {
         "requests": controller.requests,
@@ -107,7 +107,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment) 
     if shape is not None and shape.kept and report and same_signals(report.requested, shape.sent.command.signals):
         figures |= {
             "curvature": shape.move.target.curvature,
-            "stands for": f"{now.time - shape.began:.1f}",
+            "since": f"{now.time - shape.began:.1f}",
             "bound": shape.bound(not controller.observer.unknown),
         }
     text = trouble(controller, values, now)
