@@ -14,7 +14,7 @@ from dm_tools.output import WAVELENGTH, as_wavelengths, console, nanometres, pro
 #: Processes at most: a mirror takes a core and some 300 MB.
 WORKERS_MAX = 2
 #: Columns that the table needs.
-TABLE_WIDTH = 136
+TABLE_WIDTH = 140
 #: Kinds of requests, as JSON names them.
 GROUPS = ("any_order", "recipes", "restarted", "checked", "power_cut")
 
@@ -108,7 +108,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
     from rich.table import Table
 
     title = "largest coefficient error of the true surface, nm; random order, dwell 0.1 s to 10 min"
-    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), width=max(console.width, TABLE_WIDTH))
     figures = ("p50", "", "p90", "", "max", "bound", "inside", "refused", "recipes", "restart", "checked", "cut", "s")
     for heading in ("seed", "mirror", *figures):
         table.add_column(heading, justify="left" if heading == "mirror" else "right", no_wrap=True)
@@ -116,7 +116,7 @@ def show(rows: Sequence[dict[str, Any]]) -> None:
         what = row["plant"].removeprefix("drawn_") + (" *" if row["changes"] else "")
         cells = [""] * (len(figures) - 1) if row["failure"] else _cells(row)
         table.add_row(str(row["seed"]), what, *cells, f"{row['seconds']:.0f}")
-    console.print(table, width=max(console.width, TABLE_WIDTH), crop=False)
+    console.print(table, crop=False)
     console.print(
         "bound: median of those told; recipes: p90; restart: largest error of the first requests after a day's hold "
         "and 10 min without power; checked: the same after three maps more; cut: after a power cut in a move; each "
