@@ -1,8 +1,9 @@
 """The C++ examples built by colcon against the dm_msgs of the workspace, and the vision node among them at work.
 
-The ROS 2 wheels have no rclcpp: in its place issued what is in `rclcpp_stand_in`, last in the path, so that it gives
+The ROS 2 wheels have no rclcpp: in its place stands what is in `rclcpp_stand_in`, last in the path, so that it gives
 way to a real one. Types, names and fields of the messages are checked, the libraries of dm_msgs are linked, and
-package.xml, CMakeLists.txt and sources belong together. Topics and parameters go through the same rcl as everywhere.
+package.xml, CMakeLists.txt and sources belong together. Topics go through the same rmw as everywhere; parameters are
+those of the stand-in.
 """
 
 from __future__ import annotations

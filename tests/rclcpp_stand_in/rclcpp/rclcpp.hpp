@@ -45,7 +45,7 @@ inline void init(int argc, char const * const * argv)
   check(rmw_init_options_init(&options, allocator));
   options.enclave = rcutils_strdup("/", allocator);
   options.domain_id = domain ? std::stoul(domain) : 0;
-  options.discovery_options.automatic_discovery_range = RMW_AUTOMATIC_DISCOVERY_RANGE_SUBNET;
+  options.discovery_options.automatic_discovery_range = RMW_AUTOMATIC_DISCOVERY_RANGE_LOCALHOST;
   check(rmw_init(&options, &context));
 }
 inline bool shutdown() {return rmw_shutdown(&context) == RMW_RET_OK;}

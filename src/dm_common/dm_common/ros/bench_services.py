@@ -160,11 +160,11 @@ class BenchServices:
         return slept
 
     def measure(self, label: str) -> Measurement:
-        for _ in range(_TRIES):
+        for left in reversed(range(_TRIES)):
             try:
                 return self._measured(label, self._check_undisturbed)
             except MeasurementError as error:
-                if not self._no_interferometer() or not self._interferometer_returns():
+                if not self._no_interferometer() or (left and not self._interferometer_returns()):
                     raise
                 failure = error
         raise Refusal(failure.error_code, f"{failure} ({_TRIES} tries)") from failure

@@ -103,13 +103,16 @@ class PiezoActuators:
         self._drift_phase = rng.uniform(0, 2 * np.pi, (count, len(DRIFT_PERIODS_S)))
         self._hysteresis = Hysteresis(config.law, opening, count, rng)
         self.stuck = np.zeros(count, bool)
-        self.signals = np.array(initial, float)
+        self._warm, self._noon = config.warm_base * rng.standard_normal(count), rng.uniform(0.0, 2.0 * np.pi)
+        self._crosstalk = config.crosstalk * rng.standard_normal(count)
+        self.signals = self._with_crosstalk(np.array(initial, float))
         self._position = self._hysteresis.move(self.signals)
         self._crept = np.repeat(self._position[:, None], len(self._creep_times), axis=1)
         self._lagged = np.repeat((self._position - self.signals)[:, None], len(LAG_TIMES_S), axis=1)
         self._time = time
-        self._warm, self._noon = config.warm_base * rng.standard_normal(count), rng.uniform(0.0, 2.0 * np.pi)
-        self._crosstalk = config.crosstalk * rng.standard_normal(count)
+
+    def _with_crosstalk(self, signals: Array) -> Array:
+        return signals + self._crosstalk * np.roll(signals, -1)
 
     @property
     def temperature(self) -> float:
@@ -130,8 +133,7 @@ class PiezoActuators:
     def apply(self, signals: Array, time: float) -> None:
         """Take new signals (N,) at `time`."""
         self.advance(time)
-        signals = signals + self._crosstalk * np.roll(signals, -1)
-        self.signals = np.where(self.stuck, self.signals, signals)
+        self.signals = np.where(self.stuck, self.signals, self._with_crosstalk(signals))
         self._position = self._hysteresis.move(self.signals)
 
     @property

@@ -50,8 +50,14 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
 
 
 def curvatures_of(capabilities: Any) -> tuple[float, ...]:
-    """Curvatures [1/m] of the sweep: the article's, or eleven over the range of a mirror that does not reach those."""
+    """Curvatures [1/m] of the sweep: the article's, or eleven over the range of a mirror that does not reach those.
+
+    Raises:
+        RuntimeError: it reaches none.
+    """
     low, high = capabilities.curvature_min, capabilities.curvature_max
+    if not low <= high:
+        raise RuntimeError(capabilities.message)
     if low <= CURVATURES[0] and CURVATURES[-1] <= high:
         return CURVATURES
     return tuple(round(low + (high - low) * (0.02 + 0.096 * step), 4) for step in range(11))
