@@ -20,7 +20,7 @@ def samples() -> Samples:
     with pytest.MonkeyPatch.context() as patch:
         # The law of the simulation and none: the choice among all is tested elsewhere.
         laws = [law for law in CANDIDATES if law.name in ("linear", "Prandtl-Ishlinskii")]
-        patch.setattr("studies.paper.samples.CANDIDATES", laws)
+        patch.setattr("studies.paper.samples.COMMON", laws)
         assert result.hysteresis.name == laws[-1].name
     return result
 
