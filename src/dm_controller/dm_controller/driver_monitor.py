@@ -71,7 +71,9 @@ class DriverMonitor:
         self.open_until = -math.inf
         self.gone = ""
         self._heard = self._gain = 0.0
-        self._clocks: tuple[float, float] | None = None  # s, until when creep was followed, and the steady time then
+        # s, nothing gains on infinity: this clock less the steady one, and how far stamps are ahead of each of the two.
+        self._drift, self._ahead = math.inf, (math.inf, math.inf)
+        self._stamp: int | None = None
         self._latencies: deque[float] = deque(maxlen=MOVES)
 
     @property
@@ -106,9 +108,16 @@ class DriverMonitor:
 
     def clock_gain(self, report: ActuatorState, now: Moment) -> float:
         """s by which this clock, or that of the stamps, has jumped ahead since the last report; a simulator's may."""
-        before, self._clocks = self._clocks, (max(now.time, 1e-9 * stamp_ns(report.header.stamp)), now.steady)
-        gain = 0.0 if before is None or now.simulated else self._clocks[0] - before[0] - (now.steady - before[1])
-        self._gain = gain if gain > CLOCK_JUMP_S else 0.0
+        drift, stamp = now.time - now.steady, stamp_ns(report.header.stamp)
+        gain = drift - self._drift
+        # The driver's clock may be another machine's, and a stamp is repeated for as long as the mirror stands: only
+        # one that is new tells how far ahead that clock is. It must gain on both clocks here, for one may be set back.
+        if stamp and self._stamp not in (None, stamp):
+            ahead = max(0.0, 1e-9 * stamp - now.time)
+            gain = max(gain, min(ahead - self._ahead[0], ahead + drift - self._ahead[1]))
+            self._ahead = ahead, ahead + drift
+        self._drift, self._stamp = drift, stamp
+        self._gain = gain if gain > CLOCK_JUMP_S and not now.simulated else 0.0
         return self._gain
 
     def clock_jumped(self) -> list[Log]:

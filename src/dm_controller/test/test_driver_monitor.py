@@ -11,7 +11,7 @@ from dm_msgs.msg import ActuatorState, FocusRequest
 from dm_common.errors import ErrorCode, Refusal
 from dm_common.messages import doubles, time_message
 from dm_controller.driver_monitor import CONFIRM_S, DriverMonitor
-from dm_controller.focus_types import CommandedShape, Order, Outcome, SendCommand, Sent
+from dm_controller.focus_types import CommandedShape, Moment, Order, Outcome, SendCommand, Sent
 from dm_controller.planning.planner import Move
 from dm_controller.planning.target import FocusTarget
 
@@ -153,3 +153,34 @@ def test_who_reports_after_a_lease_lapsed_is_not_dead() -> None:
     assert driver.silent(BEGAN + 1.5) == ""
     assert driver.age(BEGAN + 1.5) == 0.5
     driver.check(FocusRequest(), BEGAN + 1.5)
+
+
+@pytest.mark.parametrize("ahead", [-8.0, 0.0, 8.0])
+def test_a_driver_whose_clock_is_ahead_is_not_one_whose_clock_jumps(ahead: float) -> None:
+    driver, steady, here, there = monitor(), BEGAN, 1000.0, 1000.0 + ahead  # s, clocks less the steady one
+
+    def idle_then_move() -> list[float]:
+        """What was gained in 25 s of reports that repeat a stamp, and with the next one."""
+        nonlocal steady
+        gains = []
+        for _ in range(25):
+            moment = Moment(0, here + steady, steady)
+            gains.append(driver.clock_gain(report(stamp_ns=written), moment))
+            steady += 1.0
+        return [max(gains), driver.clock_gain(report(stamp_ns=stamp()), Moment(0, here + steady, steady))]
+
+    def stamp() -> int:
+        return round(1e9 * (there + steady))
+
+    written = stamp() - 30 * 10**9  # the controller was started after the driver
+    for _ in range(3):
+        assert idle_then_move() == [0.0, 0.0]
+        written = stamp()
+    there += 60.0
+    assert idle_then_move() == [0.0, pytest.approx(60.0 + min(0.0, ahead))]
+    written = stamp()
+    here += 60.0
+    assert idle_then_move() == [pytest.approx(60.0), 0.0]
+    written = stamp()
+    here -= 60.0
+    assert idle_then_move() == [0.0, 0.0]
