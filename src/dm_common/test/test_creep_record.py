@@ -133,6 +133,19 @@ def test_while_the_link_is_lost_nobody_knows_whether_the_outputs_hold(away: floa
     assert observer.state is not None and (observer.state.crept_sigma[minute:] > 0.0).all() == bool(away)
 
 
+def test_a_small_jump_of_the_clock_is_in_doubt_for_as_long_as_itself() -> None:
+    """Not as long as the largest ever seen; a law that comes later says the same of both."""
+    observer = held_for_a_day()
+    minute, hours = np.searchsorted(CREEP_TIMES, (60.0, 3600.0))
+    observer.observe(report(0.0, 0.5, turns=1, heard=DAY), doubtful=DAY)
+    assert observer.state is not None and observer.state.crept_sigma[:hours] == pytest.approx(UNSEEN, rel=1e-3)
+    observer.observe(report(0.0, 0.5, turns=1, heard=31.0 * DAY), doubtful=6.0)
+    sigma = observer.state.crept_sigma
+    assert sigma[0] == pytest.approx(UNSEEN) and (sigma[minute:] < 0.1 * UNSEEN).all()
+    observer.use(replace(LAW, creep_rate=0.02), 0.0)
+    assert observer.state.crept_sigma == pytest.approx(sigma)
+
+
 def test_a_torn_record_is_named_and_none_is_none(tmp_path: Path) -> None:
     file = tmp_path / "mirror.creep.npz"
     assert read_record(file, 0.0) is None

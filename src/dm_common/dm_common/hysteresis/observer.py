@@ -158,7 +158,7 @@ class HysteresisObserver:
         self.latest: Applied | None = None
         self._middle, self._identified = 0.0, True
         self._record: CreepRecord | None = None
-        self._doubtful = (-np.inf, 0.0)  # s, until when, and how long
+        self._doubtful: deque[tuple[float, float]] = deque(maxlen=LOG_LENGTH)  # s, until when, and how long
         self._tracker = HysteresisTracker(self.law)
         self._log: deque[Applied] = deque(maxlen=LOG_LENGTH)
         self._observed: deque[Observed] = deque(maxlen=ESTIMATES_KEPT)
@@ -178,15 +178,16 @@ class HysteresisObserver:
             self._record = record
             if another:
                 self._log.clear()
-                self._doubtful = (-np.inf, 0.0)
+                self._doubtful.clear()
             self._tracker = HysteresisTracker(self.law, self._middle, record)
             self._observed.clear()
             for report in list(self._log):
                 self._track(report)
-            self._widen()
+            for doubt in self._doubtful:
+                self._widen(*doubt)
 
-    def _widen(self) -> None:
-        state, law, (until, elapsed) = self._tracker.state, self.law, self._doubtful
+    def _widen(self, until: float, elapsed: float) -> None:
+        state, law = self._tracker.state, self.law
         if state is None or not until > law.crept_at:  # what a calibration found later is not in doubt
             return
         state = law.advance(state, max(state.time, until))
@@ -207,8 +208,8 @@ class HysteresisObserver:
             if report.signals.size:
                 self._take(report)
             if doubtful:
-                self._doubtful = (max(report.heard, report.time), max(self._doubtful[1], doubtful))
-                self._widen()
+                self._doubtful.append((max(report.heard, report.time), doubtful))
+                self._widen(*self._doubtful[-1])
 
     def _take(self, report: Applied) -> None:
         if self._log and _same(self._log[-1], report):
