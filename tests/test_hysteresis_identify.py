@@ -24,7 +24,7 @@ from linear_mirror import make_mirror
 pytestmark = pytest.mark.slow
 
 LINEAR, PLAIN = CANDIDATES[0], PiezoConfig()
-#: Of actuators that are alike; laws of each by itself have their tests in `test_own_laws`.
+#: Tried with the linear one alone where not the choice among laws is tested.
 PLAYS = next(candidate for candidate in CANDIDATES if candidate.name == "Prandtl-Ishlinskii")
 
 
@@ -161,6 +161,8 @@ def test_actuators_that_hardly_turn_are_refused(rising: Run) -> None:
     signals[:, 4:6] = np.linspace(-1.0, 1.0, len(signals))[:, None]
     with pytest.raises(ExcitationError, match="actuator 5 turned 0 times"):
         identify(replace(rising, signals=signals))
+    with pytest.raises(ExcitationError, match="actuator 1 turned 0 times"):
+        identify(replace(rising, signals=signals[:, 4:5]))
 
 
 def test_actuators_that_hardly_move_are_refused(rising: Run) -> None:

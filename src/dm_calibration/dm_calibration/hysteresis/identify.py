@@ -197,7 +197,7 @@ def check_excitation(run: Run) -> tuple[int, ...]:
     """The few actuators, from 0, that hardly turn or hardly move; runs that cannot show hysteresis are refused.
 
     Raises:
-        ExcitationError: fewer maps than unknowns, or many actuators that hardly turn or hardly move.
+        ExcitationError: fewer maps than unknowns, or many actuators, or all, that hardly turn or hardly move.
     """
     usable = int(run.responses.usable.sum())
     actuators = run.signals.shape[1]
@@ -210,7 +210,7 @@ def check_excitation(run: Run) -> tuple[int, ...]:
     turns = (change[1:] * change[:-1] < 0.0).sum(axis=0)
     swing = np.ptp(run.signals, axis=0)
     quiet = np.flatnonzero((turns < TURNS_MIN) | (swing < SWING_MIN))
-    if quiet.size > max(1, int(QUIET_SHARE * actuators)):
+    if quiet.size == actuators or quiet.size > max(1, int(QUIET_SHARE * actuators)):
         worst = int(quiet[np.argmin(turns[quiet])])
         raise ExcitationError(
             f"actuator {worst + 1} turned {turns[worst]} times over a swing of {swing[worst]:.2f} "
