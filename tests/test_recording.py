@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +28,7 @@ from dm_msgs.msg import (
 )
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -43,7 +46,7 @@ from dm_tools.recording.bag import PARAMETER_EVENTS, BagError, BagReader, BagWri
 from dm_tools.recording.interfaces import UnknownTypeError, definition, message_class
 from dm_tools.recording.player import play, replayed
 from dm_tools.recording.recorder import Recorder
-from dm_tools.recording.session import COMPARED, differences, read_session, recalibrate
+from dm_tools.recording.session import COMPARED, _parameters, differences, read_session, recalibrate
 from dm_tools.verbs.replay import _again
 from recorded_bench import recorded
 from support import Observer, wait_until
@@ -292,15 +295,19 @@ def test_a_file_by_itself_is_a_recording(tmp_path: Path) -> None:
     assert BagReader(copied).messages == len(list(BagReader(copied).read())) == 1
 
 
-def test_a_recording_that_was_cut_off_replays_what_is_whole_in_it(tmp_path: Path) -> None:
+def test_a_recording_that_was_cut_off_replays_what_is_whole_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As when the recorder was killed, or power failed while the file was written."""
     (tmp_path / "cut").mkdir()
     kind, cut = "dm_msgs/msg/ActuatorState", tmp_path / "cut" / "bag.mcap"
+    on_disk: list[bytes] = []
+    monkeypatch.setattr(os, "fsync", lambda _file: on_disk.append((tmp_path / "bag" / "bag.mcap").read_bytes()))
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic(Topic("/actuator_state", kind, [offered(qos.STATE)], "INVALID"), definition(kind))
         for second in range(30):
             writer.write("/actuator_state", serialize_message(ActuatorState(sequence=second)), second * 10**9)
-        content = (tmp_path / "bag" / "bag.mcap").read_bytes()
+        content = on_disk[-1]
     for length in range(len(content), 8, -50):
         cut.write_bytes(content[:length])
         bag = BagReader(cut.parent)
@@ -311,6 +318,23 @@ def test_a_recording_that_was_cut_off_replays_what_is_whole_in_it(tmp_path: Path
     cut.write_bytes(flipped(content, content.rindex(b"zstd") + 40))  # in the last chunk
     with pytest.raises(BagError, match="cut: no recording, or damaged"):
         BagReader(cut.parent)
+    cut.write_bytes(b"")
+    with pytest.raises(BagError, match="empty: nothing was written yet"):
+        BagReader(cut.parent)
+
+
+def test_the_newer_value_of_a_parameter_stands_though_its_answer_was_written_later(tmp_path: Path) -> None:
+    """In a recording that was not finished, whose messages come in the order of the file."""
+    kind = "rcl_interfaces/msg/ParameterEvent"
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic(Topic(PARAMETER_EVENTS, kind, [offered(qos.STATE)], "INVALID"), definition(kind))
+        for log_time, value in (2, 0.2), (1, 0.1):
+            told = [Parameter("poke_amplitude", value=value).to_parameter_msg()]
+            event = ParameterEvent(node="/calibration", new_parameters=told)
+            writer.write(PARAMETER_EVENTS, serialize_message(event), log_time)
+        writer.flush()
+        bag = BagReader(tmp_path / "bag")
+        assert bag.unfinished and _parameters(bag, "/calibration", 3)[0]["poke_amplitude"] == 0.2
 
 
 def test_commands_are_held_back() -> None:
@@ -340,6 +364,36 @@ def test_what_is_published_is_recorded_latched_or_not(observer: Observer, domain
     assert bag.topics["/mirror_info"].type_hash.startswith("RIHS01_")
 
 
+def test_what_was_recorded_is_in_the_file_though_nothing_follows(
+    observer: Observer, domain: int, tmp_path: Path
+) -> None:
+    stream = observer.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+    with Recorder(tmp_path / "bag", topics=["actuator_state"], domain=domain) as recorder:
+        wait_until(stream.get_subscription_count, 60)
+        for number in range(2):
+            stream.publish(ActuatorState(sequence=number))
+        wait_until(lambda: recorder.counts["/actuator_state"] == 2, 60)
+        wait_until(lambda: BagReader(tmp_path / "bag").messages == 2, 5, "both in the file")
+
+
+def test_a_failure_of_the_writer_is_told(
+    observer: Observer, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also one of the library's own, and the recording is finished all the same."""
+    failed = threading.Event()
+
+    def fails(*_message: object) -> None:
+        failed.set()
+        raise AssertionError
+
+    monkeypatch.setattr(BagWriter, "write", fails)
+    observer.node.create_publisher(MirrorInfo, "mirror_info", qos.LATCHED).publish(MirrorInfo())
+    with pytest.raises(OSError, match=r"bag: the recording ended early: AssertionError\(\)"):
+        with Recorder(tmp_path / "bag", domain=domain):
+            assert failed.wait(60)
+    assert BagReader(tmp_path / "bag").unfinished == []
+
+
 def test_another_reader_decodes_it_from_the_definitions_in_the_file(
     observer: Observer, domain: int, tmp_path: Path
 ) -> None:
@@ -365,13 +419,24 @@ def test_another_reader_decodes_it_from_the_definitions_in_the_file(
 
 
 def test_parameters_of_the_nodes_are_recorded(
-    start: Callable[..., Any], observer: Observer, domain: int, tmp_path: Path
+    start: Callable[..., Any], observer: Observer, domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """With the time at which the first was asked for: whatever changes meanwhile is newer."""
+    asked: list[int] = []
+    get_parameters = AsyncParameterClient.get_parameters
+
+    def get(client: AsyncParameterClient, names: list[str]) -> Any:
+        asked.append(time.time_ns())
+        return get_parameters(client, names)
+
+    monkeypatch.setattr(AsyncParameterClient, "get_parameters", get)
     start("dm_calibration", "calibration", {"calibration_folder": str(tmp_path / "store"), "poke_amplitude": 0.31})
     wait_until(lambda: "/calibration/get_parameters" in dict(observer.node.get_service_names_and_types()), 60, "node")
     with Recorder(tmp_path / "bag", topics=["nothing"], domain=domain) as recorder:
         wait_until(lambda: recorder.counts.get(PARAMETER_EVENTS), 60, "parameters")
-    told = [deserialize_message(each.data, ParameterEvent) for each in BagReader(tmp_path / "bag").read()]
+    recorded_events = list(BagReader(tmp_path / "bag").read())
+    assert recorded_events[0].log_time <= asked[0]
+    told = [deserialize_message(each.data, ParameterEvent) for each in recorded_events]
     values = {each.name: each.value.double_value for event in told for each in event.new_parameters}
     assert values["poke_amplitude"] == 0.31 and values.keys() >= {parameter.name for parameter in PARAMETERS}
 

@@ -26,8 +26,9 @@ METADATA_FILE, SUFFIX = "metadata.yaml", ".mcap"
 MAGIC = b"\x89MCAP0\r\n"
 #: Topic that tells the parameters of nodes.
 PARAMETER_EVENTS = "/parameter_events"
-#: What was recorded reaches the file at least so often, ns; the rest is lost when the recorder is killed.
-FLUSH_NS = 5 * 10**9
+#: What was recorded reaches the disk with the first message that is so much later, ns, or by `BagWriter.flush`; the
+#: rest is lost when the recorder is killed or loses its power.
+FLUSH_NS = 4 * 10**9
 #: The library writes no checksums of its own; those of zstd are checked by whoever decompresses.
 CHECKED = {int(zstd.CompressionParameter.checksum_flag): 1}
 
@@ -98,15 +99,24 @@ class BagWriter:
         """Write one message of the topic `name`, announced before; the time in ns."""
         self._writer.write(self._connections[name], log_time, data)
         if abs(log_time - self._flushed) > FLUSH_NS:
-            storage = self._writer.storage
-            assert isinstance(storage, McapWriter)
-            storage.close_chunk()
-            storage.bio.flush()
+            self.flush()
             self._flushed = log_time
 
+    def flush(self) -> None:
+        """Bring to the disk what was written."""
+        storage = self._writer.storage
+        assert isinstance(storage, McapWriter)
+        if storage.chunk.msgs:
+            storage.close_chunk()
+        storage.bio.flush()
+        os.fsync(storage.bio.fileno())
+
     def close(self) -> None:
-        """Finish the file and write the metadata."""
+        """Finish the file and write the metadata, both to the disk."""
         self._writer.close()
+        for path in self.folder.iterdir():
+            with path.open("rb") as written:
+                os.fsync(written.fileno())
 
     def __enter__(self) -> BagWriter:
         return self
@@ -201,9 +211,11 @@ def _reader(path: Path) -> Reader:
     reader = Reader(path)
     if path.is_file() and path.suffix == SUFFIX:
         with path.open("rb") as content:
-            begins = content.read(len(MAGIC)) == MAGIC
+            begins = content.read(len(MAGIC))
+            if not begins:
+                raise ValueError(f"{path.name} is empty: nothing was written yet")
             content.seek(-len(MAGIC), os.SEEK_END)
-            if begins and content.read() != MAGIC:
+            if begins == MAGIC and content.read() != MAGIC:
                 reader.storage = _Unfinished(path)
     return reader
 

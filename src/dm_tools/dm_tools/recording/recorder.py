@@ -30,10 +30,13 @@ DISCOVERY_PERIOD_S = 0.25
 DEPTH = 100
 #: Longest sleep of the executor, s; only bounds how soon it ends.
 SPIN_S = 0.1
+#: After so long without a message the writer flushes, s; with `FLUSH_NS` nothing waits longer than five seconds.
+IDLE_S = 1.0
 #: Topics of the maps themselves, several megabytes each; what is fitted to them is on others.
 MAP_TOPIC = "surface_map"
 
-_Item = tuple[str, bytes, int] | tuple[Topic, str]
+#: A message, a topic, or () = nothing arrived for a while.
+_Item = tuple[str, bytes, int] | tuple[Topic, str] | tuple[()]
 
 
 class Recorder:
@@ -94,7 +97,7 @@ class Recorder:
     def check(self) -> None:
         """Raise OSError when the recording can no longer be written (disk full, ...)."""
         if self._failure is not None:
-            raise OSError(f"{self.folder}: the recording ended early: {self._failure}")
+            raise OSError(f"{self.folder}: the recording ended early: {str(self._failure) or repr(self._failure)}")
 
     def close(self) -> None:
         """Leave the ROS graph and finish the recording.
@@ -111,8 +114,10 @@ class Recorder:
         self._context.try_shutdown()
         self._queue.put(None)
         self._writer.join()
-        self._bag.close()
-        self.check()
+        try:
+            self._bag.close()
+        finally:
+            self.check()
 
     def __enter__(self) -> Recorder:
         return self
@@ -184,6 +189,7 @@ class Recorder:
         """
         names = list(listed.result().result.names)
         event = ParameterEvent(node=path)
+        begun = time.time_ns()  # what changes from now on is told later, so the newer value stands
 
         def fetch_next() -> None:
             if names:
@@ -191,7 +197,7 @@ class Recorder:
                 asked = self._clients[path].get_parameters([name])
                 asked.add_done_callback(lambda answer: keep(name, answer.result().values))
             else:
-                self._queue.put((PARAMETER_EVENTS, serialize_message(event), time.time_ns()))
+                self._queue.put((PARAMETER_EVENTS, serialize_message(event), begun))
 
         def keep(name: str, answer: Sequence[Any]) -> None:
             event.new_parameters += [Parameter(name=name, value=value) for value in answer]
@@ -203,16 +209,24 @@ class Recorder:
 
     def _write(self) -> None:
         """Write what arrives; compression must not hold up the executor."""
-        while (item := self._queue.get()) is not None:
+        while (item := self._next()) is not None:
             if self._failure is not None:
                 continue
             try:
-                if len(item) == 2:
+                if len(item) == 0:
+                    self._bag.flush()
+                elif len(item) == 2:
                     self._bag.add_topic(*item)
                 else:
                     self._bag.write(*item)
-            except (OSError, ValueError) as error:
+            except Exception as error:  # the library raises plain ones and asserts; nobody would see this thread end
                 self._failure = error
+
+    def _next(self) -> _Item | None:
+        try:
+            return self._queue.get(timeout=IDLE_S)
+        except queue.Empty:
+            return ()
 
 
 def _request(offered: Sequence[QoSProfile]) -> QoSProfile:

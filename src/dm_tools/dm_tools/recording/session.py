@@ -202,7 +202,8 @@ def _parameters(bag: BagReader, node: str, begun: int) -> tuple[dict[str, Any], 
     """Parameters of `node` when the run began, and what is not known of them."""
     defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
     told: dict[str, Any] = {}
-    for message in bag.read([PARAMETER_EVENTS]):
+    # The recorder writes answers later than their time; only a file that was finished is read by time.
+    for message in sorted(bag.read([PARAMETER_EVENTS]), key=lambda each: each.log_time):
         event, before = _decode(message), message.log_time < begun
         if event.node == node:
             for each in [*event.new_parameters, *(event.changed_parameters if before else ())]:
