@@ -30,9 +30,12 @@ def test_the_depth_image_comes_with_a_projection() -> None:
     info = camera_info_for(image, known, 400.0)
     assert list(info.p) == [500.0, 0.0, 160.0, 0.0, 0.0, 510.0, 120.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     assert (info.header.frame_id, known.header.frame_id) == ("camera", "")
-    told = camera_info_for(image, None, 400.0)
-    assert (told.width, told.height, told.k[0], told.p[0], told.p[2]) == (320, 240, 400.0, 400.0, 159.5)
-    assert not any(camera_info_for(image, None, 0.0).p)
+    uncalibrated = CameraInfo(width=640, height=480, binning_x=2, binning_y=2)
+    for silent in (None, uncalibrated):
+        told = camera_info_for(image, silent, 400.0)
+        assert (told.width, told.height, told.k[0], told.p[0], told.p[2]) == (320, 240, 400.0, 400.0, 159.5)
+        assert told.binning_x == 0
+        assert not any(camera_info_for(image, silent, 0.0).p)
 
 
 def points_of(depth: NDArray[np.float32], info: CameraInfo) -> NDArray[np.float64]:

@@ -114,11 +114,13 @@ def camera_info_for(image: Image, known: CameraInfo | None, focal_length_px: flo
     Args:
         image: that it is for.
         known: what the camera published; None = nothing.
-        focal_length_px: where it published nothing [px]; 0 = not known.
+        focal_length_px: of the image as it comes [px], where the camera tells none; 0 = not known.
     """
-    info = copy.deepcopy(known) if known is not None else CameraInfo(height=image.height, width=image.width)
+    info = CameraInfo(height=image.height, width=image.width)
+    if known is not None and (np.any(known.k) or not focal_length_px > 0):
+        info = copy.deepcopy(known)
     info.header = image.header
-    if known is None and focal_length_px > 0:
+    if not np.any(info.k) and focal_length_px > 0:
         centre = (image.width - 1) / 2, (image.height - 1) / 2
         info.k = [focal_length_px, 0.0, centre[0], 0.0, focal_length_px, centre[1], 0.0, 0.0, 1.0]
     if not np.any(info.r):
