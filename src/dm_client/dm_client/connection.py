@@ -166,13 +166,20 @@ class Connection:
 
         Ctrl-C and `stop` cancel it, so that the mirror is left safe; `identity`: see `run_goal`.
         """
+        server = self._servers.get(name)
+
+        def take(feedback: Any) -> None:
+            if server is not None:
+                server.heard()  # who speaks lives, even if this process missed that on a busy machine
+            on_feedback(feedback)
+
         with self._answered(name) as gone:
             result = run_goal(
                 self.clients[name],
                 goal,
                 timeout_s,
                 answer_s=self._timeout_s,
-                on_feedback=on_feedback,
+                on_feedback=take,
                 stop=stop,
                 gone=gone,
                 identity=identity,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
+from dm_msgs.action import Converge
 from dm_msgs.msg import ActuatorState, Capabilities
 
-from dm_client import DeformableMirrorClient, DeformableMirrorError
+from dm_client import DeformableMirrorClient, DeformableMirrorError, connection
 from dm_common.errors import ErrorCode
 
 
@@ -38,3 +41,21 @@ def test_it_is_not_ready_while_either_says_otherwise(driver: int, able: int, cod
     with pytest.raises(DeformableMirrorError) as waited:
         client(driver, able).wait_until_active(0.0)
     assert waited.value.error_code == code
+
+
+def test_who_gives_feedback_lives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine the lease of a node that goes on with a run may lapse for its client."""
+    asked = client(ActuatorState.STATE_ACTIVE, ErrorCode.OK)
+    heard, feedback = list[int](), list[str]()
+    server = SimpleNamespace(
+        heard=lambda: heard.append(len(feedback)), wait_for_return=lambda: None, since_now=lambda: lambda: ""
+    )
+    asked._servers, asked.clients, asked._timeout_s = {"converge": server}, {"converge": None}, 1.0  # type: ignore
+
+    def run_goal(*_arguments: object, on_feedback: object, **_options: object) -> Converge.Result:
+        on_feedback("step 1")  # type: ignore[operator]
+        return Converge.Result()
+
+    monkeypatch.setattr(connection, "run_goal", run_goal)
+    asked.run_action("converge", Converge.Goal(), feedback.append, 1.0)
+    assert (heard, feedback) == ([0], ["step 1"])
