@@ -455,3 +455,7 @@ def test_a_recording_is_published_again(observer: Observer, domain: int, tmp_pat
     assert not commands
     with pytest.raises(ValueError, match="rate = 0"):
         play(bag, [], rate=0.0)
+    observer.node.create_publisher(ActuatorState, "actuator_state", qos.STATE)
+    with pytest.raises(ValueError, match=r"/actuator_state: the node \w+ publishes it here.*ROS_DOMAIN_ID"):
+        play(bag, ["/actuator_state"], domain=domain)
+    assert len(seen) == 10

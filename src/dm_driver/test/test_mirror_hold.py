@@ -44,6 +44,14 @@ def refused(code: ErrorCode) -> Iterator[None]:
     assert caught.value.error_code == code
 
 
+def test_a_run_that_is_late_is_not_about_to_end(clock: Clock) -> None:
+    hold = MirrorHold(clock)
+    hold.ask(Operation.HOLD, "calibration", duration=1.0)
+    clock.now += 2.0
+    with pytest.raises(Refusal, match=r"for 2 s; take_over"):
+        hold.check("", take_over=False)
+
+
 def test_others_hear_who_holds_it_how_long_and_how_to_end_it(hold: MirrorHold, clock: Clock) -> None:
     clock.now += 2.0
     with pytest.raises(Refusal, match=r"calibration has held .* 2 s, about 93 s to go: cancel its action") as caught:

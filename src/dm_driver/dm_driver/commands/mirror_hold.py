@@ -125,6 +125,6 @@ class MirrorHold:
         if not self._current():
             return ""
         held = self._clock() - self._since
-        left = f", about {max(self._duration - held, 0.0):.0f} s to go" if self._duration else ""
+        left = f", about {self._duration - held:.0f} s to go" if self._duration > held else ""
         purpose = f": {self._purpose}" if self._purpose else ""
         return f"{self._holder} has held the mirror for {held:.0f} s{left}{purpose}; take_over takes it from there"

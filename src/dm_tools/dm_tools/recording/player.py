@@ -13,6 +13,8 @@ from dm_tools.recording.interfaces import message_class
 
 #: Topics that would move a real mirror; published only when asked for.
 COMMANDS = ("actuator_command", "focus_request")
+#: What the driver alone says: nodes that follow a living one would take moves of the recording for its own.
+DRIVER_STATE = "actuator_state"
 #: Topics that belong to the nodes of the recording, not to its data.
 HOUSEKEEPING = ("/rosout", PARAMETER_EVENTS)
 DEPTH = 10
@@ -52,7 +54,7 @@ def play(
         remark: called with a sentence for each topic that is left out.
 
     Raises:
-        ValueError: a rate that is not above 0.
+        ValueError: a rate that is not above 0, or the state of a driver where one runs.
         UnknownTypeError: a message type that is not installed.
         BagError: the file is damaged.
     """
@@ -67,6 +69,13 @@ def play(
             for name in names
         }
         time.sleep(DISCOVERY_S)
+        for name in names:
+            living = {info.node_name for info in node.get_publishers_info_by_topic(name)} - {node.get_name()}
+            if living and name.rsplit("/", 1)[-1] == DRIVER_STATE:
+                raise ValueError(
+                    f"{name}: the node {living.pop()} publishes it here, and who follows that would take the recorded "
+                    "moves for its own; replay with another ROS_DOMAIN_ID, or --topics without it"
+                )
         for topic in [bag.topics[name] for name in names if _has_changed(node, bag.topics[name])]:
             node.destroy_publisher(publishers.pop(topic.name))
             remark(f"{topic.name} is left out: {topic.type_name} had another layout when it was recorded")
