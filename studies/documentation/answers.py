@@ -158,8 +158,16 @@ class Asker(Connection):
         self.wait(lambda: publisher.get_subscription_count() > 0)
         self.wait(lambda: topic in self.messages and not getattr(self.messages[topic], "moving", False), 3.0)
         before = self.messages.pop(topic, None)
+
+        def answers() -> bool:
+            now = self.messages.get(topic)
+            return now is not None and (
+                before is None or (now.error_code, now.message) != (before.error_code, before.message)
+            )
+
         publisher.publish(message)
-        time.sleep(0.2)  # the first to come may be of before
+        time.sleep(0.2)
+        self.wait(answers, 1.0)  # the first to come may be of before; one that goes on saying the same is the answer
         self.wait(lambda: topic in self.messages, 5.0)
         return self.messages.get(topic, before)
 
