@@ -231,7 +231,7 @@ def test_promise_and_measurement_are_put_in_one_way(capsys: pytest.CaptureFixtur
 
 
 def test_what_stands_is_read_from_the_controllers_health() -> None:
-    values = {"curvature": 0.02, "since": "40.0", "bound": 1.3e-9, "held": True}
+    values = {"curvature": 0.02, "age": "40.0", "bound": 1.3e-9, "held": True}
     pairs = [SimpleNamespace(key=key, value=str(value)) for key, value in values.items()]
     assert settled_shape({"focus_controller": SimpleNamespace(values=pairs)}) == SettledShape(0.02, 40.0, 1.3e-9, True)
     assert settled_shape({"focus_controller": SimpleNamespace(values=pairs[3:])}) is None

@@ -235,7 +235,7 @@ def test_messages_have_their_time_and_the_log_keeps_them(monkeypatch: pytest.Mon
 
 
 def test_the_page_says_where_the_mirror_stands() -> None:
-    values = {"curvature": 0.05, "since": "40.0", "bound": 1.3e-9, "held": False}
+    values = {"curvature": 0.05, "age": "40.0", "bound": 1.3e-9, "held": False}
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     heard = {"left/focus_controller": DiagnosticStatus(name="left/focus_controller", values=pairs)}
     present = frozenset(("pdm_driver", "focus_controller"))

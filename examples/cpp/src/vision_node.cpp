@@ -1,5 +1,6 @@
 // A vision node beside the mirror: distances of what it detects in, focus requests out. It does in C++ what
-// examples/vision_node.py does in Python, see docs/camera.md: ros2 run dm_example_cpp vision_node --ros-args -p rest_distance:=10.0
+// examples/vision_node.py does in Python, see docs/camera.md:
+// ros2 run dm_example_cpp vision_node --ros-args -p rest_distance:=10.0
 
 #include <memory>
 #include <stdexcept>

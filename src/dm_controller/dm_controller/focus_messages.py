@@ -107,7 +107,7 @@ def health(controller: FocusController, values: Mapping[str, Any], now: Moment) 
     if shape is not None and shape.kept and report and same_signals(report.requested, shape.sent.command.signals):
         figures |= {
             "curvature": shape.move.target.curvature,
-            "since": f"{now.time - shape.began:.1f}",
+            "age": f"{now.time - shape.began:.1f}",
             "bound": shape.bound(not controller.observer.unknown),
         }
     text = trouble(controller, values, now)
@@ -139,9 +139,9 @@ def capabilities_message(
         return message
     assert active is not None
     low, high = active.reachable_range(FocusTarget(0.0), tolerance)
-    sentences = [f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
     if empty := nowhere(active, tolerance):
-        message.error_code, sentences = ErrorCode.UNREACHABLE, [empty]
+        message.error_code = ErrorCode.UNREACHABLE
+    sentences = [empty or f"{low:+.4f} to {high:+.4f} 1/m ({2 * low:+.3f} to {2 * high:+.3f} dioptre)"]
     if unknown and active.planner.hysteresis is not None:
         sentences.append(f"wider error bound: {unknown}")
     dead = [str(k + 1) for k, grade in enumerate(active.calibration.actuator_grade) if grade == Calibration.GRADE_DEAD]

@@ -764,7 +764,7 @@ def test_health_says_what_stands_as_long_as_it_does() -> None:
     bench.wait(40.0)
     told = health(bench.controller, VALUES, bench.now).values
     assert (told["curvature"], told["held"]) == (0.02, True) and bench.controller.hold.corrections
-    assert float(str(told["since"])) == pytest.approx(40.0, abs=0.1) and 0.0 < float(str(told["bound"])) < 3e-6
+    assert float(str(told["age"])) == pytest.approx(40.0, abs=0.1) and 0.0 < float(str(told["bound"])) < 3e-6
     bench.degauss()
     assert "curvature" not in health(bench.controller, VALUES, bench.now).values
 

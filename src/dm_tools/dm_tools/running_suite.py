@@ -179,5 +179,5 @@ def settled_shape(health: dict[str, Any]) -> SettledShape | None:
     if "curvature" not in values:
         return None
     return SettledShape(
-        float(values["curvature"]), float(values["since"]), float(values["bound"]), values["held"] == "True"
+        float(values["curvature"]), float(values["age"]), float(values["bound"]), values["held"] == "True"
     )

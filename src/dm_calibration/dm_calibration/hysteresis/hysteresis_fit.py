@@ -197,7 +197,7 @@ def _remarks(found: Identification) -> tuple[str, ...]:
     best = found.fit.candidate.name
     others = ", ".join(f"{name} {score:.2f}" for name, score in found.scores.items() if name != best)
     sentences = [f"Hysteresis: {best} predicts the maps left out best; error of other models relative to it: {others}."]
-    tried = [one for one in CANDIDATES if one.own and one.hysteretic and one.name in found.scores]
+    tried = any(one.own and one.hysteretic and one.name in found.scores for one in CANDIDATES)
     if tried and not found.fit.candidate.own:
         sentences.append("Hysteresis: the maps do not tell the actuators' loops apart; all share one law.")
     sentences += [f"Hysteresis: {name} was not taken: {reason}." for name, reason in found.refused.items()]

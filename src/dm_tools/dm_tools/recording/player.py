@@ -69,9 +69,9 @@ def play(
             for name in names
         }
         time.sleep(DISCOVERY_S)
-        for name in names:
+        for name in (name for name in names if name.rsplit("/", 1)[-1] == DRIVER_STATE):
             living = {info.node_name for info in node.get_publishers_info_by_topic(name)} - {node.get_name()}
-            if living and name.rsplit("/", 1)[-1] == DRIVER_STATE:
+            if living:
                 raise ValueError(
                     f"{name}: the node {living.pop()} publishes it here, and who follows that would take the recorded "
                     "moves for its own; replay with another ROS_DOMAIN_ID, or --topics without it"
