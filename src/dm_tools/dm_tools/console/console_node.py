@@ -41,6 +41,8 @@ LOG_LINES = 200
 SILENCE_S = 5.0
 #: Time for an answer that comes at once, s.
 ANSWER_S = 10.0
+#: Longest action, s.
+LONGEST_S = 7200.0
 #: Time that runs back by more than this is another time: a simulator that was started again, s.
 TIME_JUMP_S = 60.0
 
@@ -152,7 +154,7 @@ class ConsoleNode:
         except DeformableMirrorError as error:
             raise Refusal(error.error_code, f"{error} (error {error.error_code})") from error
 
-    async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = 7200.0) -> Any:
+    async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = LONGEST_S) -> Any:
         """Run an action to its end and return its result.
 
         Raises:

@@ -13,7 +13,6 @@ from dm_common.optics.zernike import rms_beyond_tilt
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import Session
 from dm_tools.console.view_models import NM, poke_signals, prediction_text
-from dm_tools.long_actions import calibration_step, converge_step, recipe_step
 
 #: What the plans of a calibration are called.
 PLANS = {
@@ -35,25 +34,15 @@ async def predict(session: Session, request: FocusRequest) -> str:
 
 async def move(session: Session, request: FocusRequest) -> str:
     """Take the curvature of `request`."""
-
-    def show(feedback: Any) -> None:
-        session.progress.step, session.progress.steps = round(100 * feedback.progress), 100
-        session.progress.text = ("planning", "moving", "settling")[min(feedback.phase, 2)]
-
     timeout = MOVE_S + (DEGAUSS_S if request.mode != FocusRequest.MODE_DIRECT else 0.0)
-    result = await session.ros.run("move_focus", MoveFocus.Goal(request=request), show, timeout)
+    result = await session.run("move_focus", MoveFocus.Goal(request=request), timeout)
     session.base = None
     return f"{request.curvature:+.4f} 1/m stands after {result.duration:.2f} s. {prediction_text(result.state)}"
 
 
 async def converge(session: Session, request: FocusRequest) -> str:
     """Correct the command on the interferometer until the surface is right."""
-
-    def show(feedback: Any) -> None:
-        session.progress.step = feedback.step
-        session.progress.text = converge_step(feedback)
-
-    result = await session.ros.run("converge", Converge.Goal(request=request), show)
+    result = await session.run("converge", Converge.Goal(request=request))
     session.base = None
     figures = f"{result.residual_rms * NM:.1f} nm rms, largest coefficient {result.max_zernike * NM:.2f} nm"
     return f"{figures}, {result.maps} maps"
@@ -68,12 +57,7 @@ async def flatten(session: Session) -> str:
 
 async def degauss(session: Session) -> str:
     """Wipe the history of the actuators."""
-    session.progress.text = "alternating with falling amplitude about mid range"
-
-    def show(feedback: Any) -> None:
-        session.progress.step, session.progress.steps = feedback.step, feedback.steps
-
-    answer = await session.ros.run("degauss", Degauss.Goal(), show, DEGAUSS_S)
+    answer = await session.run("degauss", Degauss.Goal(), DEGAUSS_S)
     session.base = None
     return f"done in {answer.duration:.1f} s; the mirror is at mid range"
 
@@ -87,12 +71,7 @@ async def measure(session: Session, label: str = "console") -> str:
 
 async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
     """Measure and store a calibration."""
-
-    def show(feedback: Any) -> None:
-        session.progress.step, session.progress.steps = feedback.step, feedback.steps
-        session.progress.text = calibration_step(feedback)
-
-    result = await session.ros.run("calibrate", goal, show)
+    result = await session.run("calibrate", goal)
     findings = "".join(f" Poke check: {sentence}." for sentence in result.poke_findings)
     if result.poke_check_passed:
         findings = " Poke check passed: wiring and orientation are as configured."
@@ -103,17 +82,12 @@ async def calibrate(session: Session, goal: Calibrate.Goal) -> str:
 async def estimate(session: Session, goal: Calibrate.Goal) -> str:
     """How long a calibration would take, and how good it would be; nothing moves."""
     goal.dry_run = True
-    return str((await session.ros.run("calibrate", goal, lambda _feedback: None, MOVE_S)).message)
+    return str((await session.run("calibrate", goal, MOVE_S)).message)
 
 
 async def build_recipes(session: Session, goal: BuildRecipes.Goal) -> str:
     """Condition the mirror, then converge, for every shape of the goal; stored with the calibration in use."""
-
-    def show(feedback: Any) -> None:
-        session.progress.step, session.progress.steps = feedback.recipes, len(goal.curvatures)
-        session.progress.text = recipe_step(feedback, goal.zernike)
-
-    result = await session.ros.run("build_recipes", goal, show)
+    result = await session.run("build_recipes", goal)
     session.base = None
     return str(result.message)
 

@@ -1,14 +1,13 @@
 """What all open pages of one console share: the operation under way, its progress, and everything that went wrong."""
 
 import asyncio
-import itertools
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from dm_common.errors import Refusal
-from dm_tools.console.console_node import ConsoleNode, Snapshot
+from dm_tools.console.console_node import LONGEST_S, ConsoleNode, Snapshot
 from dm_tools.console.loops import Loop
 from dm_tools.long_actions import calibration_step, converge_step, recipe_step
 
@@ -27,7 +26,6 @@ EXTERNAL = {
 class Failure:
     """Something that was refused or went wrong; `ends` is when it is shown no more, s of the steady clock."""
 
-    number: int
     clock: str
     title: str
     sentence: str
@@ -51,6 +49,23 @@ class Progress:
     text: str = ""
     can_cancel: bool = False
 
+    def take(self, action: str, feedback: Any, goal: Any = None) -> None:
+        """Show the feedback of an action; `goal` = None: somebody else's, which is not known."""
+        match action:
+            case "move_focus":
+                self.step, self.steps = round(100 * feedback.progress), 100
+                self.text = ("planning", "moving", "settling")[min(feedback.phase, 2)]
+            case "degauss":
+                self.step, self.steps = feedback.step, feedback.steps
+                self.text = "alternating with falling amplitude about mid range"
+            case "calibrate":
+                self.step, self.steps, self.text = feedback.step, feedback.steps, calibration_step(feedback)
+            case "converge":
+                self.step, self.text = feedback.step, converge_step(feedback)
+            case "build_recipes":
+                self.step, self.steps = feedback.recipes, len(goal.curvatures) if goal is not None else 0
+                self.text = recipe_step(feedback, goal.zernike if goal is not None else ())
+
 
 @dataclass
 class Session:
@@ -73,8 +88,7 @@ class Session:
     poked: list[float] = field(default_factory=list)
     loops: dict[int, Loop] = field(default_factory=dict)
     _outcome_ends: float = 0.0
-    _numbers: Any = field(default_factory=lambda: itertools.count(1))
-    _cancel: Callable[[], Awaitable[None]] | None = None
+    _cancel: str | None = None
     _task: asyncio.Task[None] | None = None
     cancelled: bool = False
 
@@ -102,49 +116,49 @@ class Session:
         name = self.ros.external_action
         if self.progress.title or not name:
             return self.progress
-        feedback = self.ros.watched[name].feedback
-        shown = Progress(EXTERNAL[name], can_cancel=True)
-        if feedback is None:
-            shown.text = "no word of it yet"
-        elif name == "calibrate":
-            shown.step, shown.steps, shown.text = feedback.step, feedback.steps, calibration_step(feedback)
-        else:
-            shown.text = recipe_step(feedback) if name == "build_recipes" else converge_step(feedback)
+        shown = Progress(EXTERNAL[name], text="no word of it yet", can_cancel=True)
+        if (feedback := self.ros.watched[name].feedback) is not None:
+            shown.take(name, feedback)
         return shown
 
     def fail(self, title: str, sentence: str) -> None:
         """Show a sentence until it is dismissed or its time is over."""
         ends = time.monotonic() + SHOWN_S
-        self.failures.append(Failure(next(self._numbers), time.strftime("%H:%M:%S"), title, sentence, ends))
+        self.failures.append(Failure(time.strftime("%H:%M:%S"), title, sentence, ends))
         del self.failures[:-FAILURES_KEPT]
         self.ros.take_log(time.time(), "ERROR", "console", f"{title}: {sentence}")
 
-    def dismiss(self, number: int) -> None:
+    def dismiss(self, failure: Failure) -> None:
         """Take a failure off the pages."""
-        self.failures[:] = [failure for failure in self.failures if failure.number != number]
+        self.failures[:] = [each for each in self.failures if each is not failure]
 
     def begin(
         self,
         title: str,
-        work: Callable[[], Awaitable[str]],
-        cancel: Callable[[], Awaitable[None]] | None = None,
+        operation: Callable[..., Awaitable[str]],
+        wish: Callable[[], Any] | None = None,
+        cancel: str | None = None,
     ) -> None:
         """Start an operation; when another is under way, say so instead.
 
         Args:
-            work: returns its outcome in words; raises Refusal or ValueError with the sentence to show.
-            cancel: how to stop it; None = it cannot be.
+            operation: called with this session and what `wish` says, if there is one; returns its outcome in words.
+                Both raise Refusal or ValueError with the sentence to show.
+            cancel: the action that stops it; "" = it looks at `cancelled` itself, None = it cannot be stopped.
         """
         if self.running:
             self.fail(title, f"not begun: {self.running} is under way")
             return
         self.progress = Progress(title, can_cancel=cancel is not None)
         self._cancel, self.cancelled, self.outcome = cancel, False, ""
-        self._task = asyncio.get_running_loop().create_task(self._follow(title, work))
+        self._task = asyncio.get_running_loop().create_task(self._follow(title, operation, wish))
 
-    async def _follow(self, title: str, work: Callable[[], Awaitable[str]]) -> None:
+    async def _follow(
+        self, title: str, operation: Callable[..., Awaitable[str]], wish: Callable[[], Any] | None
+    ) -> None:
         try:
-            self.outcome = f"{title}: {await work()} ({time.strftime('%H:%M:%S')})"
+            outcome = await operation(self, *([wish()] if wish is not None else []))
+            self.outcome = f"{title}: {outcome} ({time.strftime('%H:%M:%S')})"
             self._outcome_ends = time.monotonic() + SHOWN_S
         except (Refusal, ValueError) as error:
             self.fail(title, str(error))
@@ -154,20 +168,21 @@ class Session:
         finally:
             self.progress = Progress()
 
+    async def run(self, action: str, goal: Any, timeout_s: float = LONGEST_S) -> Any:
+        """Run an action to its end, with its progress shown, and return its result. Raises Refusal."""
+        return await self.ros.run(action, goal, lambda feedback: self.progress.take(action, feedback, goal), timeout_s)
+
     async def cancel(self) -> None:
         """Ask the operation under way to stop, here or elsewhere."""
+        name = self.ros.external_action
+        if self.progress.title:
+            if self._cancel is None:
+                return
+            name, self.cancelled, self.progress.text = self._cancel, True, "cancelling"
         try:
-            if not self.progress.title and (name := self.ros.external_action):
-                await self.ros.cancel(name)
-            elif self._cancel is not None and self.progress.title:
-                self.cancelled = True
-                self.progress.text = "cancelling"
-                await self._cancel()
+            await self.ros.cancel(name)
         except Refusal as error:
             self.fail("Cancel", str(error))
-
-    async def between_steps(self) -> None:
-        """How work that checks `cancelled` between its steps is cancelled."""
 
     async def end(self) -> None:
         """Cancel what is under way here and wait for its end, for a shutdown in order."""

@@ -15,7 +15,7 @@ from dm_tools.console.loops import modelled_loop
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import Cell, cells, towards
-from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card, labelled
+from dm_tools.console.widgets.components import ActionButton, Chart, DecimalField, Line, card
 
 ARROWS = {"right": 0.0, "up": math.pi / 2, "left": math.pi, "down": -math.pi / 2}
 
@@ -29,12 +29,12 @@ class ActuatorCards:
         self._loop: tuple[Any, ...] = ()
         with ui.element("div").classes("pair"):
             with card("Command map"):
-                with ui.element("div").classes("map w-full").props('tabindex="0" role="group"') as self._map:
+                with ui.element("div").classes("map w-full").props('tabindex="0" role="group"') as keys:
                     self._picture = Chart("square", lambda value: self._clicked(int(value[2])))
-                labelled(self._map, "Actuators. Arrow keys choose, Enter pokes, Escape releases")
+                keys.props('aria-label="Actuators. Arrow keys choose, Enter pokes, Escape releases"')
                 for key, direction in ARROWS.items():
-                    self._map.on(f"keydown.{key}.prevent", lambda _event, way=direction: self._step(way))
-                self._map.on("keydown.enter.prevent", lambda: self._poke())
+                    keys.on(f"keydown.{key}.prevent", partial(self._step, direction))
+                keys.on("keydown.enter.prevent", self._poke)
                 ui.label("▲▼ at a limit · … on its way · ! refused · ? doubtful grade · × not wired").classes("text")
             with card("Actuator"):
                 self._text = Line("text figures", live=True)
@@ -49,8 +49,8 @@ class ActuatorCards:
                     self._with_map = ui.switch("Map after a poke", value=True)
                 with ui.element("div").classes("line"):
                     self._poke_button = ActionButton("Poke", self._poke)
-                    self._release = ActionButton("Release (Esc)", self._start_release, True)
-                    self._measure_loop = ActionButton("Measure its loop", self._start_loop, True)
+                    self._release = ActionButton("Release (Esc)", self._start_release, outline=True)
+                    self._measure_loop = ActionButton("Measure its loop", self._start_loop, outline=True)
                 self._reason = Line("reason")
                 self._loop_text = Line("text figures")
                 self._loop_picture = Chart("loop")
@@ -94,15 +94,15 @@ class ActuatorCards:
             session.fail(f"Poke {number}", reason)
             return
         maps = bool(self._with_map.value) and not reason_against("measure", snapshot, "")
-        session.begin(f"Poke {number}", lambda: operations.poke(session, number, self._swing(), maps))
+        session.begin(f"Poke {number}", lambda _session: operations.poke(session, number, self._swing(), maps))
 
     def _start_release(self) -> None:
-        self._session.begin("Release", lambda: operations.release(self._session))
+        self._session.begin("Release", operations.release)
 
     def _start_loop(self) -> None:
         session, number = self._session, self._session.chosen
-        work = partial(operations.measure_loop, session, number)
-        session.begin(f"Loop of actuator {number}", lambda: work(self._swing()), session.between_steps)
+        title = f"Loop of actuator {number}"
+        session.begin(title, lambda _session: operations.measure_loop(session, number, self._swing()), cancel="")
 
     # --- showing ---
 

@@ -1,7 +1,6 @@
 """The card of calibrations: run one, see how it goes, load one."""
 
 from collections.abc import Iterable
-from functools import partial
 from html import escape
 from typing import Any
 
@@ -40,15 +39,21 @@ class CalibrationCard:
             self._maps.bind_visibility_from(self._plan, "value", value=Calibrate.Goal.PLAN_HYSTERESIS)
             self._note = ui.input("Note, stored with it").classes("w-full")
             with ui.element("div").classes("line"):
-                self._start = ActionButton("Calibrate", self._begin)
-                self._estimate = ActionButton("How long?", self._begin_estimate, True)
-                self._cancel = ActionButton("Cancel calibration", session.cancel, True)
+                self._start = ActionButton(
+                    "Calibrate", session.begin, "Calibration", operations.calibrate, self._goal, "calibrate"
+                )
+                self._estimate = ActionButton(
+                    "How long?", session.begin, "Estimate", operations.estimate, self._goal, outline=True
+                )
+                self._cancel = ActionButton("Cancel calibration", session.cancel, outline=True)
             self._reason = Line("reason")
             self._progress = Line("text figures", live=True)
             self._residuals = Chart("run")
             self._choice = ui.select({}, label="In the store").classes("w-full")
             self._choice.on("popup-show", self._forget_list)
-            self._load = ActionButton("Load", self._begin_load, True)
+            self._load = ActionButton(
+                "Load", session.begin, "Load", operations.load, lambda: str(self._choice.value or ""), outline=True
+            )
 
     def _goal(self) -> Calibrate.Goal:
         """What the fields ask for. Raises ValueError naming the field."""
@@ -61,17 +66,6 @@ class CalibrationCard:
                 )
             goal.hysteresis_maps = int(length)
         return goal
-
-    def _begin(self) -> None:
-        session = self._session
-        cancel = partial(session.ros.cancel, "calibrate")
-        session.begin("Calibration", lambda: operations.calibrate(session, self._goal()), cancel)
-
-    def _begin_estimate(self) -> None:
-        self._session.begin("Estimate", lambda: operations.estimate(self._session, self._goal()))
-
-    def _begin_load(self) -> None:
-        self._session.begin("Load", lambda: operations.load(self._session, str(self._choice.value or "")))
 
     def refresh(self, snapshot: Snapshot) -> None:
         session = self._session

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from nicegui import ui
@@ -63,36 +64,25 @@ class DecimalField:
             self._field.set_value(f"{value:g}")
 
 
-def labelled(element: Any, name: str) -> Any:
-    """Give an element the name that screen readers say."""
-    return element.props(f'aria-label="{name}"')
-
-
-class ActionButton:
-    """A button that is disabled with its reason as a tooltip.
+class ActionButton(ui.element):
+    """A button that is disabled with its reason as a tooltip; a click calls `on_click` with the arguments.
 
     Args:
-        text: on it.
-        on_click: called without arguments.
         outline: for what is not the main thing to do.
     """
 
-    def __init__(self, text: str, on_click: Callable[[], Any], outline: bool = False) -> None:
-        self._reason: str | None = None
-        with ui.element("span") as self._shell:
-            self._button = ui.button(text, on_click=lambda: on_click()).props("no-caps unelevated")
+    def __init__(self, text: str, on_click: Callable[..., Any], *arguments: Any, outline: bool = False) -> None:
+        super().__init__("span")
+        with self:
+            self._button = ui.button(text, on_click=partial(on_click, *arguments)).props("no-caps unelevated")
             # The words of a filled button have their colour from the page's style, which knows of the dark.
             self._button.props("outline" if outline else "text-color=none")
 
     def allow(self, reason: str) -> None:
         """Enable it when `reason` is empty, else disable it and say why."""
-        if reason == self._reason:
-            return
-        self._reason = reason
         self._button.set_enabled(not reason)
-        # On the shell: a disabled button shows no tooltip.
-        self._shell.props["title"] = reason
-        self._shell.update()
+        if reason != self.props.get("title"):  # about the button: a disabled one shows no tooltip
+            self.props["title"] = reason
 
 
 class Chart:
@@ -135,14 +125,15 @@ class Chart:
         return chart
 
 
-class Line:
-    """A line of text, out of sight while it is empty."""
+class Line(ui.label):
+    """A line of text, out of sight while it is empty; `live` = screen readers say what is new in it."""
 
     def __init__(self, classes: str = "text", live: bool = False) -> None:
-        self.label = ui.label("").classes(classes)
+        super().__init__("")
+        self.classes(classes)
         if live:
-            self.label.props('role="status" aria-live="polite"')
+            self.props('role="status" aria-live="polite"')
 
     def show(self, text: str) -> None:
-        self.label.set_text(text)  # NiceGUI sends only what has changed
-        self.label.set_visibility(bool(text))
+        self.set_text(text)  # NiceGUI sends only what has changed
+        self.set_visibility(bool(text))

@@ -2,7 +2,6 @@
 
 import math
 import time
-from functools import partial
 
 from dm_msgs.msg import FocusRequest
 from nicegui import background_tasks, ui
@@ -13,7 +12,7 @@ from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
 from dm_tools.console.view_models import MODES, reachable
-from dm_tools.console.widgets.components import ActionButton, DecimalField, Line, card, labelled
+from dm_tools.console.widgets.components import ActionButton, DecimalField, Line, card
 
 #: Step of the slider, 1/m.
 STEP = 0.0005
@@ -34,23 +33,21 @@ class FocusCard:
         with card("Focus"):
             self._text = Line("text figures")
             self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
-            labelled(self._slider, "Curvature in 1 per metre").props("label switch-label-side")
+            self._slider.props('aria-label="Curvature in 1 per metre" label switch-label-side')
             with ui.element("div").classes("line"):
                 self._number = DecimalField("Curvature, 1/m", 0.0, "w-36", self._typed)
                 self._conic = DecimalField("Conic constant", 0.0, "w-28", self._touch)
                 self._power = Line("text figures")
-            self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO, on_change=lambda: self._touch())
-            labelled(self._mode.props("inline"), "Mode")
+            self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO, on_change=self._touch)
+            self._mode.props('inline aria-label="Mode"')
             self._prediction = Line("text figures", live=True)
             with ui.element("div").classes("line"):
-                self._move = ActionButton("Move", self._start_move)
-                self._flatten = ActionButton(
-                    "Flatten", lambda: session.begin("Flatten", lambda: operations.flatten(session)), True
+                self._move = ActionButton("Move", session.begin, "Move", operations.move, self._request, "move_focus")
+                self._flatten = ActionButton("Flatten", session.begin, "Flatten", operations.flatten, outline=True)
+                self._degauss = ActionButton("Degauss", session.begin, "Degauss", operations.degauss, outline=True)
+                self._converge = ActionButton(
+                    "Converge", session.begin, "Converge", operations.converge, self._request, "converge", outline=True
                 )
-                self._degauss = ActionButton(
-                    "Degauss", lambda: session.begin("Degauss", lambda: operations.degauss(session)), True
-                )
-                self._converge = ActionButton("Converge", self._start_converge, True)
             self._reason = Line("reason")
 
     def _slid(self) -> None:
@@ -75,16 +72,6 @@ class FocusCard:
         return FocusRequest(
             curvature=float(self._number.value), conic_constant=float(self._conic.value), mode=str(self._mode.value)
         )
-
-    def _start_move(self) -> None:
-        session = self._session
-        cancel = partial(session.ros.cancel, "move_focus")
-        session.begin("Move", lambda: operations.move(session, self._request()), cancel)
-
-    def _start_converge(self) -> None:
-        session = self._session
-        cancel = partial(session.ros.cancel, "converge")
-        session.begin("Converge", lambda: operations.converge(session, self._request()), cancel)
 
     def refresh(self, snapshot: Snapshot) -> None:
         session = self._session
@@ -137,10 +124,10 @@ class FocusCard:
     async def _predict(self) -> None:
         try:
             text = await operations.predict(self._session, self._request())
-            self._prediction.label.classes(remove="refused")
+            self._prediction.classes(remove="refused")
             self._prediction.show(text)
         except (Refusal, ValueError) as error:
-            self._prediction.label.classes(add="refused")
+            self._prediction.classes(add="refused")
             self._prediction.show(str(error))
         finally:
             self._asking = False

@@ -1,5 +1,6 @@
 """The header of the page, always in sight: state of the bench, what is missing, and everything that was refused."""
 
+from functools import partial
 from html import escape
 
 from nicegui import ui
@@ -56,7 +57,7 @@ class Header:
         state = snapshot.actuator_state
         if state is not None and state.error_code and state.message:
             lacking.append(f"Driver: {state.message} (error {state.error_code})")
-        key = (tuple(lacking), tuple(failure.number for failure in self._session.failures))
+        key = (*lacking, *self._session.failures)
         if key != self._shown:
             self._shown = key
             self._fill(lacking)
@@ -67,7 +68,7 @@ class Header:
             for failure in reversed(self._session.failures):
                 with ui.element("div").classes("failure"):
                     ui.label(f"{failure.clock} {failure.title}: {failure.sentence}")
-                    button = ui.button("Dismiss", on_click=lambda _event, n=failure.number: self._session.dismiss(n))
+                    button = ui.button("Dismiss", on_click=partial(self._session.dismiss, failure))
                     button.props(f'flat dense no-caps color=negative aria-label="Dismiss: {failure.title}"')
             for sentence in lacking:
                 with ui.element("div").classes("failure missing"):

@@ -1,6 +1,5 @@
 """The card of recipes: those of the calibration in use, and how to build more."""
 
-from functools import partial
 from html import escape
 
 from dm_msgs.action import BuildRecipes
@@ -36,16 +35,10 @@ class RecipesCard:
                 self._conic = DecimalField("Conic", 0.0, "w-20")
                 self._terms = ui.input("Added terms, nm").classes("w-full")
                 self._terms.props('hint="astigmatism cos=200, coma sin=-50"')
-            self._build = ActionButton("Build recipes", self._begin)
+            self._build = ActionButton(
+                "Build recipes", session.begin, "Recipes", operations.build_recipes, self._goal, "build_recipes"
+            )
             self._reason = Line("reason")
-
-    def _begin(self) -> None:
-        session = self._session
-        session.begin(
-            "Recipes",
-            lambda: operations.build_recipes(session, self._goal()),
-            partial(session.ros.cancel, "build_recipes"),
-        )
 
     def _goal(self) -> BuildRecipes.Goal:
         """What the fields say. Raises ValueError naming the one that makes no sense."""

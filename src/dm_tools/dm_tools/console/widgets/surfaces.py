@@ -15,7 +15,7 @@ from dm_tools.console.status import reason_against
 from dm_tools.console.surface_view import SurfaceView
 from dm_tools.console.surfaces import Surface
 from dm_tools.console.view_models import bars
-from dm_tools.console.widgets.components import ActionButton, Chart, Line, card, labelled
+from dm_tools.console.widgets.components import ActionButton, Chart, Line, card
 
 #: Share of the pixels that the scale of a difference covers: a few stray ones must not flatten it.
 COVERED = 99.5
@@ -35,9 +35,7 @@ class SurfaceCard:
         self._names: list[ui.label] = []
         with card("Surface"):
             with ui.element("div").classes("line"):
-                self._measure = ActionButton(
-                    "Measure", lambda: session.begin("Measure", lambda: operations.measure(session))
-                )
+                self._measure = ActionButton("Measure", session.begin, "Measure", operations.measure)
                 self._then = ui.switch("Prediction of the moment of the map", value=True)
                 self._when = Line("text")
             self._reason = Line("reason")
@@ -91,8 +89,7 @@ class ZernikeCard:
         self._view = view
         self._shown: tuple[Any, ...] = ()
         with card("Zernike coefficients"):
-            self._kind = ui.radio(KINDS, value=True)
-            labelled(self._kind.props("inline"), "What the bars show")
+            self._kind = ui.radio(KINDS, value=True).props('inline aria-label="What the bars show"')
             self._bars = Chart("bars")
             self._note = Line("text")
 
