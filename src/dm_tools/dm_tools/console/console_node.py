@@ -52,6 +52,7 @@ class Snapshot:
     """The latest message of each topic; None = none was heard.
 
     Attributes:
+        calibration: in use; None = none is, or none was heard.
         diagnostics: {node: latest status}, of this namespace's nodes and others.
         present: names of the nodes heard lately, without the namespace.
         bench_time: s, ROS time as far as heard.
@@ -136,8 +137,11 @@ class ConsoleNode:
             for name, when in dict(self._heard).items()
             if when >= recent and name.startswith(self._prefix)
         )
+        messages = dict(self._connection.messages)
+        if "calibration" in messages and not messages["calibration"].id:
+            del messages["calibration"]
         return Snapshot(
-            **dict(self._connection.messages),
+            **messages,
             diagnostics=dict(self._diagnostics),
             present=present,
             bench_time=self._bench_time,

@@ -140,7 +140,7 @@ async def measure_loop(session: Session, actuator: int, amplitude: float) -> str
     """Take one actuator up and down with a map at every step; it ends where it began."""
     snapshot, (mirror, start) = session.snapshot(), _mirror_and_signals(session)
     calibration, observer = snapshot.calibration, session.ros.observer
-    if calibration is None or not calibration.id:
+    if calibration is None:
         raise Refusal(
             ErrorCode.NOT_CALIBRATED,
             "a measured loop needs a calibration: it holds what the actuator does to the surface",

@@ -30,10 +30,11 @@ class EffectiveSignals(NamedTuple):
     effective: Floats | None
     doubt: str
 
-    def same_as(self, other: EffectiveSignals) -> bool:
-        """Whether both say the same."""
-        mine, theirs = (np.array(each.effective, dtype=np.float64) for each in (self, other))
-        return self.doubt == other.doubt and np.array_equal(mine, theirs, equal_nan=True)
+    def near(self, other: EffectiveSignals, tolerance: float = 0.0) -> bool:
+        """Whether both say the same, with signals that differ by no more than `tolerance`."""
+        mine, theirs = (np.array(each.effective, dtype=np.float64) for each in (self, other))  # None = one NaN
+        alike = self.doubt == other.doubt and mine.shape == theirs.shape
+        return alike and np.allclose(mine, theirs, rtol=0.0, atol=tolerance, equal_nan=True)
 
 
 class StateObserver:

@@ -57,7 +57,7 @@ def badges(snapshot: Any, doubt: str) -> list[Badge]:
         active = state.driver_state == ActuatorState.STATE_ACTIVE
         text = DRIVER_STATES.get(state.driver_state, "?") + (", moving" if state.moving else "")
         shown.append(Badge(f"driver: {text}", "" if active else "bad"))
-    if calibration is None or not calibration.id:
+    if calibration is None:
         shown.append(Badge("no calibration", "doubt"))
     else:
         quality = QUALITIES.get(calibration.quality, "?")

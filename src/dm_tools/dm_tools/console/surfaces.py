@@ -32,7 +32,7 @@ def _disc() -> tuple[Floats, Floats, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Sag over the aperture, piston and tilt removed.
+    """Sag over the aperture, piston and tilt removed; some of it is known.
 
     Attributes:
         sag: (GRID, GRID) m, row 0 = top, NaN = no data or outside the aperture.
@@ -44,18 +44,18 @@ class Surface:
 
     @cached_property
     def peak_to_valley(self) -> float:
-        """m; NaN without data."""
-        return float(np.nanmax(self.sag) - np.nanmin(self.sag)) if np.isfinite(self.sag).any() else float("nan")
+        """In m."""
+        return float(np.nanmax(self.sag) - np.nanmin(self.sag))
 
     @cached_property
     def rms(self) -> float:
-        """m; NaN without data."""
-        return float(np.nanstd(self.sag)) if np.isfinite(self.sag).any() else float("nan")
+        """In m."""
+        return float(np.nanstd(self.sag))
 
     @cached_property
     def extent(self) -> float:
-        """m, largest magnitude; NaN without data."""
-        return float(np.nanmax(np.abs(self.sag))) if np.isfinite(self.sag).any() else float("nan")
+        """m, largest magnitude."""
+        return float(np.nanmax(np.abs(self.sag)))
 
 
 def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
@@ -133,11 +133,7 @@ class SurfaceModel:
 
 
 def difference(measured: Surface, predicted: Surface) -> Surface:
-    """Measured minus predicted.
-
-    Raises:
-        ValueError: the apertures differ.
-    """
+    """Measured minus predicted. Raises ValueError when the apertures differ."""
     gap = abs(measured.radius - predicted.radius)
     if measured.radius > 0 and gap > RADIUS_TOLERANCE * predicted.radius:
         raise ValueError(

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from dm_msgs.msg import ActuatorState, Calibration, FocusRequest
 from matplotlib import colormaps
+from matplotlib.colors import to_hex
 
 from dm_common import Floats
 from dm_common.figures import with_point
 from dm_common.optics.zernike import NAMES, PISTON_TILT, SPOKEN
-from dm_common.recipes import recipe_row
 
 NM = 1e9
 #: Half-width of a 95 % interval in standard deviations.
@@ -81,32 +81,34 @@ def ink_on(colour: str) -> str:
 
 def cells(mirror: Any, state: Any, calibration: Any) -> list[Cell]:
     """The actuators of a dm_msgs/MirrorInfo with a dm_msgs/ActuatorState and the grades of a Calibration, or None."""
-    count = int(mirror.actuators)
-    applied = np.array(state.applied, dtype=np.float64) if state is not None else np.zeros(0)
-    known = applied.shape == (count,)
-    flags = np.frombuffer(bytes(state.flags), dtype=np.uint8) if state is not None else np.zeros(0, np.uint8)
-    flags = flags if flags.shape == (count,) else np.zeros(count, np.uint8)
-    grades = list(calibration.actuator_grade) if calibration is not None else []
-    grades = grades if len(grades) == count else [Calibration.GRADE_GOOD] * count
-    share = (applied - mirror.signal_min) / (mirror.signal_max - mirror.signal_min) if known else np.full(count, 0.5)
-    colours = colormaps[SIGNAL_COLOURS](np.clip(share, 0.0, 1.0), bytes=True)
-    result = []
-    for index in range(count):
-        fill = "#e4e7eb" if not known else "#" + bytes(colours[index, :3]).hex()
-        marks = _marks(int(flags[index]), int(grades[index]), float(applied[index]) if known else None, mirror)
-        result.append(
+    count = mirror.actuators
+
+    def one_each(values: Sequence[Any], otherwise: Any) -> Sequence[Any]:
+        return values if len(values) == count else [otherwise] * count
+
+    applied = one_each(state.applied if state is not None else (), None)
+    flags = one_each(bytes(state.flags) if state is not None else b"", 0)
+    grades = one_each(calibration.actuator_grade if calibration is not None else (), Calibration.GRADE_GOOD)
+    found = []
+    for index, (signal, flag, grade) in enumerate(zip(applied, flags, grades, strict=True)):
+        fill = "#e4e7eb"
+        if signal is not None:
+            share = (signal - mirror.signal_min) / (mirror.signal_max - mirror.signal_min)
+            fill = to_hex(colormaps[SIGNAL_COLOURS](share))
+        marks = _marks(flag, grade, signal, mirror)
+        found.append(
             Cell(
                 number=index + 1,
                 x=mirror.actuator_x[index] * 1e3,
                 y=mirror.actuator_y[index] * 1e3,
-                signal=float(applied[index]) if known else None,
+                signal=signal,
                 fill=fill,
                 ink=ink_on(fill),
                 remarks=tuple(text for _sign, text in marks),
                 mark=marks[0][0] if marks else "",
             )
         )
-    return result
+    return found
 
 
 def _marks(flags: int, grade: int, signal: float | None, mirror: Any) -> list[tuple[str, str]]:
@@ -244,23 +246,14 @@ def evenly(first: float | None, last: float | None, number: float | None) -> lis
     assert first is not None and last is not None and number is not None
     if not (float(number).is_integer() and 1 <= number <= NUMBER_MAX):
         raise ValueError(f"number = {number:g}: must be a whole number, 1 to {NUMBER_MAX}")
-    if number == 1:
-        return [float(first)]
-    if first == last:
+    if first == last and number > 1:
         raise ValueError(f"first = last = {first:g} 1/m: must differ, or number must be 1")
-    return [round(first + (last - first) * k / (number - 1), 9) for k in range(int(number))]
-
-
-def recipe_rows(calibration: Any) -> list[tuple[str, ...]]:
-    """Recipes of a dm_msgs/Calibration; see `recipe_row`."""
-    if calibration is None or not calibration.id:
-        return []
-    return [recipe_row(recipe) for recipe in calibration.recipes.recipes]
+    return [round(value, 9) for value in np.linspace(first, last, int(number)).tolist()]
 
 
 def calibration_text(calibration: Any) -> list[str]:
-    """A dm_msgs/Calibration in lines: what it is and how good."""
-    if calibration is None or not calibration.id:
+    """A dm_msgs/Calibration in lines: what it is and how good; None = none is in use."""
+    if calibration is None:
         return ["No calibration is in use."]
     lines = [
         f"{calibration.id}: {QUALITIES.get(calibration.quality, '?')}, method {calibration.method}, "

@@ -116,8 +116,7 @@ class ActuatorCards:
         if mirror is None:
             self._picture.show(None, "The driver has not published its actuators yet.")
             return
-        calibration = snapshot.calibration if snapshot.calibration is not None and snapshot.calibration.id else None
-        self._cells = cells(mirror, snapshot.actuator_state, calibration)
+        self._cells = cells(mirror, snapshot.actuator_state, snapshot.calibration)
         session.chosen = min(session.chosen, len(self._cells))
         radius = 0.5e3 * mirror.working_aperture_diameter
         self._picture.show(command_map(self._cells, session.chosen, radius, mirror.signal_min, mirror.signal_max))
@@ -125,10 +124,10 @@ class ActuatorCards:
         volts = f", {state.volts[session.chosen - 1]:.1f} V" if state is not None and len(state.volts) else ""
         limits = f"limits {mirror.signal_min:+.1f} to {mirror.signal_max:+.1f}"
         self._text.show(f"{cell.text[0].upper()}{cell.text[1:]}{volts}; {limits}.")
-        self._show_loop(snapshot, calibration)
+        self._show_loop(snapshot)
 
-    def _show_loop(self, snapshot: Snapshot, calibration: Any) -> None:
-        session, mirror = self._session, snapshot.mirror_info
+    def _show_loop(self, snapshot: Snapshot) -> None:
+        session, mirror, calibration = self._session, snapshot.mirror_info, snapshot.calibration
         law = session.ros.observer.law
         if calibration is None or not law.has_history:
             fault = session.ros.observer.fault if calibration is not None else ""

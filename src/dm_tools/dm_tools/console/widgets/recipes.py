@@ -5,12 +5,12 @@ from html import escape
 from dm_msgs.action import BuildRecipes
 from nicegui import ui
 
-from dm_common.recipes import terms_of
+from dm_common.recipes import recipe_row, terms_of
 from dm_tools.console import operations
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
-from dm_tools.console.view_models import NUMBER_MAX, evenly, recipe_rows
+from dm_tools.console.view_models import NUMBER_MAX, evenly
 from dm_tools.console.widgets.components import ActionButton, DecimalField, Line, folded
 
 #: Range of [1], section 3.2, 1/m, and the number of its curvatures.
@@ -52,10 +52,10 @@ class RecipesCard:
         reason = reason_against("converge", snapshot, self._session.running)
         self._build.allow(reason)
         self._reason.show(f"Not possible now: {reason}" if reason else "")
-        rows = recipe_rows(snapshot.calibration)
+        calibration = snapshot.calibration
+        rows = [recipe_row(recipe) for recipe in calibration.recipes.recipes] if calibration is not None else []
         self._table.set_visibility(bool(rows))
-        in_use = snapshot.calibration is not None and bool(snapshot.calibration.id)
-        none = "This calibration holds none." if in_use else "No calibration is in use."
+        none = "This calibration holds none." if calibration is not None else "No calibration is in use."
         self._text.show(
             "A recipe is a command that was corrected on the interferometer from the conditioned mirror; the mode "
             f"“Conditioned” uses them. {'' if rows else none}"
