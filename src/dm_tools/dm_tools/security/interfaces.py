@@ -28,14 +28,10 @@ LIFECYCLE_SERVICES = (
 LOGS = ("/parameter_events", "/rosout")
 #: Whoever may publish it turns the time of all others.
 CLOCK = "/clock"
-_HEALTH = ("/diagnostics",)
-_TRANSITIONS = ("~/transition_event",)
-_LIFECYCLE = frozenset(node.name for node in NODES if node.lifecycle)
+HEALTH = "/diagnostics"
 #: What an operator's program calls.
 _OPERATION = ("flatten", "list_calibrations", "load_calibration", "measure", "set_focus", "set_signals")
 _LONG_OPERATION = ("build_recipes", "calibrate", "converge", "degauss", "move_focus")
-#: Enclaves of nodes that go by simulated time.
-_TIMED = frozenset(node.name for node in NODES) - {"virtual_bench"}
 
 
 @dataclass(frozen=True)
@@ -44,43 +40,40 @@ class NodeInterface:
 
     Attributes:
         name: of the node; `*` where the process number stands.
-        enclave: last part of the enclave's path.
         publish, subscribe: topics.
         reply, request: services that the node offers and calls.
         execute, call: actions that it offers and calls.
+        enclave: last part of the enclave's path; "" = the name.
     """
 
     name: str
-    enclave: str
     publish: tuple[str, ...] = ()
     subscribe: tuple[str, ...] = ()
     reply: tuple[str, ...] = ()
     request: tuple[str, ...] = ()
     execute: tuple[str, ...] = ()
     call: tuple[str, ...] = ()
+    enclave: str = ""
 
 
-#: The nodes of a bench, and the programs that talk to them.
+#: The nodes of a bench, and the programs that talk to them; without what `interfaces` adds.
 _DECLARED = (
     NodeInterface(
         "pdm_driver",
-        "pdm_driver",
-        publish=(*_HEALTH, "actuator_state", "mirror_info"),
+        publish=("actuator_state", "mirror_info"),
         subscribe=("actuator_command",),
         reply=("hold_mirror", "set_signals"),
         execute=("degauss",),
     ),
     NodeInterface(
         "interferometer",
-        "interferometer",
-        publish=(*_HEALTH, "surface_map", "surface_map_info", "surface_samples", "zernike"),
+        publish=("surface_map", "surface_map_info", "surface_samples", "zernike"),
         subscribe=("mirror_info",),
         reply=("ingest_file", "measure"),
     ),
     NodeInterface(
         "calibration",
-        "calibration",
-        publish=(*_HEALTH, "calibration"),
+        publish=("calibration",),
         subscribe=("actuator_state", "mirror_info", "surface_map_info", "surface_samples", "temperature", "zernike"),
         reply=(
             *("fit_influence_function", "fit_regression", "list_calibrations", "load_calibration"),
@@ -91,11 +84,10 @@ _DECLARED = (
         call=("degauss",),
     ),
     # The way back to mid range when the node ends in a run: the same process, over a node of its own.
-    NodeInterface("calibration_exit", "calibration", request=("set_signals",)),
+    NodeInterface("calibration_exit", request=("set_signals",), enclave="calibration"),
     NodeInterface(
         "focus_controller",
-        "focus_controller",
-        publish=(*_HEALTH, "actuator_command", "actuator_estimate", "capabilities", "focus_state"),
+        publish=("actuator_command", "actuator_estimate", "capabilities", "focus_state"),
         subscribe=("actuator_state", "calibration", "focus_request", "mirror_info", "surface_map_info"),
         reply=("flatten", "set_focus"),
         request=("hold_mirror", "measure", "predict_error", "set_signals", "store_recipes"),
@@ -104,9 +96,8 @@ _DECLARED = (
     ),
     NodeInterface(
         "autofocus",
-        "autofocus",
         publish=(
-            *(*_HEALTH, "autofocus_state", "focus_request"),
+            *("autofocus_state", "focus_request"),
             *("focus_stack/camera_info", "focus_stack/depth", "focus_stack/image"),
         ),
         subscribe=("actuator_state", "capabilities", "focus_state", "camera_info", "image_raw", "image_raw/compressed"),
@@ -116,31 +107,30 @@ _DECLARED = (
     ),
     NodeInterface(
         "dm_console_*",
-        "console",
         subscribe=(
-            *("/diagnostics", "/rosout", "actuator_estimate", "actuator_state", "calibration", "capabilities"),
+            *(HEALTH, "/rosout", "actuator_estimate", "actuator_state", "calibration", "capabilities"),
             *("mirror_info", "surface_map", "surface_map_info", "zernike"),
         ),
         request=_OPERATION,
         call=_LONG_OPERATION,
+        enclave="console",
     ),
     NodeInterface(
         "dm_client_*",
-        "cli",
         subscribe=(
-            *(*_HEALTH, "actuator_state", "calibration", "capabilities"),
+            *(HEALTH, "actuator_state", "calibration", "capabilities"),
             *("mirror_info", "surface_map", "surface_map_info"),
         ),
         request=(*_OPERATION, "ingest_file", "update_calibration"),
         call=_LONG_OPERATION,
+        enclave="cli",
     ),
-)
-#: Only where there is a simulation instead of hardware: whoever holds this enclave sets the time of all others.
-_SIMULATION = NodeInterface(
-    "virtual_bench",
-    "virtual_bench",
-    publish=(*_HEALTH, CLOCK, "camera_info", "image_raw", "temperature", "~/endpoints"),
-    reply=("~/power", "~/trigger"),
+    # Only where there is a simulation instead of hardware: whoever holds this enclave sets the time of all others.
+    NodeInterface(
+        "virtual_bench",
+        publish=(CLOCK, "camera_info", "image_raw", "temperature", "~/endpoints"),
+        reply=("~/power", "~/trigger"),
+    ),
 )
 
 
@@ -151,18 +141,23 @@ def interfaces(simulation: bool = False, sensor: str = "") -> tuple[NodeInterfac
         simulation: with the virtual bench and its clock.
         sensor: topic that the interferometer takes coefficients from (its parameter `zernike_topic`); "" = map files.
     """
-    heard = {"interferometer": (sensor,)} if sensor else {}
-    nodes = [replace(node, subscribe=(*node.subscribe, *heard.get(node.name, ()))) for node in _DECLARED]
-    nodes += [_SIMULATION] if simulation else []
-    return tuple(
-        replace(
-            node,
-            publish=tuple(sorted({*node.publish, *LOGS, *(_TRANSITIONS if node.name in _LIFECYCLE else ())})),
-            subscribe=tuple(sorted({*node.subscribe, *((CLOCK,) if simulation and node.enclave in _TIMED else ())})),
-            reply=tuple(
-                sorted({*node.reply, *PARAMETER_SERVICES, *(LIFECYCLE_SERVICES if node.name in _LIFECYCLE else ())})
-            ),
-            request=tuple(sorted(node.request)),
-        )
-        for node in nodes
-    )
+    suite = {node.name: node for node in NODES}
+    found = []
+    for node in _DECLARED:
+        enclave = node.enclave or node.name
+        publish, subscribe = {*node.publish, *LOGS}, {*node.subscribe}
+        reply = {*node.reply, *PARAMETER_SERVICES}
+        if node.name == "virtual_bench" and not simulation:
+            continue
+        if node.name in suite:
+            publish.add(HEALTH)
+            if suite[node.name].lifecycle:
+                publish.add("~/transition_event")
+                reply.update(LIFECYCLE_SERVICES)
+        if node.name == "interferometer" and sensor:
+            subscribe.add(sensor)
+        if simulation and enclave in suite and enclave != "virtual_bench":  # they go by simulated time
+            subscribe.add(CLOCK)
+        sets = {"publish": publish, "subscribe": subscribe, "reply": reply, "request": node.request}
+        found.append(replace(node, enclave=enclave, **{rule: tuple(sorted(names)) for rule, names in sets.items()}))
+    return tuple(found)

@@ -11,14 +11,7 @@ from dm_tools.security.interfaces import NodeInterface, interfaces
 POLICY_VERSION = "0.2.0"
 #: Enclaves of the suite stand under this one.
 ROOT = "/dm"
-_RULES = (
-    ("topics", "topic", "publish"),
-    ("topics", "topic", "subscribe"),
-    ("services", "service", "reply"),
-    ("services", "service", "request"),
-    ("actions", "action", "execute"),
-    ("actions", "action", "call"),
-)
+_RULES = {"topic": ("publish", "subscribe"), "service": ("reply", "request"), "action": ("execute", "call")}
 _ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
 _ACTION_TOPICS = ("feedback", "status")
 
@@ -75,12 +68,12 @@ def policy_xml(profile: Profile, enclave: str) -> str:
     profiles = xml.SubElement(place, "profiles")
     for node in profile.enclaves()[enclave]:
         one = xml.SubElement(profiles, "profile", ns=profile.ns, node=node.name)
-        for group, element, rule in _RULES:
-            names = getattr(node, rule)
-            if names:
-                listed = xml.SubElement(one, group, {rule: "ALLOW"})
-                for name in names:
-                    xml.SubElement(listed, element).text = f"~{name[1:]}" if name.startswith("~") else name
+        for element, rules in _RULES.items():
+            for rule in rules:
+                if names := getattr(node, rule):
+                    listed = xml.SubElement(one, f"{element}s", {rule: "ALLOW"})
+                    for name in names:
+                        xml.SubElement(listed, element).text = name
     return _text(policy)
 
 
