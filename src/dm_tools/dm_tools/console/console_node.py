@@ -80,7 +80,6 @@ class ConsoleNode:
 
     Attributes:
         log: the last lines that nodes logged, and what went wrong here: time, level, logger, message.
-        lines_logged: how many were heard in all.
     """
 
     def __init__(self, namespace: str = "", domain: int | None = None) -> None:
@@ -93,7 +92,6 @@ class ConsoleNode:
         self._connection = Connection("dm_console", namespace, domain, TOPICS, INTERFACES, self._take)
         self.node = self._connection.node
         self.log: deque[tuple[str, str, str, str]] = deque(maxlen=LOG_LINES)
-        self.lines_logged = 0
         # Nodes offer their latest lines to those who come late.
         profile = QoSProfile(depth=LOG_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(Log, "/rosout", self._take_line, profile)
@@ -123,7 +121,6 @@ class ConsoleNode:
     def take_log(self, time_s: float, level: str, logger: str, message: str) -> None:
         """Keep a line of the log."""
         self.log.append((time.strftime("%H:%M:%S", time.localtime(time_s)), level, logger, message))
-        self.lines_logged += 1
 
     def close(self) -> None:
         """Leave the ROS graph; the mirror keeps its shape."""

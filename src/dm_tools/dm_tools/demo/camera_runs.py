@@ -1,29 +1,33 @@
 """What `dm demo --camera` has the camera do: searches, a focus stack, tracking; and the images of it."""
 
-from __future__ import annotations
-
 import math
 import time
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections import deque
+from typing import Any, NamedTuple
 
 import numpy as np
+from dm_msgs.msg import AutofocusState
 from numpy.typing import NDArray
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from sensor_msgs.msg import Image
 
+from dm_autofocus import CameraFocusClient
+from dm_autofocus.images import grey
+from dm_autofocus.sharpness import Region, cut, tenengrad
+from dm_common.ros import qos
 from dm_tools.output import console, progress_bar
 from dm_tools.verbs.up import DISTANCES
-
-if TYPE_CHECKING:  # slow to import, and `dm --help` does not need it
-    from dm_autofocus import CameraFocusClient
 
 #: How fast the nearest object comes nearer [m/s] until it is so far away [m].
 SPEED, NEAREST = 0.7, 4.5
 #: Time for the mirror to settle before an image is looked at, s.
 SETTLE_S = 0.3
+#: Images that wait for what `autofocus_state` says of them.
+WAITING = 60
 
 
-@dataclass(frozen=True)
-class Shot:
+class Shot(NamedTuple):
     """One counted image: grey levels (H, W), curvature [1/m] and sharpness."""
 
     image: NDArray[np.uint8]
@@ -31,13 +35,11 @@ class Shot:
     sharpness: float
 
 
-@dataclass
-class Focused:
+class Focused(NamedTuple):
     """The search on one object.
 
     Attributes:
         distance: true distance of the object [m].
-        region: left, top, width, height as shares of the image.
         result: what the action answered.
         shots: counted images in order.
         final: the image after the search.
@@ -45,28 +47,21 @@ class Focused:
     """
 
     distance: float
-    region: tuple[float, float, float, float]
-    result: Any = None
-    shots: list[Shot] = field(default_factory=list)
-    final: Shot | None = None
+    region: Region
+    result: Any
+    shots: list[Shot]
+    final: Shot
     by_distance: float = math.nan
 
 
-@dataclass
-class Approach:
-    """Tracking of the first object while it comes nearer.
+class Approach(NamedTuple):
+    """Tracking of the first object while it comes nearer: counted images, and its true distance at each [m]."""
 
-    Attributes:
-        shots: counted images.
-        distances: true ones of the object when each came [m].
-    """
-
-    shots: list[Shot] = field(default_factory=list)
-    distances: list[float] = field(default_factory=list)
+    shots: list[Shot]
+    distances: list[float]
 
 
-@dataclass(frozen=True)
-class Sweep:
+class Sweep(NamedTuple):
     """A focus stack.
 
     Attributes:
@@ -86,70 +81,49 @@ class Recorder:
     """Keeps the images that counted, with what `autofocus_state` says of them."""
 
     def __init__(self, client: CameraFocusClient) -> None:
-        from dm_msgs.msg import AutofocusState
-        from sensor_msgs.msg import Image
-
-        from dm_common.ros import qos
-
-        self._images: dict[tuple[int, int], Any] = {}
+        self._client = client
+        self._images: deque[Any] = deque(maxlen=WAITING)
+        self._count = 0
         self.shots: list[Shot] = []
-        self.newest: Any = None
-        self.count = 0
         client.node.create_subscription(Image, "image_raw", self._on_image, qos.MAP)
         client.node.create_subscription(AutofocusState, "autofocus_state", self._on_state, qos.STATE)
 
-    def _on_image(self, message: Any) -> None:
-        self.newest = message
-        self.count += 1
-        self._images[message.header.stamp.sec, message.header.stamp.nanosec] = message
-        for old in list(self._images)[:-60]:
-            del self._images[old]
+    def _on_image(self, image: Any) -> None:
+        self._images.append(image)
+        self._count += 1
 
     def _on_state(self, state: Any) -> None:
-        from dm_autofocus.images import grey
+        if state.phase != state.PHASE_IDLE:
+            counted = [image for image in self._images if image.header.stamp == state.header.stamp]
+            self.shots += [Shot(grey(image).copy(), state.curvature, state.sharpness) for image in counted]
 
-        message = self._images.get((state.header.stamp.sec, state.header.stamp.nanosec))
-        if message is not None and state.phase != state.PHASE_IDLE:
-            self.shots.append(Shot(grey(message).copy(), state.curvature, state.sharpness))
-
-
-def image_now(client: CameraFocusClient, recorder: Recorder) -> NDArray[np.uint8]:
-    """The second image from now: its exposure began after this call."""
-    from dm_autofocus.images import grey
-
-    before = recorder.count
-    if not client.wait(lambda: recorder.count >= before + 2, 5.0):
-        raise RuntimeError("no images came on image_raw within 5 s")
-    return grey(recorder.newest).copy()
+    def image_now(self) -> NDArray[np.uint8]:
+        """The second image from now: its exposure began after this call."""
+        before = self._count
+        if not self._client.wait(lambda: self._count >= before + 2, 5.0):
+            raise RuntimeError("no images came on image_raw within 5 s")
+        return grey(self._images[-1]).copy()
 
 
-def focus_on(client: CameraFocusClient, recorder: Recorder, item: Focused) -> None:
-    """Search on one object, then focus it by its distance alone for comparison."""
-    from dm_autofocus.sharpness import cut, tenengrad
-
+def focus_on(client: CameraFocusClient, recorder: Recorder, distance: float, region: Region) -> Focused:
+    """Search on the object at `distance` [m], then focus it by its distance alone for comparison."""
     recorder.shots.clear()
     with progress_bar() as progress:
-        task = progress.add_task(f"object at {item.distance:g} m", total=None)
-        item.result = client.autofocus(
-            item.region, on_feedback=lambda f: progress.update(task, total=f.steps, completed=f.step)
-        )
-        progress.update(task, total=item.result.images, completed=item.result.images)
+        task = progress.add_task(f"object at {distance:g} m", total=None)
+        result = client.autofocus(region, on_feedback=lambda f: progress.update(task, total=f.steps, completed=f.step))
+        progress.update(task, total=result.images, completed=result.images)
     time.sleep(SETTLE_S)
-    image = image_now(client, recorder)
-    item.shots = list(recorder.shots)
-    item.final = Shot(image, item.result.curvature, tenengrad(cut(image, item.region)))
-    client.focus_distance(item.distance)
+    image, shots = recorder.image_now(), list(recorder.shots)
+    client.focus_distance(distance)
     time.sleep(SETTLE_S)
-    item.by_distance = tenengrad(cut(image_now(client, recorder), item.region))
+    by_distance = tenengrad(cut(recorder.image_now(), region))
+    final = Shot(image, result.curvature, tenengrad(cut(image, region)))
+    return Focused(distance, region, result, shots, final, by_distance)
 
 
-def follow(client: CameraFocusClient, recorder: Recorder, region: tuple[float, float, float, float]) -> Approach:
+def follow(client: CameraFocusClient, recorder: Recorder, region: Region) -> Approach:
     """Stay on the first object while it comes nearer."""
-    from dm_msgs.msg import AutofocusState
-    from rclpy.parameter import Parameter
-    from rclpy.parameter_client import AsyncParameterClient
-
-    bench, begun, approach = AsyncParameterClient(client.node, "virtual_bench"), math.nan, Approach()
+    bench, begun, approach = AsyncParameterClient(client.node, "virtual_bench"), math.nan, Approach([], [])
     recorder.shots.clear()
 
     def move(feedback: Any) -> None:

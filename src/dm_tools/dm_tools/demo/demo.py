@@ -76,8 +76,6 @@ def best_possible(calibration: Any, mirror: Any, ends: tuple[float, float]) -> f
 
 def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
     """Ask for each curvature, measure what came, and compare."""
-    import numpy as np
-
     from dm_controller.planning.target import FocusTarget
     from dm_tools.verify import map_of, surface_error
 
@@ -88,18 +86,9 @@ def sweep(client: Any, settle: float) -> list[dict[str, Any]]:
             prediction = client.focus(curvature, dry_run=True)
             client.move_focus(curvature, settle_time=settle)
             measurement, image = client.measure_map(f"focus {curvature:+.3f}")
-            sag = map_of(image)
-            error = surface_error(sag, measurement.info, FocusTarget(curvature))
-            rows.append(
-                {
-                    "curvature": curvature,
-                    "prediction": prediction,
-                    "signals": np.asarray(prediction.signals),
-                    "sag": np.array(sag),
-                    "info": measurement.info,
-                    "error": error,
-                }
-            )
+            sag, info = map_of(image), measurement.info
+            error = surface_error(sag, info, FocusTarget(curvature))
+            rows.append({"curvature": curvature, "prediction": prediction, "sag": sag, "info": info, "error": error})
             progress.advance(task)
     return rows
 
@@ -109,15 +98,8 @@ def show_sweep(rows: list[dict[str, Any]], fitting_limit: float, how: str) -> No
     from rich.table import Table
 
     table = Table(title=f"open-loop focus, {how}: predicted before the move, re-measured after it")
-    for heading in (
-        "curvature 1/m",
-        "dioptre",
-        "predicted rms nm",
-        "measured rms nm",
-        "largest coeff. nm",
-        "λ/n",
-        "saturated",
-    ):
+    errors = ("predicted rms nm", "measured rms nm", "largest coeff. nm", "λ/n")
+    for heading in ("curvature 1/m", "dioptre", *errors, "saturated"):
         table.add_column(heading, justify="right")
     for row in rows:
         table.add_row(
@@ -195,10 +177,12 @@ def demo(
     json: JsonOption = None,
 ) -> None:
     """Calibrate a virtual mirror (a PDM30-37) through the real nodes, wire protocol and file formats, then focus it."""
+    if creep is None:
+        creep = 0.0 if hysteresis is Hysteresis.off else 0.01
     if camera:
         from dm_tools.demo.demo_camera import demo_camera
 
-        demo_camera(hysteresis, creep, seed, speed, out, json)
+        demo_camera(hysteresis.value, creep, seed, speed, out, json)
         return
     from dm_msgs.action import Calibrate
 
@@ -209,15 +193,14 @@ def demo(
 
     started = time.monotonic()
     folder = new_folder(out)
-    actual_creep = creep if creep is not None else (0.0 if hysteresis is Hysteresis.off else 0.01)
-    config = bench_config(folder, hysteresis.value, actual_creep, seed, speed, config_file)
+    config = bench_config(folder, hysteresis.value, creep, seed, speed, config_file)
     name = config["pdm_driver"].get("mirror.name", "PDM30-37")
-    figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": actual_creep, "seed": seed}
+    figures: dict[str, Any] = {"plant": hysteresis.value, "creep_per_decade": creep, "seed": seed}
     with own_domain() as domain:
         if map_file is not None:
             figures["real_map"] = ingest_real_map(map_file, folder, domain)
         console.print(
-            f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {actual_creep:.0%} per decade, "
+            f"virtual bench: {name}, hysteresis {hysteresis.value}, creep {creep:.0%} per decade, "
             f"seed {seed}; its time runs {f'{speed:g} times as fast as' if speed else 'as'} real time; logs in "
             f"{os.path.relpath(folder)}"
         )
@@ -233,7 +216,7 @@ def demo(
             rows, without_hysteresis = sweep(client, settle), []
             ends = rows[0]["curvature"], rows[-1]["curvature"]
             fitting_limit = best_possible(client.latest("calibration"), mirror, ends)
-            if hysteresis_maps and (hysteresis is not Hysteresis.off or actual_creep):
+            if hysteresis_maps and (hysteresis is not Hysteresis.off or creep):
                 show_sweep(rows, fitting_limit, "influence function alone")
                 console.print("what an influence function cannot know is hysteresis and creep; now they are identified")
                 without_hysteresis = rows

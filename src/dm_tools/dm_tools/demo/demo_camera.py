@@ -6,9 +6,18 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dm_tools.demo.camera_runs import Focused, Recorder, focus_on, follow, image_now, sweep_of
-from dm_tools.demo.demo_bench import Hysteresis, bench_config, new_folder, running_bench, wait_for_calibration
+from dm_msgs.action import Calibrate
+from rich.table import Table
+
+from dm_autofocus import CameraFocusClient
+from dm_autofocus.sharpness import Region
+from dm_client import DeformableMirrorClient
+from dm_common.ros.domains import own_domain
+from dm_tools.demo.camera_runs import Focused, Recorder, focus_on, follow, sweep_of
+from dm_tools.demo.demo_bench import bench_config, new_folder, running_bench, wait_for_calibration
+from dm_tools.demo.pictures import save_animation, save_contact_sheet
 from dm_tools.output import console, next_step, write_json
+from dm_tools.verbs import calibrate
 from dm_tools.verbs.up import DISTANCES, RATE, add_camera
 
 #: Of the calibration: fewer and smaller maps than a bench would take, for a quick demonstration.
@@ -23,14 +32,13 @@ def camera_config(folder: Path, law: str, creep: float, seed: int) -> dict[str, 
     return config
 
 
-def regions(count: int) -> list[tuple[float, float, float, float]]:
+def regions(count: int) -> list[Region]:
     """The middle of each of `count` strips side by side."""
     return [((number + 0.15) / count, 0.15, 0.7 / count, 0.7) for number in range(count)]
 
 
 def figures_of(item: Focused) -> dict[str, Any]:
     """One object for JSON."""
-    assert item.final is not None
     return {
         "distance_m": item.distance,
         "found_m": item.result.distance,
@@ -47,8 +55,6 @@ def figures_of(item: Focused) -> dict[str, Any]:
 
 def show(found: list[Focused], depth: float) -> None:
     """Print the table."""
-    from rich.table import Table
-
     table = Table(title=f"autofocus at {RATE:g} images per second; depth of focus +-{2 * depth:.4f} dioptre")
     for heading in ("object m", "found m", "error dioptre", "sharpness", "by distance only", "images", "seconds"):
         table.add_column(heading, justify="right")
@@ -66,49 +72,35 @@ def show(found: list[Focused], depth: float) -> None:
     console.print(table)
 
 
-def demo_camera(
-    hysteresis: Hysteresis, creep: float | None, seed: int, speed: float, out: Path, json: Path | None
-) -> None:
+def demo_camera(law: str, creep: float, seed: int, speed: float, out: Path, json: Path | None) -> None:
     """Calibrate in fast time, then start again in real time with a camera and focus on every object."""
-    from dm_msgs.action import Calibrate
-
-    from dm_autofocus import CameraFocusClient
-    from dm_client import DeformableMirrorClient
-    from dm_common.ros.domains import own_domain
-    from dm_tools.demo.pictures import save_animation, save_contact_sheet
-    from dm_tools.verbs.calibrate import figures_of as calibration_figures
-    from dm_tools.verbs.calibrate import made_by, run_calibration, show_result
-
     started = time.monotonic()
     folder = new_folder(out)
-    law = hysteresis.value
-    actual_creep = creep if creep is not None else (0.0 if law == "off" else 0.01)
-    console.print(f"virtual bench with a camera: PDM30-37, hysteresis {law}, creep {actual_creep:.0%}, seed {seed}")
+    console.print(f"virtual bench with a camera: PDM30-37, hysteresis {law}, creep {creep:.0%}, seed {seed}")
     with own_domain() as domain:
-        config = bench_config(folder, law, actual_creep, seed, speed)
+        config = bench_config(folder, law, creep, seed, speed)
         config["virtual_bench"]["interferometer.pixels"] = PIXELS
         with running_bench(config, folder / "calibration", domain, DeformableMirrorClient) as client:
             goal = Calibrate.Goal(
                 plan=Calibrate.Goal.PLAN_HYSTERESIS, hysteresis_maps=MAPS, activate=True, note="camera"
             )
-            calibrated = run_calibration(client, goal)
-            show_result(calibrated, made_by(client, calibrated))
+            calibrated = calibrate.run_calibration(client, goal)
+            calibrate.show_result(calibrated, calibrate.made_by(client, calibrated))
     shutil.rmtree(folder / "maps")
     # A domain of its own: the first suite's time ran ahead, and nothing of it must be taken for news.
     with own_domain() as domain:
-        config = camera_config(folder, law, actual_creep, seed)
+        config = camera_config(folder, law, creep, seed)
         with running_bench(config, folder / "camera", domain, CameraFocusClient) as camera:
             wait_for_calibration(camera, calibrated.id)
             camera.degauss()  # from here on the controller knows the actuators' history
             recorder = Recorder(camera)
             reach = camera.focus_range()
             console.print(f"the camera focuses {reach.message}")
-            image_now(camera, recorder)
+            recorder.image_now()
             found = [
-                Focused(distance, region) for distance, region in zip(DISTANCES, regions(len(DISTANCES)), strict=True)
+                focus_on(camera, recorder, distance, region)
+                for distance, region in zip(DISTANCES, regions(len(DISTANCES)), strict=True)
             ]
-            for item in found:
-                focus_on(camera, recorder, item)
             sweep = sweep_of(camera, recorder)
             approach = follow(camera, recorder, found[0].region)
     show(found, reach.curvature_tolerance)
@@ -125,9 +117,9 @@ def demo_camera(
         json,
         {
             "plant": law,
-            "creep_per_decade": actual_creep,
+            "creep_per_decade": creep,
             "seed": seed,
-            "calibration": calibration_figures(calibrated),
+            "calibration": calibrate.figures_of(calibrated),
             "camera": [figures_of(item) for item in found],
             "stack": {"images": len(sweep.shots), "seconds": sweep.seconds},
             "tracked_images": len(approach.shots),

@@ -15,10 +15,10 @@ from matplotlib.colors import Normalize
 from matplotlib.patches import Circle, RegularPolygon
 
 from dm_common.optics.piston_tilt import remove_plane
+from dm_tools.output import WAVELENGTH
 
 #: Curvatures shown as columns: the ends, half way and flat.
 COLUMNS = (-0.05, -0.02, 0.0, 0.02, 0.05)
-WAVELENGTH_NM = 632.8
 
 
 def draw_command(axes: Axes, signals: np.ndarray, positions: np.ndarray, aperture_radius: float) -> Any:
@@ -55,8 +55,7 @@ def save_sweep_figure(
 ) -> Path:
     """Command, measured map and residual of a sweep, and the residuals against curvature.
 
-    Args:
-        without_hysteresis: the same sweep by an influence function alone, for comparison.
+    `without_hysteresis` is the same sweep by an influence function alone, for comparison.
     """
     positions = np.column_stack([mirror.actuator_x, mirror.actuator_y])
     curvatures = np.array([row["curvature"] for row in rows])
@@ -71,7 +70,7 @@ def save_sweep_figure(
         axes = [figure.add_subplot(grid[line, column]) for line in range(3)]
         info = row["info"]
         axes[0].set_title(f"{row['curvature']:+.2f} 1/m", fontsize=10)
-        command = draw_command(axes[0], row["signals"], positions, info.aperture_radius)
+        command = draw_command(axes[0], row["prediction"].signals, positions, info.aperture_radius)
         measured = draw_map(axes[1], sag * 1e6, info, sag_limit, "viridis")
         residual = draw_map(axes[2], row["error"].residual * 1e9, info, residual_limit, "PuOr")
         axes[2].set_title(f"{row['error'].rms * 1e9:.1f} nm rms", fontsize=9)
@@ -79,10 +78,8 @@ def save_sweep_figure(
         for item in axes:
             item.tick_params(labelsize=7)
         if column == 0:
-            for item, label in zip(
-                axes, ("command\ny, mm", "measured, tilt removed\ny, mm", "residual\ny, mm"), strict=True
-            ):
-                item.set_ylabel(label)
+            for item, label in zip(axes, ("command", "measured, tilt removed", "residual"), strict=True):
+                item.set_ylabel(f"{label}\ny, mm")
         if column == len(shown) - 1:
             figure.colorbar(command, ax=axes[0], label="signal")
             figure.colorbar(measured, ax=axes[1], label="sag, µm")
@@ -102,8 +99,9 @@ def save_sweep_figure(
             label="largest coefficient, influence function alone",
         )
     for divisor in (50, 500):
-        summary.axhline(WAVELENGTH_NM / divisor, color="grey", linewidth=0.8, linestyle=":")
-        summary.annotate(f"λ/{divisor}", (curvatures[0], WAVELENGTH_NM / divisor), fontsize=8, va="bottom")
+        limit_nm = 1e9 * WAVELENGTH / divisor
+        summary.axhline(limit_nm, color="grey", linewidth=0.8, linestyle=":")
+        summary.annotate(f"λ/{divisor}", (curvatures[0], limit_nm), fontsize=8, va="bottom")
     summary.set(xlabel="requested curvature, 1/m (concave positive)", ylabel="nm")
     summary.legend(fontsize=8, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     summary.margins(y=0.12)

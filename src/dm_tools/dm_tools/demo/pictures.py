@@ -17,6 +17,7 @@ from matplotlib.patches import Rectangle
 from PIL import Image
 
 from dm_autofocus.sharpness import check_region, cut
+from dm_tools.demo.camera_runs import Approach, Focused, Shot, Sweep
 
 #: Okabe-Ito, one per object.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -39,7 +40,7 @@ def _draw_image(axes: Axes, image: Any, region: Sequence[float], colour: str) ->
     return picture, frame
 
 
-def _sharpness_axes(axes: Axes, found: Sequence[Any]) -> None:
+def _sharpness_axes(axes: Axes, found: Sequence[Focused]) -> None:
     shots = [shot for item in found for shot in item.shots]
     low, high = min(s.curvature for s in shots), max(s.curvature for s in shots)
     margin = 0.03 * (high - low)
@@ -49,14 +50,8 @@ def _sharpness_axes(axes: Axes, found: Sequence[Any]) -> None:
     axes.grid(alpha=0.3)
 
 
-def save_contact_sheet(found: Sequence[Any], path: Path, title: str) -> Path:
-    """The image at the end of each search, and the sharpness of all that led there.
-
-    Args:
-        found: objects with `distance`, `region`, `result`, `shots` and `final`, as `dm demo --camera` makes them.
-        path: PNG file to write.
-        title: of the sheet.
-    """
+def save_contact_sheet(found: Sequence[Focused], path: Path, title: str) -> Path:
+    """The image at the end of each search, and the sharpness of all that led there, as a PNG file."""
     figure = plt.figure(figsize=(4.2 * len(found), 7.2), layout="constrained")
     figure.suptitle(title)
     grid = figure.add_gridspec(2, len(found))
@@ -77,17 +72,9 @@ def save_contact_sheet(found: Sequence[Any], path: Path, title: str) -> Path:
 
 
 def save_animation(
-    found: Sequence[Any], sweep: Any, approach: Any, path: Path, title: str, frames_per_second: int = 7
+    found: Sequence[Focused], sweep: Sweep, approach: Approach, path: Path, title: str, frames_per_second: int = 7
 ) -> Path:
-    """What the camera does, as a GIF: searches, a sweep in which the picture stands still, its depth, and tracking.
-
-    Args:
-        found: as for `save_contact_sheet`.
-        sweep, approach: of `dm demo --camera`.
-        path: GIF file to write.
-        title: of the animation.
-        frames_per_second: of the animation.
-    """
+    """What the camera does, as a GIF: searches, a sweep in which the picture stands still, its depth, and tracking."""
     figure: Figure = plt.figure(figsize=(8.4, 3.8), dpi=80, layout="constrained")
     figure.suptitle(title, fontsize=8, color="gray")
     left, right = figure.subplots(1, 2)
@@ -109,7 +96,7 @@ def save_animation(
         box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none"}
         depth.text(across * width, along * height, f"{middle:.1f} m", ha="center", bbox=box)
 
-    def show(shot: Any, text: str, colour: str, region: Sequence[float] | None = None) -> None:
+    def show(shot: Shot, text: str, colour: str, region: Sequence[float] | None = None) -> None:
         height, width = shot.image.shape
         picture.set_data(shot.image)
         frame.set_visible(region is not None)

@@ -12,7 +12,7 @@ from typing import Any
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
 _SEPARATOR = "=" * 80
-_FEEDBACK_MESSAGE = "_FeedbackMessage"
+_FEEDBACK_MESSAGE = "FeedbackMessage"
 _PARTS = {"Goal": 0, "Result": 1, "Feedback": 2}
 
 
@@ -46,38 +46,32 @@ def definition(type_name: str) -> str:
     Raises:
         UnknownTypeError: not installed.
     """
-    main = _Definition(type_name)
+    main, waiting = _text_and_types(type_name)
     done: dict[str, str] = {}
-    waiting = main.used
     while waiting:
         name = waiting.pop(0)
         if name not in done:
             package, _, stem = name.partition("/")
-            part_of_action = "_" in stem
-            used = _Definition(f"{package}/{'action' if part_of_action else 'msg'}/{stem}")
-            done[f"{package}/action/{stem}" if part_of_action else name] = used.text
-            waiting += used.used
-    return "\n".join([main.text, *(f"{_SEPARATOR}\nMSG: {name}\n{text}" for name, text in done.items())])
+            kind = "action" if "_" in stem else "msg"  # part of an action
+            text, used = _text_and_types(f"{package}/{kind}/{stem}")
+            done[f"{package}/action/{stem}" if kind == "action" else name] = text
+            waiting += used
+    return "\n".join([main, *(f"{_SEPARATOR}\nMSG: {name}\n{text}" for name, text in done.items())])
 
 
-class _Definition:
+def _text_and_types(type_name: str) -> tuple[str, list[str]]:
     """The text of one type, and the ``package/Type`` of those it uses."""
-
-    def __init__(self, type_name: str) -> None:
-        package, kind, name = type_name.split("/")
-        cls = message_class(type_name)
-        fields = " ".join(cls.get_fields_and_field_types().values())
-        self.used = list(dict.fromkeys(re.findall(r"[a-z]\w*/\w+", fields)))
-        try:
-            folder = Path(get_package_share_directory(package)) / kind
-            if kind == "msg":
-                self.text = (folder / f"{name}.msg").read_text()
-            elif name.endswith(_FEEDBACK_MESSAGE):
-                action = name.removesuffix(_FEEDBACK_MESSAGE)
-                # With its full name: readers look for a shorter one in different places.
-                self.text = f"unique_identifier_msgs/UUID goal_id\n{package}/action/{action}_Feedback feedback\n"
-            else:
-                action, part = name.rsplit("_", 1)
-                self.text = re.split(r"(?m)^---$", (folder / f"{action}.action").read_text())[_PARTS[part]]
-        except (OSError, PackageNotFoundError) as error:
-            raise UnknownTypeError(f"message type {type_name}: its definition is not installed: {error}") from error
+    package, kind, name = type_name.split("/")
+    fields = " ".join(message_class(type_name).get_fields_and_field_types().values())
+    used = list(dict.fromkeys(re.findall(r"[a-z]\w*/\w+", fields)))
+    action, _, part = name.rpartition("_")
+    if part == _FEEDBACK_MESSAGE:
+        # With its full name: readers look for a shorter one in different places.
+        return f"unique_identifier_msgs/UUID goal_id\n{package}/action/{action}_Feedback feedback\n", used
+    try:
+        folder = Path(get_package_share_directory(package)) / kind
+        if kind == "msg":
+            return (folder / f"{name}.msg").read_text(), used
+        return re.split(r"(?m)^---$", (folder / f"{action}.action").read_text())[_PARTS[part]], used
+    except (OSError, PackageNotFoundError) as error:
+        raise UnknownTypeError(f"message type {type_name}: its definition is not installed: {error}") from error

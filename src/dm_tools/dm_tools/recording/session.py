@@ -62,14 +62,12 @@ class Session:
         run: what was commanded and measured.
         parameters: of the node `calibration`, defaults where the recording has none.
         published: the message on `calibration` that the run ended with; None = it was not activated.
-        runs: runs in the recording.
         remarks: sentences on what the recording does not hold.
     """
 
     run: RecordedRun
     parameters: dict[str, Any]
     published: Any
-    runs: int
     remarks: tuple[str, ...]
 
 
@@ -102,22 +100,19 @@ def read_session(bag: BagReader, number: int = 0, namespace: str = "") -> Sessio
     if not mirrors:
         raise RecordingError(f"{bag.path}: no mirror_info before the run ended: begin the recording earlier")
     mirror = mirror_from(mirrors[-1])
-    maps = _maps(received, chosen.begun, end)
+    during = {
+        name: [message for time, message in messages if chosen.begun <= time < end]
+        for name, messages in received.items()
+    }
+    maps = _maps(during)
     moves = [move for time, move in _moves(received["actuator_state"], mirror) if chosen.begun <= time < end]
     before = [message for time, message in received["calibration"] if time < chosen.begun and message.id]
     run = RecordedRun(mirror, tuple(moves), maps, chosen.plan, _model(before[-1]) if before else None)
     parameters, remarks = _parameters(bag, f"{prefix}calibration", chosen.begun)
     last = max((measured.stamp_ns for measured in maps), default=-1)
     known = {message.id for message in before}
-    published = next(
-        (
-            message
-            for time, message in received["calibration"]
-            if chosen.begun <= time < end and message.id not in known and stamp_ns(message.header.stamp) == last
-        ),
-        None,
-    )
-    return Session(run, parameters, published, len(runs), remarks)
+    made = [each for each in during["calibration"] if each.id not in known and stamp_ns(each.header.stamp) == last]
+    return Session(run, parameters, made[0] if made else None, remarks)
 
 
 def recalibrate(session: Session, identifier: str, created_ns: int) -> Calibration:
@@ -176,20 +171,14 @@ def _moves(states: Iterable[tuple[int, Any]], mirror: Mirror) -> Iterator[tuple[
         turns, degausses = state.turns, state.degausses
 
 
-def _maps(received: dict[str, list[tuple[int, Any]]], begun: int, end: int) -> tuple[Measurement, ...]:
-    """The maps in the order of their stamps, put together from their topics."""
+def _maps(messages: dict[str, list[Any]]) -> tuple[Measurement, ...]:
+    """The maps in the order of their stamps, put together from the messages of their topics."""
     parts: dict[int, dict[str, Any]] = {}
-    for name in ("zernike", "surface_samples", "surface_map_info"):
-        for time, message in received[name]:
-            if begun <= time < end:
-                parts.setdefault(stamp_ns(message.header.stamp), {})[name] = message
+    for topic, part in (("zernike", "zernike"), ("surface_samples", "samples"), ("surface_map_info", "info")):
+        for message in messages[topic]:
+            parts.setdefault(stamp_ns(message.header.stamp), {})[part] = message
     whole = [parts[stamp] for stamp in sorted(parts) if len(parts[stamp]) == 3]
-    return tuple(
-        measurement_from(
-            SimpleNamespace(zernike=each["zernike"], samples=each["surface_samples"], info=each["surface_map_info"])
-        )
-        for each in whole
-    )
+    return tuple(measurement_from(SimpleNamespace(**each)) for each in whole)
 
 
 def _model(calibration: Any) -> Any:

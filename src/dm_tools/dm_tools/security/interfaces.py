@@ -158,6 +158,14 @@ def interfaces(simulation: bool = False, sensor: str = "") -> tuple[NodeInterfac
             subscribe.add(sensor)
         if simulation and enclave in suite and enclave != "virtual_bench":  # they go by simulated time
             subscribe.add(CLOCK)
-        sets = {"publish": publish, "subscribe": subscribe, "reply": reply, "request": node.request}
-        found.append(replace(node, enclave=enclave, **{rule: tuple(sorted(names)) for rule, names in sets.items()}))
+        found.append(
+            replace(
+                node,
+                publish=tuple(sorted(publish)),
+                subscribe=tuple(sorted(subscribe)),
+                reply=tuple(sorted(reply)),
+                request=tuple(sorted(node.request)),
+                enclave=enclave,
+            )
+        )
     return tuple(found)

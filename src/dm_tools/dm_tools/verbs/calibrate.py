@@ -88,11 +88,6 @@ def metres(text: str) -> float:
     return float(found[1]) * {"pm": 1e-12, "nm": 1e-9, "um": 1e-6}[found[2]]
 
 
-def start_fresh(client: Any, fresh: bool = True) -> None:
-    """Have the next goal begin anew, or not. Raises DeformableMirrorError: see `set_parameter`."""
-    set_parameter(client, "calibration", "start_fresh", fresh)
-
-
 def made_by(client: Any, result: Any) -> Any:
     """The message of the calibration that a run made; None where it is not in use."""
 
@@ -241,10 +236,11 @@ def calibrate(
         note=note,
         take_over=take_over,
     )
+    fresh = fresh and not dry_run
     with running_suite(namespace) as client, naming_holder(client):
         source = source_of(write, config, client.mirror_info.serial) if write is not None and not dry_run else None
-        if fresh and not dry_run:
-            start_fresh(client)
+        if fresh:
+            set_parameter(client, "calibration", "start_fresh", True)
         try:
             if not dry_run and plan == CalibrationPlan.hysteresis:
                 console.print(f"expected: {expected_run(client, goal)}", soft_wrap=True)
@@ -255,9 +251,9 @@ def calibrate(
                 show_result(error.response)
                 if write is not None and source is not None and error.response.parameters:
                     write_parameters(error.response.parameters, write, source)
-            if fresh and not dry_run:  # refused before it began, it would hold for somebody else's goal
+            if fresh:  # refused before it began, it would hold for somebody else's goal
                 with suppress(DeformableMirrorError):
-                    start_fresh(client, False)
+                    set_parameter(client, "calibration", "start_fresh", False)
             raise
     if dry_run:
         console.print(result.message)

@@ -43,7 +43,7 @@ class ActuatorCards:
                         "Number", value=session.chosen, min=1, step=1, format="%d", on_change=self._typed
                     )
                     self._number.classes("w-20")
-                    self._amplitude = DecimalField("Amplitude", 0.3, "w-24")
+                    self._amplitude = DecimalField("Amplitude", 0.3).classes("w-24")
                 with ui.element("div").classes("line"):
                     self._on_click = ui.switch("Poke by click")
                     self._with_map = ui.switch("Map after a poke", value=True)
@@ -83,9 +83,9 @@ class ActuatorCards:
 
     def _swing(self) -> float:
         """The amplitude that was typed. Raises ValueError when there is none."""
-        if self._amplitude.value is None:
+        if (amplitude := self._amplitude.number) is None:
             raise ValueError("the amplitude must be a number")
-        return float(self._amplitude.value)
+        return amplitude
 
     def _poke(self) -> None:
         session, number, snapshot = self._session, self._session.chosen, self._session.snapshot()

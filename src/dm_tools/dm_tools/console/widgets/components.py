@@ -33,35 +33,27 @@ def folded(title: str) -> Iterator[None]:
         yield
 
 
-class DecimalField:
-    """A field for a number as people write it: browsers read `0,02` in a field of their own for numbers as 2.
+class DecimalField(ui.input):
+    """A field for a number as people write it: browsers read `0,02` in a field of their own for numbers as 2."""
 
-    Args:
-        label: of it.
-        value: to begin with.
-        classes: of the page's style.
-        on_change: called without arguments.
-    """
-
-    def __init__(self, label: str, value: float, classes: str, on_change: Callable[[], Any] = lambda: None) -> None:
-        self._field = ui.input(
-            label, value=f"{value:g}", on_change=lambda: on_change(), validation={"not a number": self._is_number}
+    def __init__(self, label: str, number: float, on_change: Callable[[], Any] | None = None) -> None:
+        super().__init__(
+            label,
+            value=f"{number:g}",
+            on_change=on_change,
+            validation={"not a number": lambda text: decimal(text) is not None},
         )
-        self._field.classes(classes).props('inputmode="decimal" hide-bottom-space')
-
-    @staticmethod
-    def _is_number(text: str) -> bool:
-        return decimal(text) is not None
+        self.props('inputmode="decimal" hide-bottom-space')
 
     @property
-    def value(self) -> float | None:
+    def number(self) -> float | None:
         """What stands in it; None = no number."""
-        return decimal(self._field.value)
+        return decimal(self.value)
 
-    def set_value(self, value: float) -> None:
+    def set_number(self, number: float) -> None:
         """Put a number in it, unless it stands there in other signs."""
-        if self.value != value:
-            self._field.set_value(f"{value:g}")
+        if self.number != number:
+            self.set_value(f"{number:g}")
 
 
 class ActionButton(ui.element):

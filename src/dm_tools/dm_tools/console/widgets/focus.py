@@ -1,7 +1,6 @@
 """The card that asks for a curvature."""
 
 import math
-import time
 
 from dm_msgs.msg import FocusRequest
 from nicegui import background_tasks, ui
@@ -16,8 +15,6 @@ from dm_tools.console.widgets.components import ActionButton, DecimalField, Line
 
 #: Step of the slider, 1/m.
 STEP = 0.0005
-#: A prediction is asked for when the wish has stood still so long, s.
-CALM_S = 0.3
 
 
 class FocusCard:
@@ -26,20 +23,17 @@ class FocusCard:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._range: tuple[float, float] | None = None
-        self._changed_at = 0.0
         self._asked = self._asking = self._typing = False
-        #: What a prediction depends on beside the wish.
-        self._basis: tuple[object, ...] = ()
+        self._wish: tuple[object, ...] = ()  # and what else a prediction depends on
         with card("Focus"):
             self._text = Line("text figures")
             self._slider = ui.slider(min=-0.05, max=0.05, step=STEP, value=0.0, on_change=self._slid)
             self._slider.props('aria-label="Curvature in 1 per metre" label switch-label-side')
             with ui.element("div").classes("line"):
-                self._number = DecimalField("Curvature, 1/m", 0.0, "w-36", self._typed)
-                self._conic = DecimalField("Conic constant", 0.0, "w-28", self._touch)
+                self._number = DecimalField("Curvature, 1/m", 0.0, self._typed).classes("w-36")
+                self._conic = DecimalField("Conic constant", 0.0).classes("w-28")
                 self._power = Line("text figures")
-            self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO, on_change=self._touch)
-            self._mode.props('inline aria-label="Mode"')
+            self._mode = ui.radio(MODES, value=FocusRequest.MODE_AUTO).props('inline aria-label="Mode"')
             self._prediction = Line("text figures", live=True)
             with ui.element("div").classes("line"):
                 self._move = ActionButton("Move", session.begin, "Move", operations.move, self._request, "move_focus")
@@ -52,26 +46,21 @@ class FocusCard:
 
     def _slid(self) -> None:
         if not self._typing:
-            self._number.set_value(round(float(self._slider.value or 0.0), 4))
+            self._number.set_number(round(float(self._slider.value or 0.0), 4))
 
     def _typed(self) -> None:
-        value = self._number.value
+        value = self._number.number
         if value is not None and self._range is not None and self._range[0] <= value <= self._range[1]:
             self._typing = True  # what was typed must not be rounded to the slider's steps
             self._slider.set_value(value)
             self._typing = False
-        self._touch()
-
-    def _touch(self) -> None:
-        self._changed_at, self._asked = time.monotonic(), False
 
     def _request(self) -> FocusRequest:
         """The wish. Raises ValueError when a field is empty."""
-        if self._number.value is None or self._conic.value is None:
+        curvature, conic_constant = self._number.number, self._conic.number
+        if curvature is None or conic_constant is None:
             raise ValueError("curvature and conic constant must be numbers")
-        return FocusRequest(
-            curvature=float(self._number.value), conic_constant=float(self._conic.value), mode=str(self._mode.value)
-        )
+        return FocusRequest(curvature=curvature, conic_constant=conic_constant, mode=str(self._mode.value))
 
     def refresh(self, snapshot: Snapshot) -> None:
         session = self._session
@@ -82,14 +71,12 @@ class FocusCard:
         self._converge.allow(reason_against("converge", snapshot, session.running))
         self._reason.show(f"Not possible now: {reason}" if reason else "")
         self._take_range(snapshot)
-        value = self._number.value
+        value = self._number.number
         self._power.show(f"= {2 * value:+.4f} dioptre" if value is not None else "")
-        basis = self._prediction_basis(snapshot)
-        if basis != self._basis:
-            self._basis = basis
-            self._touch()
-        calm = time.monotonic() - self._changed_at > CALM_S
-        if not reason and calm and not self._asked and not self._asking:
+        wish = (value, self._conic.number, self._mode.value, *self._prediction_basis(snapshot))
+        if wish != self._wish:
+            self._wish, self._asked = wish, False
+        elif not (reason or self._asked or self._asking):  # it has stood still since the last time
             self._asked = self._asking = True
             background_tasks.create(self._predict())
 

@@ -49,15 +49,10 @@ class LogCard:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._shown: tuple[int, bool] | None = None
         with folded("Log"):
             self._all = ui.switch("Show everything, not only warnings and errors", value=True)
             self._place = ui.html("", sanitize=False).classes("scroll")
             self._place.props('tabindex="0" role="log" aria-label="Log"')
 
     def refresh(self, _snapshot: Snapshot) -> None:
-        ros = self._session.ros
-        key = (ros.lines_logged, bool(self._all.value))
-        if key != self._shown:
-            self._shown = key
-            self._place.set_content(_table(log_rows(list(ros.log), bool(self._all.value))))
+        self._place.set_content(_table(log_rows(list(self._session.ros.log), bool(self._all.value))))

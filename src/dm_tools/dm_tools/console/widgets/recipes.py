@@ -28,11 +28,11 @@ class RecipesCard:
             self._table = ui.html("", sanitize=False).classes("scroll")
             self._table.props('tabindex="0" role="region" aria-label="Recipes of the calibration in use"')
             with ui.element("div").classes("line"):
-                self._first = DecimalField("First, 1/m", FIRST, "w-24")
-                self._last = DecimalField("Last, 1/m", LAST, "w-24")
+                self._first = DecimalField("First, 1/m", FIRST).classes("w-24")
+                self._last = DecimalField("Last, 1/m", LAST).classes("w-24")
                 self._number = ui.number("Recipes", value=NUMBER, min=1, max=NUMBER_MAX, step=1, format="%d")
                 self._number.classes("w-20")
-                self._conic = DecimalField("Conic", 0.0, "w-20")
+                self._conic = DecimalField("Conic", 0.0).classes("w-20")
                 self._terms = ui.input("Added terms, nm").classes("w-full")
                 self._terms.props('hint="astigmatism cos=200, coma sin=-50"')
             self._build = ActionButton(
@@ -42,10 +42,10 @@ class RecipesCard:
 
     def _goal(self) -> BuildRecipes.Goal:
         """What the fields say. Raises ValueError naming the one that makes no sense."""
-        if (conic := self._conic.value) is None:
+        if (conic := self._conic.number) is None:
             raise ValueError("conic: must be a number")
         terms = terms_of(self._terms.value) if self._terms.value.strip() else []
-        curvatures = evenly(self._first.value, self._last.value, self._number.value)
+        curvatures = evenly(self._first.number, self._last.number, self._number.value)
         return BuildRecipes.Goal(curvatures=curvatures, conic_constant=conic, zernike=terms)
 
     def refresh(self, snapshot: Snapshot) -> None:

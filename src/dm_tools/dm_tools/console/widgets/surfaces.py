@@ -87,7 +87,6 @@ class ZernikeCard:
 
     def __init__(self, view: SurfaceView) -> None:
         self._view = view
-        self._shown: tuple[Any, ...] = ()
         with card("Zernike coefficients"):
             self._kind = ui.radio(KINDS, value=True).props('inline aria-label="What the bars show"')
             self._bars = Chart("bars")
@@ -95,10 +94,6 @@ class ZernikeCard:
 
     def refresh(self, snapshot: Snapshot) -> None:
         zernike, wanted = snapshot.zernike, bool(self._kind.value)
-        key = (self._view.version, wanted, zernike)
-        if key == self._shown:
-            return
-        self._shown = key
         of_this_map = zernike is not None and stamp_ns(zernike.header.stamp) == self._view.stamp
         predicted = self._view.predicted_zernike if of_this_map else None
         as_difference = wanted and predicted is not None
