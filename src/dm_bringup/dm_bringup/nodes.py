@@ -3,11 +3,11 @@
 Standard library only, for `./dm` takes the environment of the nodes from here before it has one.
 """
 
-import importlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from pkgutil import resolve_name
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -15,11 +15,10 @@ class SuiteNode:
     """One node.
 
     Attributes:
-        name: of the node and of its executable; its module is `<package>.<name>_node`.
+        name: of the node and of its executable; `some_name` is the class `SomeNameNode` in `<package>.some_name_node`.
         package: that holds it.
-        class_name: of the node, in its module.
         parameter_module: of the package; its `PARAMETERS` is the table of the node's parameters.
-        configuring: "module.function" of the package that the node makes its parts with from the values of all its
+        configuring: "module:function" of the package that the node makes its parts with from the values of all its
             parameters, or checks them by, raising ValueError; "" = any values that the table allows will do.
         lifecycle: whether it is a lifecycle node.
         optional: whether it runs only where a configuration has a section for it.
@@ -27,7 +26,6 @@ class SuiteNode:
 
     name: str
     package: str
-    class_name: str
     parameter_module: str
     configuring: str = ""
     lifecycle: bool = True
@@ -40,58 +38,26 @@ class SuiteNode:
 
     def load_class(self) -> Any:
         """The class of the node; imports what the node needs."""
-        return getattr(importlib.import_module(self.module), self.class_name)
+        return resolve_name(f"{self.module}:{self.name.title().replace('_', '')}Node")
 
     def load_parameters(self) -> tuple[Any, ...]:
         """The table of the node's parameters, each a `dm_common.ros.parameters.Parameter`."""
-        table: tuple[Any, ...] = importlib.import_module(f"{self.package}.{self.parameter_module}").PARAMETERS
+        table: tuple[Any, ...] = resolve_name(f"{self.package}.{self.parameter_module}:PARAMETERS")
         return table
 
     def load_configuring(self) -> Callable[[Mapping[str, Any]], Any] | None:
         """The function of `configuring`; None where there is none."""
-        if not self.configuring:
-            return None
-        module, _, name = self.configuring.rpartition(".")
-        return cast(
-            "Callable[[Mapping[str, Any]], Any]", getattr(importlib.import_module(f"{self.package}.{module}"), name)
-        )
+        return resolve_name(f"{self.package}.{self.configuring}") if self.configuring else None
 
 
 #: In the order of their start. They stop together, the bench after the others: it outlives the driver's last ramp.
 NODES = (
-    SuiteNode(
-        "virtual_bench",
-        "dm_simulation",
-        "VirtualBenchNode",
-        "parameters",
-        "parameters.check_bench",
-        lifecycle=False,
-        optional=True,
-    ),
-    SuiteNode(
-        "pdm_driver",
-        "dm_driver",
-        "PdmDriverNode",
-        "driver_parameters",
-        "driver_configuration.build_configuration",
-    ),
-    SuiteNode(
-        "interferometer",
-        "dm_calibration",
-        "InterferometerNode",
-        "interferometer_parameters",
-        "interferometer_parameters.configure",
-    ),
-    SuiteNode("calibration", "dm_calibration", "CalibrationNode", "calibration_parameters"),
-    SuiteNode("focus_controller", "dm_controller", "FocusControllerNode", "focus_parameters"),
-    SuiteNode(
-        "autofocus",
-        "dm_autofocus",
-        "AutofocusNode",
-        "autofocus_parameters",
-        "autofocus_parameters.focus_optics",
-        optional=True,
-    ),
+    SuiteNode("virtual_bench", "dm_simulation", "parameters", "parameters:check_bench", lifecycle=False, optional=True),
+    SuiteNode("pdm_driver", "dm_driver", "driver_parameters", "driver_configuration:build_configuration"),
+    SuiteNode("interferometer", "dm_calibration", "interferometer_parameters", "interferometer_parameters:configure"),
+    SuiteNode("calibration", "dm_calibration", "calibration_parameters"),
+    SuiteNode("focus_controller", "dm_controller", "focus_parameters"),
+    SuiteNode("autofocus", "dm_autofocus", "autofocus_parameters", "autofocus_parameters:focus_optics", optional=True),
 )
 NAMES = tuple(node.name for node in NODES)
 #: `python -m` by the name of the node.

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NoReturn, Self
 
 import yaml
@@ -131,8 +130,7 @@ class Suite:
 
     def __enter__(self) -> Self:
         self.folder.mkdir(parents=True, exist_ok=True)
-        parameters = self.folder / "config.yaml"
-        save_config(self._config, parameters)
+        save_config(self._config, self.folder / "config.yaml")
         for node in nodes_of(self._config):
             if node.name in self._nodes:
                 self._start(node.name)
@@ -220,7 +218,5 @@ class Suite:
         for group in (nodes, hardware):
             stop_processes(group, timeout_s)
 
-    def __exit__(
-        self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.stop()

@@ -10,7 +10,6 @@ with DeformableMirrorClient() as mirror:
 
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any, Self, TypedDict, Unpack
 
 from dm_msgs.action import BuildRecipes, Calibrate, Converge, Degauss, MoveFocus
@@ -91,9 +90,7 @@ class DeformableMirrorClient(Connection):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, _type: type[BaseException] | None, _error: BaseException | None, _traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()
 
     # --- what is known ---
