@@ -31,13 +31,9 @@ PHASES = ("degauss", "pokes", "surfaces", "fit", "store", "hysteresis")
 class ExternalGoals:
     """Follows all goals of one action by its status and feedback topics. May be asked from any thread.
 
-    Args:
-        node: subscribes.
-        action_type: of dm_msgs.
-        name: of the action.
-
     Attributes:
         goals: goals that were seen to begin.
+        feedback: the latest of the goal that runs; None before the first.
         residuals: feedback field `residual_rms` (m) of every step of the last goal.
     """
 
@@ -47,9 +43,9 @@ class ExternalGoals:
         self._running: bytes = b""
         self._own: set[bytes] = set()
         self._ended: set[bytes] = set()
-        self._feedback: Any = None
         self._heard = 0.0
         self.goals = 0
+        self.feedback: Any = None
         self.residuals: list[float] = []
         interface, latched = action_type.Impl, qos_profile_action_status_default
         node.create_subscription(interface.GoalStatusMessage, self._status_topic, self._on_status, latched)
@@ -60,13 +56,11 @@ class ExternalGoals:
 
     def own(self, identity: Any) -> None:
         """Note that this console is about to send the goal `identity`, a unique_identifier_msgs/UUID."""
-        with self._lock:
-            self._own.add(bytes(identity.uuid))
+        self._own.add(bytes(identity.uuid))
 
     def disown(self, identity: Any) -> None:
         """Note that this console has lost sight of the goal `identity`: if it runs, it does as one of somebody else."""
-        with self._lock:
-            self._own.discard(bytes(identity.uuid))
+        self._own.discard(bytes(identity.uuid))
 
     @property
     def running(self) -> bool:
@@ -76,12 +70,6 @@ class ExternalGoals:
             if not running or running in self._own or time.monotonic() - heard > SILENCE_S:
                 return False
         return bool(self._node.count_publishers(self._status_topic))
-
-    @property
-    def feedback(self) -> Any:
-        """The latest feedback of the goal that runs; None before the first."""
-        with self._lock:
-            return self._feedback
 
     def cancel(self) -> Future | None:
         """Ask the goal that runs to stop: the answer, None = no goal runs. Its status says when it has stopped."""
@@ -93,15 +81,10 @@ class ExternalGoals:
         return self._cancel.call_async(request)
 
     def _on_status(self, message: Any) -> None:
-        running = []
+        goals = [(bytes(entry.goal_info.goal_id.uuid), entry.status) for entry in message.status_list]
         with self._lock:
-            for entry in message.status_list:
-                identity = bytes(entry.goal_info.goal_id.uuid)
-                if entry.status in RUNNING:
-                    running.append(identity)
-                else:
-                    self._ended.add(identity)
-            newest = running[-1] if running else b""
+            self._ended |= {identity for identity, status in goals if status not in RUNNING}
+            newest = next((identity for identity, status in reversed(goals) if status in RUNNING), b"")
             if newest and newest != self._running:
                 self._begin(newest)
             self._running, self._heard = newest, time.monotonic()
@@ -114,14 +97,14 @@ class ExternalGoals:
                 return
             if identity != self._running:
                 self._begin(identity)
-            if self._feedback is None:
+            if self.feedback is None:
                 self.residuals = []
-            if feedback.residual_rms > 0.0 and (self._feedback is None or feedback.step != self._feedback.step):
+            if feedback.residual_rms > 0.0 and (self.feedback is None or feedback.step != self.feedback.step):
                 self.residuals.append(float(feedback.residual_rms))
-            self._feedback, self._heard = feedback, time.monotonic()
+            self.feedback, self._heard = feedback, time.monotonic()
 
     def _begin(self, identity: bytes) -> None:
-        self._running, self._feedback = identity, None
+        self._running, self.feedback = identity, None
         self.goals += 1
 
 
