@@ -34,8 +34,7 @@ from dm_common.messages import applied_from, estimate_from, estimate_message
 from dm_common.optics.zernike import basis
 from dm_tools.console import status, view_models
 from dm_tools.console.charts.command_map import command_map, outlines
-from dm_tools.console.charts.heat_map import SAG_COLOURS, heat_map
-from dm_tools.console.charts.plots import INK, loop_chart, residual_chart, zernike_chart
+from dm_tools.console.charts.plots import INK, SAG_COLOURS, heat_map, loop_chart, residual_chart, zernike_chart
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.loops import effective_change, modelled_loop, modelled_way, way
 from dm_tools.console.session import SHOWN_S, Session

@@ -31,7 +31,7 @@ from dm_simulation.interferometer.zygo_files import encode_dat
 from dm_tools.doctor import bench as doctor_bench
 from dm_tools.doctor import machine as doctor_machine
 from dm_tools.doctor.doctor import held_by_the_nodes
-from dm_tools.doctor.finding import Finding
+from dm_tools.doctor.machine import Finding
 from dm_tools.verbs.up import shared_config
 from hysteretic_mirror import MIRROR
 from recorded_bench import recorded

@@ -14,8 +14,7 @@ from dm_bringup.suite import Config, ConfigError, load_config
 from dm_common.errors import unknown_name
 from dm_common.ros.domains import held_by, holders
 from dm_common.ros.parameters import REQUIRED, Parameter, ParameterError
-from dm_tools.doctor.finding import Check, Finding
-from dm_tools.doctor.machine import disk
+from dm_tools.doctor.machine import Check, Finding, disk
 
 UNSET = "CHANGE"
 DAY_S = 86400.0

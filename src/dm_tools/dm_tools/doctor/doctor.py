@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dm_tools.doctor.finding import Finding
+from dm_tools.doctor.machine import Finding, machine_checks
 from dm_tools.output import JsonOption, NamespaceOption, console, next_step, write_json
 
 #: Checks of what only one can have at a time: the nodes, while they run.
@@ -22,7 +22,6 @@ def doctor(
     A note is worth knowing; only what is WRONG makes the exit status 1. Nothing is changed, no output is written to.
     """
     from dm_tools.doctor.bench import bench_checks
-    from dm_tools.doctor.machine import machine_checks
 
     checks = machine_checks(namespace)
     if config is not None:

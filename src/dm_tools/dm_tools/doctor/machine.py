@@ -6,11 +6,11 @@ import shutil
 import subprocess
 import time
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dm_bringup.nodes import NODES
-from dm_tools.doctor.finding import Check, Finding
 
 MODULES = ("rclpy", "dm_msgs.msg", "numpy", "scipy", "statsmodels", "h5py", "serial")
 #: Each node takes a segment of 16 MB in /dev/shm, see config/fastdds.xml.
@@ -25,6 +25,24 @@ DISCOVERY_S = 3.0
 #: Commands that seem older than `limits.command_age` or further ahead than `limits.command_lead` are refused.
 CLOCK_SKEW_S = 0.5
 REPORTS_S = 2.5
+
+
+class Finding(NamedTuple):
+    """Something a person should know.
+
+    Attributes:
+        problem: what is wrong, in words.
+        cure: what to do about it; "" = nothing, all is well.
+        note: True = worth knowing, but nothing is broken.
+    """
+
+    problem: str
+    cure: str
+    note: bool = False
+
+
+#: A name and what finds out; None when all is well.
+Check = tuple[str, Callable[[], Finding | None]]
 
 
 def machine_checks(namespace: str = "") -> list[Check]:

@@ -7,8 +7,7 @@ from nicegui import ui
 
 from dm_common.messages import stamp_ns
 from dm_tools.console import operations
-from dm_tools.console.charts.heat_map import DIFFERENCE_COLOURS, SAG_COLOURS, heat_map
-from dm_tools.console.charts.plots import zernike_chart
+from dm_tools.console.charts.plots import DIFFERENCE_COLOURS, SAG_COLOURS, heat_map, zernike_chart
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.session import Session
 from dm_tools.console.status import reason_against
