@@ -372,7 +372,7 @@ def test_what_was_recorded_is_in_the_file_though_nothing_follows(
         wait_until(stream.get_subscription_count, 60)
         for number in range(2):
             stream.publish(ActuatorState(sequence=number))
-        wait_until(lambda: recorder.counts["/actuator_state"] == 2, 60)
+        wait_until(lambda: recorder.counts.get("/actuator_state") == 2, 60)
         wait_until(lambda: BagReader(tmp_path / "bag").messages == 2, 5, "both in the file")
 
 
