@@ -70,11 +70,7 @@ def nodes_of(configured: Collection[str]) -> tuple[SuiteNode, ...]:
 
 
 def node_environment(config_folder: Path) -> dict[str, str]:
-    """Environment variables of every process of the suite, unless the user has set them.
-
-    Args:
-        config_folder: `config` of this package, in the checkout or in its share.
-    """
+    """Environment variables of every process, unless the user sets them, by the folder `config` of this package."""
     return {
         "FASTRTPS_DEFAULT_PROFILES_FILE": str(config_folder / "fastdds.xml"),
         # Matrix products here take a millisecond; threads of several nodes would fight over the cores for longer.

@@ -30,11 +30,7 @@ class ConfigError(ValueError):
 
 
 def load_config(path: Path) -> Config:
-    """Read a ROS 2 parameter file into {node: {parameter: value}}.
-
-    Raises:
-        ConfigError: not readable, not YAML, or not of the form of a parameter file.
-    """
+    """{node: {parameter: value}} of a ROS 2 parameter file. Raises ConfigError when it is none, or cannot be read."""
     try:
         content = yaml.safe_load(path.read_text())
     except OSError as error:

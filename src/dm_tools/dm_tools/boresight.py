@@ -45,8 +45,7 @@ def run_boresight(
 ) -> None:
     """Find the camera's axis, have the focus controller keep the picture there, and see whether it stands still.
 
-    Raises:
-        DeformableMirrorError: it does not move less than before: the axis is as it was.
+    Raises DeformableMirrorError when it does not move less than before: the axis is as it was.
     """
     from dm_autofocus import CameraFocusClient
     from dm_calibration.influence.poke_cure import parameter_text

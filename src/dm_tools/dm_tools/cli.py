@@ -150,11 +150,7 @@ def _set_environment() -> None:
 
 
 def run(words: list[str], name: str) -> None:
-    """Run the command with these words, and end the process with its exit status.
-
-    Args:
-        name: by which it was called.
-    """
+    """Run the command, called by this name with these words, and end the process with its exit status."""
     _set_environment()
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # `./dm` keeps it back while modules are imported

@@ -138,8 +138,7 @@ def converge_step(feedback: Any) -> str:
 def recipe_step(feedback: Any, zernike: Sequence[float] = ()) -> str:
     """Feedback of the action `build_recipes`: number in the list, shape, the map and how far off it was.
 
-    Args:
-        zernike: of the goal; () = of somebody else's, which is not known.
+    `zernike` is that of the goal; () = of somebody else's, which is not known.
     """
     if not feedback.step:
         return converge_step(feedback)

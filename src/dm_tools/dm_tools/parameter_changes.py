@@ -9,14 +9,7 @@ from dm_tools.output import console
 
 
 def set_parameter(client: Any, node: str, name: str, value: Any) -> None:
-    """Set a parameter of a running node.
-
-    Args:
-        client: whose namespace and node are used.
-
-    Raises:
-        DeformableMirrorError: the node does not answer, or refuses.
-    """
+    """Set a parameter of a running node. Raises DeformableMirrorError when it does not answer, or refuses."""
     from rclpy.parameter import Parameter
 
     answer = _answer(client, node, lambda parameters: parameters.set_parameters([Parameter(name, value=value)]))

@@ -45,11 +45,7 @@ def where(client: DeformableMirrorClient) -> str:
 
 @contextmanager
 def running_suite(namespace: str) -> Iterator[DeformableMirrorClient]:
-    """A client of the suite that runs in this namespace.
-
-    Raises:
-        NotRunningError: none of its nodes is found.
-    """
+    """A client of the suite that runs in this namespace. Raises NotRunningError when none of its nodes is found."""
     from dm_client import DeformableMirrorClient
 
     with DeformableMirrorClient(namespace) as client:

@@ -37,8 +37,7 @@ def map_of(image: Any) -> NDArray[np.float32]:
 def surface_error(sag: NDArray[np.floating[Any]], info: Any, target: FocusTarget) -> SurfaceError:
     """Judge a map (row 0 = top) with its dm_msgs/SurfaceMapInfo against a target over the map's aperture.
 
-    Raises:
-        ValueError: the map has no lateral resolution, so that a curvature means nothing.
+    Raises ValueError when the map has no lateral resolution, so that a curvature means nothing.
     """
     if not info.aperture_radius > 0:
         raise ValueError("the map has no lateral resolution: set the interferometer's parameter `pitch`")

@@ -74,10 +74,6 @@ class Snapshot:
 class ConsoleNode:
     """Listens to one mirror's nodes and calls them.
 
-    Args:
-        namespace: of the mirror, "" for none.
-        domain: ROS domain; None = the environment's.
-
     Attributes:
         log: the last lines that nodes logged, and what went wrong here: time, level, logger, message.
     """
@@ -145,11 +141,7 @@ class ConsoleNode:
         )
 
     async def call(self, name: str, request: Any, timeout_s: float = ANSWER_S) -> Any:
-        """Call a service of the suite.
-
-        Raises:
-            Refusal: it refused, with its sentence, or did not answer.
-        """
+        """Call a service of the suite. Raises Refusal when it refused, with its sentence, or did not answer."""
         try:
             return await asyncio.to_thread(self._connection.call, name, request, timeout_s)
         except DeformableMirrorError as error:
@@ -158,8 +150,7 @@ class ConsoleNode:
     async def run(self, name: str, goal: Any, on_feedback: Callable[[Any], None], timeout_s: float = LONGEST_S) -> Any:
         """Run an action to its end and return its result.
 
-        Raises:
-            Refusal: the goal was refused, ended with an error or was cancelled, with the node's sentence.
+        Raises Refusal with the node's sentence when the goal was refused, ended with an error or was cancelled.
         """
         identity = INTERFACES[name].Impl.SendGoalService.Request().goal_id
         identity.uuid = list(uuid.uuid4().bytes)
@@ -186,10 +177,9 @@ class ConsoleNode:
         return next((name for name, watch in self.watched.items() if watch.running), "")
 
     async def cancel(self, name: str) -> None:
-        """Ask the goal that runs for `name` to stop, whoever sent it; nothing when none runs.
+        """Ask the goal that runs for `name`, if one does, to stop, whoever sent it.
 
-        Raises:
-            Refusal: no answer, or the node does not know the goal.
+        Raises Refusal when there is no answer, or the node does not know the goal.
         """
         own, watched = self._stops.get(name), self.watched.get(name)
         if own is not None:

@@ -23,12 +23,7 @@ RECONNECT_S = 60.0
 
 
 def serve(ros: ConsoleNode, port: int) -> None:
-    """Serve the console on loopback until Ctrl-C.
-
-    Args:
-        ros: closed by the caller.
-        port: 1 to 65535.
-    """
+    """Serve the console on loopback until Ctrl-C; the caller closes `ros`."""
     session = Session(ros)
     view = SurfaceView(ros.observer)
 

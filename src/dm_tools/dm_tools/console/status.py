@@ -44,11 +44,7 @@ class Badge:
 
 
 def badges(snapshot: Any, doubt: str) -> list[Badge]:
-    """Mirror, driver, calibration and history in a few words each.
-
-    Args:
-        doubt: why the history is not known, in words; "" = it is.
-    """
+    """Mirror, driver, calibration and history in a few words each; `doubt` = why that is not known, "" = it is."""
     mirror, state, calibration = snapshot.mirror_info, snapshot.actuator_state, snapshot.calibration
     shown = [Badge(f"{mirror.name} {mirror.serial}")] if mirror is not None else [Badge("no mirror", "bad")]
     if "pdm_driver" not in snapshot.present or state is None:
@@ -89,7 +85,6 @@ def reason_against(need: str, snapshot: Any, running: str) -> str:
     Args:
         need: what it needs: "move" (the driver), "focus" (driver and calibration), "measure" (the interferometer),
             "calibrate" (driver and interferometer), "converge" (all), "store" (the node calibration).
-        snapshot: of :class:`~dm_tools.console.console_node.ConsoleNode`.
         running: title of the operation under way, "" = none.
     """
     if running:

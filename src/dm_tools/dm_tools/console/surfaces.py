@@ -65,7 +65,6 @@ def measured_surface(sag: NDArray[np.floating[Any]], info: Any) -> Surface:
 
     Args:
         sag: (H, W) m, row 0 = top, NaN = no data.
-        info: its dm_msgs/SurfaceMapInfo.
 
     Raises:
         ValueError: the aperture radius of the map is not positive, or no pixel of the aperture is valid.
@@ -99,8 +98,7 @@ class SurfaceModel:
 
     Between the sampling points the 21 terms are exact, and what is beyond them is interpolated linearly.
 
-    Raises:
-        ValueError: arrays of the calibration that do not fit together, naming the field.
+    Raises ValueError, naming the field, for arrays of the calibration that do not fit together.
     """
 
     def __init__(self, calibration: Any) -> None:

@@ -214,8 +214,7 @@ def prediction_text(state: Any) -> str:
 def poke_signals(base: Sequence[float], actuator: int, amplitude: float, low: float, high: float) -> list[float]:
     """`base` (N,) with one actuator (1-based) moved by `amplitude`, or the other way where the range ends.
 
-    Raises:
-        ValueError: no such actuator.
+    Raises ValueError when there is no such actuator.
     """
     if not 1 <= actuator <= len(base):
         raise ValueError(f"actuator = {actuator}: must be 1 to {len(base)}")
@@ -235,11 +234,7 @@ def decimal(text: str | None) -> float | None:
 
 
 def evenly(first: float | None, last: float | None, number: float | None) -> list[float]:
-    """`number` curvatures from `first` to `last`, 1/m.
-
-    Raises:
-        ValueError: naming the field that makes no sense.
-    """
+    """`number` curvatures from `first` to `last`, 1/m. Raises ValueError naming the field that makes no sense."""
     for name, value in (("first", first), ("last", last), ("number", number)):
         if value is None or not math.isfinite(value):
             raise ValueError(f"{name}: must be a number")

@@ -52,8 +52,7 @@ def ingest_real_map(path: Path, folder: Path, domain: int) -> dict[str, Any]:
 def curvatures_of(capabilities: Any) -> tuple[float, ...]:
     """Curvatures [1/m] of the sweep: the article's, or eleven over the range of a mirror that does not reach those.
 
-    Raises:
-        RuntimeError: it reaches none.
+    Raises RuntimeError when it reaches none.
     """
     low, high = capabilities.curvature_min, capabilities.curvature_max
     if not low <= high:

@@ -34,10 +34,7 @@ def free_ports(count: int) -> list[int]:
     """Ports that are free on loopback now, for TCP and UDP alike.
 
     Handed out in turn over all processes of this user: what was drawn at random could be another's choice as well, as
-    long as neither had bound it.
-
-    Raises:
-        RuntimeError: there are not so many.
+    long as neither had bound it. Raises RuntimeError when there are not so many.
     """
     ports: list[int] = []
     with (Path(tempfile.gettempdir()) / f"dm-ports-{os.getuid()}").open("a+") as turn:
@@ -134,10 +131,6 @@ def running_bench(config: dict[str, dict[str, Any]], logs: Path, domain: int, cl
 
 
 def wait_for_calibration(client: Any, identifier: str) -> None:
-    """Wait until the focus controller uses a calibration.
-
-    Raises:
-        RuntimeError: it does not.
-    """
+    """Wait until the focus controller uses a calibration. Raises RuntimeError when it does not."""
     if not client.wait(lambda: client.capabilities.calibration_id == identifier):
         raise RuntimeError("the focus controller did not take the new calibration")

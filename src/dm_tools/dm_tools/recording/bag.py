@@ -137,11 +137,7 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open what is at `path`.
-
-        Raises:
-            BagError: no recording there, or none that can be read.
-        """
+        """Open what is at `path`. Raises BagError when that is no recording, or none that can be read."""
         self.path = path
         self.topics: dict[str, Topic] = {}
         with self._opened() as readers:
@@ -158,11 +154,7 @@ class BagReader:
             self.unfinished = [str(reader.path) for reader in readers if isinstance(reader.storage, _Unfinished)]
 
     def read(self, names: Sequence[str] | None = None) -> Iterator[Message]:
-        """Messages in the order received; `names` = only of these topics.
-
-        Raises:
-            BagError: the file is damaged.
-        """
+        """Messages in the order received, `names` = only of these topics. Raises BagError when the file is damaged."""
         missing = sum(count for name, count in self.counts.items() if names is None or name in names)
         with self._opened() as readers:
             for reader in readers:  # each begins where the one before ended

@@ -22,11 +22,7 @@ class UnknownTypeError(ValueError):
 
 @cache
 def message_class(type_name: str) -> Any:
-    """The class of ``package/msg/Type``, or of ``package/action/Type_FeedbackMessage``.
-
-    Raises:
-        UnknownTypeError: the package or the type is not installed.
-    """
+    """The class of ``package/msg/Type``, or of ``package/action/Type_FeedbackMessage``. Raises UnknownTypeError."""
     try:
         package, kind, name = type_name.split("/")
         module = importlib.import_module(f"{package}.{kind}")
@@ -41,11 +37,7 @@ def message_class(type_name: str) -> Any:
 
 @cache
 def definition(type_name: str) -> str:
-    """The definition of a message type with all types it uses, in the format `ros2msg`.
-
-    Raises:
-        UnknownTypeError: not installed.
-    """
+    """The definition of a message type with all it uses, in the format `ros2msg`. Raises UnknownTypeError."""
     main, waiting = _text_and_types(type_name)
     done: dict[str, str] = {}
     while waiting:

@@ -25,8 +25,7 @@ DISCOVERY_S = 1.0
 def replayed(topics: Sequence[str], names: Sequence[str] = (), commands: bool = False) -> list[str]:
     """Which of `topics` are published: `names`, or all but commands, hidden and housekeeping ones.
 
-    Raises:
-        ValueError: a name that is not in the recording.
+    Raises ValueError for a name that is not in the recording.
     """
     wanted = [name if name.startswith("/") else f"/{name}" for name in names]
     for name in wanted:

@@ -100,11 +100,7 @@ class Recorder:
             raise OSError(f"{self.folder}: the recording ended early: {str(self._failure) or repr(self._failure)}")
 
     def close(self) -> None:
-        """Leave the ROS graph and finish the recording.
-
-        Raises:
-            OSError: not everything could be written.
-        """
+        """Leave the ROS graph and finish the recording. Raises OSError when not everything could be written."""
         if not self._writer.is_alive():
             return
         self._stopping = True

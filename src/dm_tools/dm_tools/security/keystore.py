@@ -11,11 +11,7 @@ _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 
 
 def check_keystore(folder: Path, profile: Profile) -> list[str]:
-    """What is wrong with a keystore, in words; empty when nothing is.
-
-    Raises:
-        ValueError: there is no such folder.
-    """
+    """What is wrong with a keystore, in words; empty when nothing is. Raises ValueError when there is none."""
     if not folder.is_dir():
         raise ValueError(f"--check {folder}: no such folder")
     found: list[str] = []

@@ -58,11 +58,7 @@ def full_name(name: str, ns: str, node: str) -> str:
 
 
 def policy_xml(profile: Profile, enclave: str) -> str:
-    """The policy file of one enclave.
-
-    Raises:
-        KeyError: no such enclave.
-    """
+    """The policy file of one enclave."""
     policy = xml.Element("policy", version=POLICY_VERSION)
     place = xml.SubElement(xml.SubElement(policy, "enclaves"), "enclave", path=profile.path(enclave))
     profiles = xml.SubElement(place, "profiles")
@@ -160,11 +156,7 @@ def environment(profile: Profile, keystore: Path) -> str:
 
 
 def write_profile(profile: Profile, folder: Path) -> list[Path]:
-    """Write policies, governance and environment into a keystore's folder; returns the files.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Write policies, governance and environment into a keystore's folder; returns the files. Raises OSError."""
     folder = folder.absolute()
     files = {
         folder / "policies" / f"{enclave}.policy.xml": policy_xml(profile, enclave) for enclave in profile.enclaves()

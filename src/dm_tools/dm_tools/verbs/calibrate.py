@@ -77,11 +77,7 @@ def expected_run(client: Any, goal: Any) -> str:
 
 
 def metres(text: str) -> float:
-    """A length above 0 with its unit, such as 2nm, in m.
-
-    Raises:
-        typer.BadParameter: another form, 0, or a unit that is none of a surface.
-    """
+    """A length above 0 with its unit, such as 2nm, in m. Raises typer.BadParameter for anything else."""
     found = re.fullmatch(r"\s*(\d+|\d*\.\d+)\s*(pm|nm|um)\s*", with_point(text))
     if found is None or float(found[1]) == 0.0:
         raise typer.BadParameter(f"--until {text!r}: must be a number above 0 with pm, nm or um, such as 2nm")

@@ -22,11 +22,7 @@ DEFAULT = "-0.05:0.05:11"
 
 
 def curvatures_of(text: str) -> list[float]:
-    """Curvatures (1/m) from a list such as "-0.02,0,0.02", or from first:last:number.
-
-    Raises:
-        typer.BadParameter: naming what is not a number.
-    """
+    """Curvatures (1/m) from a list such as "-0.02,0,0.02", or from first:last:number. Raises typer.BadParameter."""
     parts = (with_point(text) if ":" in text else text).split(":")
     try:
         if len(parts) == 1:

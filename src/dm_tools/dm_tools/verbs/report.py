@@ -55,8 +55,7 @@ def folder_with(name: str, folders: Sequence[Path]) -> Path:
 def find_calibration(name: str, store: Any) -> tuple[Any, Path]:
     """The calibration of that id or file, "" = the newest that can be read, and its file.
 
-    Raises:
-        ValueError: there is none, with the reason.
+    Raises ValueError with the reason when there is none.
     """
     from dm_calibration.store.calibration_store import SUFFIX, CalibrationStore
 

@@ -113,11 +113,7 @@ def up(
 
 @contextlib.contextmanager
 def only_suite(namespace: str) -> Iterator[None]:
-    """Keep the place of the suite in this ROS domain and namespace.
-
-    Raises:
-        RuntimeError: another `dm up` keeps it.
-    """
+    """Keep the place of the suite in this ROS domain and namespace. Raises RuntimeError when another does."""
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     folder = Path(os.environ.get("ROS_HOME", "~/.ros")).expanduser()
     folder.mkdir(parents=True, exist_ok=True)

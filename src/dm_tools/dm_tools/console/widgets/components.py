@@ -59,8 +59,7 @@ class DecimalField(ui.input):
 class ActionButton(ui.element):
     """A button that is disabled with its reason as a tooltip; a click calls `on_click` with the arguments.
 
-    Args:
-        outline: for what is not the main thing to do.
+    One with an `outline` is for what is not the main thing to do.
     """
 
     def __init__(self, text: str, on_click: Callable[..., Any], *arguments: Any, outline: bool = False) -> None:
