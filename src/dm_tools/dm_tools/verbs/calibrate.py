@@ -15,6 +15,7 @@ from dm_tools.output import (
     NamespaceOption,
     TakeOverOption,
     console,
+    figures,
     nanometres,
     next_step,
     progress_bar,
@@ -131,25 +132,14 @@ def after_run(result: Any, written: Path | None) -> str:
 
 def figures_of(result: Any) -> dict[str, Any]:
     """A calibration's figures for JSON; NaN for what it does not have, as a dry run has no residual."""
-
-    def length(metres: float) -> float:
-        return nanometres(metres) if metres > 0.0 else math.nan
-
-    return {
-        "id": result.id,
-        "maps": result.maps,
-        "maps_dropped": result.maps_dropped,
-        "seconds": result.duration,
-        "in_sample_rms_nm": length(result.in_sample_rms),
-        "held_out_rms_nm": length(result.held_out_rms),
-        "condition_number": result.condition_number or math.nan,
-        "hysteresis_model": result.hysteresis_model,
-        "hysteresis_held_out_max_zernike_nm": length(result.hysteresis_held_out_max_zernike),
-        "expected_max_zernike_nm": length(result.expected_max_zernike),
-        "expected_seconds": result.expected_duration,
-        "poke_findings": list(result.poke_findings),
-        "parameters": result.parameters,
-    }
+    residuals = figures(result, "in_sample_rms_nm", "held_out_rms_nm")
+    of_moves = figures(result, "hysteresis_held_out_max_zernike_nm", "expected_max_zernike_nm")
+    return (
+        figures(result, "id", "maps", "maps_dropped", "hysteresis_model", "parameters")
+        | {name: length if length > 0.0 else math.nan for name, length in (residuals | of_moves).items()}
+        | {"condition_number": result.condition_number or math.nan, "poke_findings": list(result.poke_findings)}
+        | {"seconds": result.duration, "expected_seconds": result.expected_duration}
+    )
 
 
 def calibrate(

@@ -10,6 +10,7 @@ from dm_tools.output import (
     NamespaceOption,
     TakeOverOption,
     console,
+    figures,
     nanometres,
     next_step,
     progress_bar,
@@ -53,21 +54,12 @@ def _build(client: Any, curvatures: list[float], conic: float, zernike: list[flo
 
 
 def _figures(book: Any) -> dict[str, Any]:
-    return {
-        "degauss_steps": book.degauss_steps,
-        "interpolation_error_nm": nanometres(book.interpolation_error),
-        "recipes": [
-            {
-                "curvature": recipe.curvature,
-                "conic_constant": recipe.conic_constant,
-                "zernike_nm": [nanometres(term) for term in recipe.zernike],
-                "max_zernike_nm": nanometres(recipe.max_zernike),
-                "rms_nm": nanometres(recipe.rms),
-                "maps": recipe.maps,
-            }
-            for recipe in book.recipes
-        ],
-    }
+    recipes = [
+        figures(recipe, "curvature", "conic_constant", "max_zernike_nm", "rms_nm", "maps")
+        | {"zernike_nm": [nanometres(term) for term in recipe.zernike]}
+        for recipe in book.recipes
+    ]
+    return figures(book, "degauss_steps", "interpolation_error_nm") | {"recipes": recipes}
 
 
 def recipes(
