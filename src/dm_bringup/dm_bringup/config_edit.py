@@ -18,12 +18,12 @@ def edited(text: str, changes: Changes) -> str:
     Raises:
         ConfigError: the text has a form that cannot be changed so; nothing is lost by an edit.
     """
-    expected = _read(text)
+    expected = values_of(text)
     for node, values in changes.items():
         expected[node] = expected.get(node, {}) | dict(values)
         for name, value in values.items():
             text = _with_value(text, node, name, value)
-    if _read(text) != expected:
+    if values_of(text) != expected:
         raise ConfigError(f"this file cannot be changed without losing its form; put in by hand: {dict(changes)}")
     return text
 
@@ -55,7 +55,7 @@ def _section(text: str, node: str) -> Any:
     return None
 
 
-def _read(text: str) -> dict[str, dict[str, Any]]:
+def values_of(text: str) -> dict[str, dict[str, Any]]:
     """The values of a parameter file by nodes. Raises ConfigError."""
     try:
         content = yaml.safe_load(text) or {}

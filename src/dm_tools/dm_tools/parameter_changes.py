@@ -1,6 +1,6 @@
 """Changes to parameters that a measurement has found: of running nodes, and in their parameter file."""
 
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -72,23 +72,16 @@ def write_parameters(parameters: str, target: Path, source: Path) -> None:
         ConfigError: `source` cannot be changed without losing its form.
         OSError: it cannot be written; what stood at `target` still does.
     """
-    import yaml
-
-    from dm_bringup.config_edit import edited
+    from dm_bringup.config_edit import edited, values_of
     from dm_common.atomic_write import write_whole
 
     if not parameters:
         console.print(f"no parameter has to be changed: {target} is not written")
         return
-    changes = yaml.safe_load(parameters) or {}
-    plain = {key.rsplit("/", 1)[-1]: section["ros__parameters"] for key, section in changes.items()}
-    text = edited(source.read_text(), plain)
+    text = edited(source.read_text(), values_of(parameters))
     if target.exists():
-        before = target.with_name(target.name + ".before")
-        for number in count(2):
-            if not before.exists():
-                break
-            before = target.with_name(f"{target.name}.before{number}")
+        kept = (target.with_name(f"{target.name}.before{number}") for number in chain([""], count(2)))
+        before = next(path for path in kept if not path.exists())
         write_whole(before, target.read_bytes())
         console.print(f"{target} as it was is kept as {before}")
     write_whole(target.resolve(), text.encode())
