@@ -85,8 +85,7 @@ def save_animation(
     # What stands still: a cross on the middle of the picture.
     height, width = sweep.sharp.shape
     cross = left.axhline(height / 2), left.axvline(width / 2)
-    for line in cross:
-        line.set(color="#F0E442", linewidth=0.8, visible=False)
+    plt.setp(cross, color="#F0E442", linewidth=0.8, visible=False)
     depth = right.inset_axes((0, 0, 1, 1))
     depth.set(visible=False, xticks=[], yticks=[])
     depth.imshow(sweep.depth, cmap="viridis_r", norm=LogNorm(4, 150), interpolation="nearest", aspect="auto")
@@ -116,21 +115,16 @@ def save_animation(
         show(item.final if done else item.shots[shown], f"1  Few images. {text}", colour, item.region)
 
     def stand(shown: int) -> None:
-        for line in cross:
-            line.set(visible=True)
+        plt.setp(cross, visible=True)
         show(sweep.shots[shown], "2  The picture stands still while the focus sweeps", "black")
 
     def everything(_shown: int) -> None:
-        for line in cross:
-            line.set(visible=False)
+        plt.setp(cross, visible=False)
         picture.set_data(sweep.sharp)
         depth.set(visible=True)
         right.set_axis_off()
-        left.set_title(
-            f"3  All sharp, and how far away: {len(sweep.shots)} images, {sweep.seconds:.1f} s",
-            color="black",
-            fontsize=9,
-        )
+        text = f"3  All sharp, and how far away: {len(sweep.shots)} images, {sweep.seconds:.1f} s"
+        left.set_title(text, color="black", fontsize=9)
 
     def track(shown: int) -> None:
         depth.set(visible=False)

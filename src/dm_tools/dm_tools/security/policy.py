@@ -113,21 +113,19 @@ def dds_topics(profile: Profile, enclave: str) -> dict[str, set[str]]:
     """The DDS topics that an enclave may "publish" and "subscribe", as sros2 writes them into its permissions."""
     publish, subscribe = {"ros_discovery_info"}, {"ros_discovery_info"}
     for node in profile.enclaves()[enclave]:
-
-        def names(rule: str, node: NodeInterface = node) -> list[str]:
-            return [full_name(name, profile.ns, node.name) for name in getattr(node, rule)]
-
-        publish |= {f"rt{name}" for name in names("publish")}
-        subscribe |= {f"rt{name}" for name in names("subscribe")}
-        actions = {
-            rule: [f"{name}/_action/{part}" for name in names(rule) for part in _ACTION_SERVICES]
-            for rule in ("execute", "call")
+        full = {
+            rule: [full_name(name, profile.ns, node.name) for name in getattr(node, rule)]
+            for rules in _RULES.values()
+            for rule in rules
         }
-        offered, called = names("reply") + actions["execute"], names("request") + actions["call"]
+        offered = full["reply"] + [f"{name}/_action/{part}" for name in full["execute"] for part in _ACTION_SERVICES]
+        called = full["request"] + [f"{name}/_action/{part}" for name in full["call"] for part in _ACTION_SERVICES]
+        publish |= {f"rt{name}" for name in full["publish"]}
         publish |= {f"rr{name}Reply" for name in offered} | {f"rq{name}Request" for name in called}
+        publish |= {f"rt{name}/_action/{part}" for name in full["execute"] for part in _ACTION_TOPICS}
+        subscribe |= {f"rt{name}" for name in full["subscribe"]}
         subscribe |= {f"rq{name}Request" for name in offered} | {f"rr{name}Reply" for name in called}
-        publish |= {f"rt{name}/_action/{part}" for name in names("execute") for part in _ACTION_TOPICS}
-        subscribe |= {f"rt{name}/_action/{part}" for name in names("call") for part in _ACTION_TOPICS}
+        subscribe |= {f"rt{name}/_action/{part}" for name in full["call"] for part in _ACTION_TOPICS}
     return {"publish": publish, "subscribe": subscribe}
 
 
