@@ -127,13 +127,11 @@ async def release(session: Session) -> str:
     base, (_, requested) = session.base, _mirror_and_signals(session)
     if base is None:
         return "nothing is poked"
+    ours = np.array_equal(requested, session.poked)
+    if ours:
+        await session.ros.call("set_signals", SetSignals.Request(signals=base, wait=True), MOVE_S)
     session.base = None
-    if not np.array_equal(requested, session.poked):
-        return "the mirror was moved by somebody else since; it stays where it is"
-    session.base = base
-    await session.ros.call("set_signals", SetSignals.Request(signals=base, wait=True), MOVE_S)
-    session.base = None
-    return "back at the shape before"
+    return "back at the shape before" if ours else "the mirror was moved by somebody else since; it stays where it is"
 
 
 async def measure_loop(session: Session, actuator: int, amplitude: float) -> str:

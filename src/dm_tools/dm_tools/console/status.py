@@ -116,21 +116,11 @@ def reason_against(need: str, snapshot: Any, running: str) -> str:
     return ""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One status of `/diagnostics`; `figures` in full."""
-
-    level: str
-    node: str
-    message: str
-    figures: str
-
-
-def diagnostic_rows(statuses: dict[str, Any]) -> list[Row]:
-    """The latest status of each node, the worst first."""
+def diagnostic_rows(statuses: dict[str, Any]) -> list[tuple[str, str, str, str]]:
+    """(level, node, message, figures) of the latest status of each node, the worst first."""
     worst_first = sorted(statuses.values(), key=lambda status: (-ord(bytes(status.level)), status.name))
     return [
-        Row(
+        (
             LEVELS.get(bytes(status.level), "?"),
             status.name,
             status.message,

@@ -170,19 +170,19 @@ def bars(zernike: Any, predicted: Floats | None, as_difference: bool) -> list[Ba
         return []
     sigma = np.array(zernike.sigma, dtype=np.float64)
     reach = SIGMAS_95 * sigma if sigma.shape == measured.shape else np.zeros_like(measured)
-    usable = predicted is not None and predicted.shape == measured.shape
-    if as_difference and not usable:
-        return []
-    shown = measured - predicted if as_difference and predicted is not None else measured
+    shown, marked = measured, predicted
+    if as_difference:
+        if predicted is None:
+            return []
+        shown, marked = measured - predicted, None
     return [
         Bar(
             name=f"{SPOKEN[k].replace('secondary', '2nd')} {NAMES[k].split()[0].replace('_', '').replace('^', ',')}",
             value_nm=float(shown[k]) * NM,
             reach_nm=float(reach[k]) * NM,
-            predicted_nm=float(predicted[k]) * NM if predicted is not None and usable and not as_difference else None,
+            predicted_nm=float(marked[k]) * NM if marked is not None else None,
         )
-        for k in range(len(NAMES))
-        if k >= PISTON_TILT
+        for k in range(PISTON_TILT, len(NAMES))
     ]
 
 

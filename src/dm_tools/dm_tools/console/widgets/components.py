@@ -76,7 +76,7 @@ class ActionButton(ui.element):
             self.props["title"] = reason
 
 
-class Chart:
+class Chart(ui.element):
     """A chart that is sent only when it changed; a text stands there while there is none.
 
     Args:
@@ -85,35 +85,30 @@ class Chart:
     """
 
     def __init__(self, shape: str, on_click: Callable[[Any], None] | None = None) -> None:
+        super().__init__("div")
+        self.classes("chart")
         self._shape, self._on_click = shape, on_click
         self._shown: Drawing | None = None
         self._chart: ui.echart | None = None  # made with the first drawing: it must have its size from the beginning
-        self._place = ui.element("div").classes("chart")
-        with self._place:
-            self._text = ui.label("").classes("empty")
-            self._text.set_visibility(False)
+        with self:
+            self._empty = Line("empty")
 
     def show(self, drawing: Drawing | None, text: str = "") -> None:
         """Show a drawing, or `text` when there is none."""
-        self._text.set_visibility(drawing is None and bool(text))
-        self._text.set_text(text)
+        self._empty.show(text if drawing is None else "")
         if self._chart is not None:
             self._chart.set_visibility(drawing is not None)
         if drawing is not None and drawing != self._shown:
-            chart = self._chart = self._chart or self._new_chart()
-            chart.options.clear()
-            chart.options.update(drawing.options)
-            chart.props["aria-label"] = drawing.description
-            chart.update()
+            if self._chart is None:
+                with self:
+                    self._chart = ui.echart({}, renderer="svg").classes(self._shape).props('role="img"')
+                if (on_click := self._on_click) is not None:
+                    self._chart.on_point_click(lambda event: on_click(event.value))
+            self._chart.options.clear()
+            self._chart.options.update(drawing.options)
+            self._chart.props["aria-label"] = drawing.description
+            self._chart.update()
         self._shown = drawing
-
-    def _new_chart(self) -> ui.echart:
-        with self._place:
-            chart = ui.echart({}, renderer="svg").classes(self._shape).props('role="img"')
-        if self._on_click is not None:
-            on_click = self._on_click
-            chart.on_point_click(lambda event: on_click(event.value))
-        return chart
 
 
 class Line(ui.label):

@@ -37,9 +37,9 @@ class DiagnosticsCard:
 
     def refresh(self, snapshot: Snapshot) -> None:
         content = "".join(
-            f'<div class="status"><b>{escape(row.level)}: {escape(row.node)}</b> {_short(row.message)}'
-            f'<div class="faint">{_short(row.figures)}</div></div>'
-            for row in diagnostic_rows(snapshot.diagnostics)
+            f'<div class="status"><b>{escape(level)}: {escape(node)}</b> {_short(message)}'
+            f'<div class="faint">{_short(figures)}</div></div>'
+            for level, node, message, figures in diagnostic_rows(snapshot.diagnostics)
         ) or _empty("No node has reported its health yet.")
         self._place.set_content(content)
 
