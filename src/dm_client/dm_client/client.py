@@ -96,7 +96,10 @@ class DeformableMirrorClient(Connection):
     # --- what is known ---
 
     def latest(self, topic: str, timeout_s: float | None = None) -> Any:
-        """The latest message of a topic of TOPICS. Raises DeformableMirrorError when none came within the time."""
+        """The latest message of `mirror_info`, `calibration`, `capabilities` or `actuator_state`.
+
+        Raises DeformableMirrorError when none came within the time.
+        """
         if not self.wait(lambda: topic in self.messages, timeout_s):
             raise DeformableMirrorError(ErrorCode.INTERNAL, f"no message on {topic}: are the nodes running (./dm up)?")
         return self.messages[topic]

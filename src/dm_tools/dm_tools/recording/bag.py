@@ -80,7 +80,8 @@ class BagWriter:
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._writer.open()
         assert isinstance(self._writer.storage, McapWriter)
-        self._writer.storage.compressor = partial(zstd.compress, options=CHECKED)
+        self._storage = self._writer.storage
+        self._storage.compressor = partial(zstd.compress, options=CHECKED)
         self._connections: dict[str, interfaces.Connection] = {}
         self._flushed = 0
 
@@ -104,12 +105,10 @@ class BagWriter:
 
     def flush(self) -> None:
         """Bring to the disk what was written."""
-        storage = self._writer.storage
-        assert isinstance(storage, McapWriter)
-        if storage.chunk.msgs:
-            storage.close_chunk()
-        storage.bio.flush()
-        os.fsync(storage.bio.fileno())
+        if self._storage.chunk.msgs:
+            self._storage.close_chunk()
+        self._storage.bio.flush()
+        os.fsync(self._storage.bio.fileno())
 
     def close(self) -> None:
         """Finish the file and write the metadata, both to the disk."""

@@ -81,20 +81,17 @@ def up(
         for name, file in itertools.zip_longest(mirrors, config or [])
     ]
     with tempfile.TemporaryDirectory(prefix="dm-up-") as temporary, contextlib.ExitStack() as stack:
-        for name in mirrors:
+        for name, configuration in mirrors.items():
             stack.enter_context(only_suite(name))
-        for configuration in mirrors.values():  # else a driver would take the mirror of another bench for its own
+            # Else a driver would take the mirror of another bench for its own.
             if taken := taken_ports(configuration["virtual_bench"]) if "virtual_bench" in configuration else None:
                 raise RuntimeError(f"virtual_bench: {taken.problem}: {taken.cure}")
         stack.callback(end, watchers, stop)  # the last of all: the mirrors are safe first
         folder = logs if logs is not None else Path(temporary)
-        suites = [
-            stack.enter_context(
-                Suite(configuration, folder / name, namespace=name, echo=logs is None, remap=remap or [])
-            )
-            for name, configuration in mirrors.items()
-        ]
+        suites = []
         for name, configuration in mirrors.items():
+            suite = Suite(configuration, folder / name, namespace=name, echo=logs is None, remap=remap or [])
+            suites.append(stack.enter_context(suite))
             kind = "virtual bench" if "virtual_bench" in configuration else "hardware"
             console.print(f"the nodes {f'of {name} ' if name else ''}are starting ({kind})")
             if kind == "virtual bench":
