@@ -80,8 +80,7 @@ class ConsoleNode:
 
     def __init__(self, namespace: str = "", domain: int | None = None) -> None:
         self._prefix = f"{namespace.strip('/')}/" if namespace.strip("/") else ""
-        self._heard: dict[str, float] = {}
-        self._diagnostics: dict[str, DiagnosticStatus] = {}
+        self._diagnostics: dict[str, tuple[DiagnosticStatus, float]] = {}  # and when they were heard
         self._bench_time = 0.0
         self._stops: dict[str, threading.Event] = {}  # of the goals that run; once set they are cancelled
         self.observer = StateObserver()
@@ -108,8 +107,7 @@ class ConsoleNode:
         restarted = time_s < self._bench_time - TIME_JUMP_S
         self._bench_time = time_s if restarted else max(self._bench_time, time_s)
         for status in message.status:
-            self._diagnostics[status.name] = status
-            self._heard[status.name] = time.monotonic()
+            self._diagnostics[status.name] = status, time.monotonic()
 
     def _take_line(self, line: Log) -> None:
         self.take_log(seconds(line.stamp), LOG_LEVELS.get(line.level, str(line.level)), line.name, line.msg)
@@ -124,10 +122,10 @@ class ConsoleNode:
 
     def snapshot(self) -> Snapshot:
         """What is known now."""
-        recent = time.monotonic() - SILENCE_S
+        recent, diagnostics = time.monotonic() - SILENCE_S, dict(self._diagnostics)
         present = frozenset(
             name.removeprefix(self._prefix)
-            for name, when in dict(self._heard).items()
+            for name, (_status, when) in diagnostics.items()
             if when >= recent and name.startswith(self._prefix)
         )
         messages = dict(self._connection.messages)
@@ -135,7 +133,7 @@ class ConsoleNode:
             del messages["calibration"]
         return Snapshot(
             **messages,
-            diagnostics=dict(self._diagnostics),
+            diagnostics={name: status for name, (status, _when) in diagnostics.items()},
             present=present,
             bench_time=self._bench_time,
         )

@@ -50,10 +50,9 @@ details.card:not([open]) { gap: 0; }
 .figures { font-variant-numeric: tabular-nums; }
 .scroll { max-height: 340px; overflow: auto; width: 100%; font-size: .82rem; }
 .scroll table { width: 100%; border-collapse: collapse; }
-.scroll td { padding: 1px 8px 1px 0; vertical-align: top; overflow-wrap: anywhere; }
+.scroll td { padding: 1px 8px 1px 0; vertical-align: top; overflow-wrap: anywhere; white-space: nowrap; }
 .status { margin-bottom: 6px; overflow-wrap: anywhere; }
 .faint { color: var(--faint); }
-.scroll td { white-space: nowrap; }
 .scroll td:first-child { font-weight: 600; }
 .scroll td:last-child { white-space: normal; width: 100%; }
 .numbers th { text-align: right; font-weight: 600; padding: 1px 8px 1px 0; }
@@ -67,9 +66,8 @@ button:focus-visible, .q-slider:focus-within { outline: 3px solid var(--focus); 
 .chart .nicegui-echart { width: 100%; height: auto; }
 .chart .square { height: calc(100cqw + 44px); cursor: pointer; }
 .chart .heat { height: calc(100cqw - 40px); }
-.chart .bars { height: 340px; }
+.chart .bars, .chart .loop { height: 340px; }
 .chart .run { height: 190px; }
-.chart .loop { height: 340px; }
 .empty { color: var(--faint); padding: 24px 8px; text-align: center; }
 .work { display: flex; gap: 8px; align-items: center; flex: 1 1 300px; min-width: 0; }
 .work .text { flex: 0 1 auto; overflow: hidden; display: -webkit-box; -webkit-box-orient: vertical;

@@ -2,9 +2,7 @@
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from dm_common import Floats
 from dm_common.messages import stamp_ns
 from dm_tools.console.console_node import Snapshot
 from dm_tools.console.state_observer import EffectiveSignals, StateObserver
@@ -25,8 +23,8 @@ class SurfaceView:
 
     Attributes:
         version: rises whenever something changed.
-        measured, predicted, difference: None with a reason in `..._reason`. `predicted` is for now, `difference` for
-            the moment of the map.
+        measured, predicted, difference: or why there is none. `predicted` is for now, `difference` for the moment of
+            the map.
         predicted_then: for the moment of the map; None = not known.
         predicted_zernike: (K,) m for the moment of the map; None = not known.
         remark: on what the prediction leaves out, in words; "" = nothing.
@@ -37,15 +35,13 @@ class SurfaceView:
     def __init__(self, observer: StateObserver) -> None:
         self._observer = observer
         self.version = self.stamp = 0
-        self.measured: Surface | None = None
-        self.predicted: Surface | None = None
-        self.difference: Surface | None = None
+        self.measured: Surface | str = "No map was measured yet."
+        self.predicted: Surface | str = NO_CALIBRATION
+        self.difference: Surface | str = NO_CALIBRATION
         self.predicted_then: Surface | None = None
-        self.predicted_zernike: NDArray[np.float64] | None = None
-        self.no_map_reason = "No map was measured yet."
-        self.no_prediction_reason = self.no_difference_reason = NO_CALIBRATION
+        self.predicted_zernike: Floats | None = None
         self.remark = self.when = ""
-        self._model: SurfaceModel | None = None
+        self._model: SurfaceModel | str = NO_CALIBRATION
         self._calibration = self._image = None
         self._then = self._now = EffectiveSignals(None, "")
 
@@ -67,12 +63,11 @@ class SurfaceView:
     def _take_calibration(self, calibration: Any) -> bool:
         if calibration is self._calibration:
             return False
-        self._calibration, self._model, self.no_prediction_reason = calibration, None, NO_CALIBRATION
-        if calibration is not None:
-            try:
-                self._model = SurfaceModel(calibration)
-            except ValueError as error:
-                self.no_prediction_reason = str(error)
+        self._calibration = calibration
+        try:
+            self._model = SurfaceModel(calibration) if calibration is not None else NO_CALIBRATION
+        except ValueError as error:
+            self._model = str(error)
         return True
 
     def _take_map(self, snapshot: Snapshot) -> bool:
@@ -81,38 +76,39 @@ class SurfaceView:
             return False
         self._image, self.stamp = image, stamp_ns(info.header.stamp)
         try:
-            self.measured, self.no_map_reason = measured_surface(map_of(image), info), ""
+            self.measured = measured_surface(map_of(image), info)
         except ValueError as error:
-            self.measured, self.no_map_reason = None, f"The last map cannot be shown: {error}"
+            self.measured = f"The last map cannot be shown: {error}"
         return True
 
     def _draw(self) -> None:
         """Work out what is shown."""
-        self.predicted = self.predicted_then = self.difference = self.predicted_zernike = None
+        self.predicted_then = self.predicted_zernike = None
         self.when = ""
-        if self._model is None:
-            self.no_difference_reason = self.no_prediction_reason
+        if isinstance(self._model, str):
+            self.predicted = self.difference = self._model
             return
-        self.predicted, self.no_prediction_reason = _predicted(self._model, self._now)
         self.remark = CREEP_BEFORE if self._observer.creep_unseen else ""
-        if self.measured is None:
-            self.no_difference_reason = self.no_map_reason
+        try:
+            self.predicted = self._model.surface(_known(self._now, self._model))
+        except ValueError as error:
+            self.predicted = str(error)
+        if isinstance(self.measured, str):
+            self.difference = self.measured
             return
-        self.predicted_then, reason = _predicted(self._model, self._then)
-        if self.predicted_then is not None and self._then.effective is not None:
-            try:
-                self.difference = difference(self.measured, self.predicted_then)
-                self.predicted_zernike = self._model.coefficients(self._then.effective)
-            except ValueError as error:
-                reason = str(error)
-            if self.predicted is not None:
-                here = self._now.near(self._then._replace(doubt=self.doubt), SMALL_MOVE)
-                self.when = "The map is of the present shape." if here else MOVED
-        self.no_difference_reason = f"Not comparable: {reason}." if reason else ""
+        try:
+            then = _known(self._then, self._model)
+            self.predicted_then, self.predicted_zernike = self._model.surface(then), self._model.coefficients(then)
+            self.difference = difference(self.measured, self.predicted_then)
+        except ValueError as error:
+            self.difference = f"Not comparable: {error}."
+        if self.predicted_then is not None and isinstance(self.predicted, Surface):
+            moved = not self._now.near(self._then._replace(doubt=self.doubt), SMALL_MOVE)
+            self.when = MOVED if moved else "The map is of the present shape."
 
 
-def _predicted(model: SurfaceModel, signals: EffectiveSignals) -> tuple[Surface | None, str]:
-    """The surface under these signals, or None and why it is not known."""
+def _known(signals: EffectiveSignals, model: SurfaceModel) -> Floats:
+    """The effective signals (N,). Raises ValueError when they are not known, or of another mirror."""
     if signals.effective is None or signals.effective.shape != (model.actuators,):
-        return None, signals.doubt or "the calibration is of another mirror"
-    return model.surface(signals.effective), ""
+        raise ValueError(signals.doubt or "the calibration is of another mirror")
+    return signals.effective

@@ -55,23 +55,22 @@ class SurfaceCard:
             return
         self._shown = key
         self._when.show(view.when)
-        then = bool(self._then.value) and view.predicted_then is not None
-        predicted = view.predicted_then if then else view.predicted
-        self._names[1].set_text(PREDICTED[then])
-        limit = max([s.extent for s in (view.measured, predicted) if s is not None], default=np.nan)
-        self._panel(0, view.measured, limit, SAG_COLOURS, "measured surface", view.no_map_reason)
+        predicted = (self._then.value and view.predicted_then) or view.predicted
+        self._names[1].set_text(PREDICTED[predicted is view.predicted_then])
+        limit = max([s.extent for s in (view.measured, predicted) if isinstance(s, Surface)], default=np.nan)
+        self._panel(0, view.measured, limit, SAG_COLOURS, "measured surface")
         text = " ".join([f"A guess until a degauss: {view.doubt}." if view.doubt else "", view.remark]).strip()
-        self._panel(1, predicted, limit, SAG_COLOURS, "predicted surface", view.no_prediction_reason, text)
+        self._panel(1, predicted, limit, SAG_COLOURS, "predicted surface", text)
         gap = view.difference
-        extent = float(np.nanpercentile(np.abs(gap.sag), COVERED)) if gap is not None else np.nan
-        self._panel(2, gap, extent, DIFFERENCE_COLOURS, "measured minus predicted", view.no_difference_reason)
+        extent = float(np.nanpercentile(np.abs(gap.sag), COVERED)) if isinstance(gap, Surface) else np.nan
+        self._panel(2, gap, extent, DIFFERENCE_COLOURS, "measured minus predicted")
 
     def _panel(
-        self, place: int, surface: Surface | None, limit: float, colours: str, name: str, reason: str, remark: str = ""
+        self, place: int, surface: Surface | str, limit: float, colours: str, name: str, remark: str = ""
     ) -> None:
         picture, text = self._panels[place]
-        if surface is None:
-            picture.show(None, reason)
+        if isinstance(surface, str):
+            picture.show(None, surface)
             text.show("")
             return
         picture.show(heat_map(surface, limit, colours, name))
@@ -102,5 +101,6 @@ class ZernikeCard:
         if found and predicted is not None and not as_difference:
             text.append("The diamond is the prediction for the moment of the map.")
         if found and wanted and not as_difference:
-            text.append(f"Shown as measured. {self._view.no_difference_reason}")
+            text.append("Shown as measured.")
+            text += [self._view.difference] if isinstance(self._view.difference, str) else []
         self._note.show(" ".join(text))
