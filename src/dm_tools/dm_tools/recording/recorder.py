@@ -85,11 +85,6 @@ class Recorder:
         self._spinning.start()
 
     @property
-    def folder(self) -> Path:
-        """Where the recording is."""
-        return self._bag.folder
-
-    @property
     def counts(self) -> dict[str, int]:
         """Messages written of each topic so far."""
         return self._bag.counts
@@ -97,7 +92,7 @@ class Recorder:
     def check(self) -> None:
         """Raise OSError when the recording can no longer be written (disk full, ...)."""
         if self._failure is not None:
-            raise OSError(f"{self.folder}: the recording ended early: {str(self._failure) or repr(self._failure)}")
+            raise OSError(f"{self._bag.folder}: the recording ended early: {str(self._failure) or repr(self._failure)}")
 
     def close(self) -> None:
         """Leave the ROS graph and finish the recording. Raises OSError when not everything could be written."""

@@ -44,10 +44,11 @@ def keys_missing(folder: Path, profile: Profile) -> list[str]:
 def _compare_text(path: Path, wanted: str) -> list[str]:
     if not path.is_file():
         return [f"{path}: missing"]
-    old, new = (set(map(str.strip, text.splitlines())) for text in (path.read_text(errors="replace"), wanted))
-    more, less = sorted(old - new), sorted(new - old)
-    if path.read_text(errors="replace") == wanted:
+    written = path.read_text(errors="replace")
+    if written == wanted:
         return []
+    old, new = (set(map(str.strip, text.splitlines())) for text in (written, wanted))
+    more, less = sorted(old - new), sorted(new - old)
     text = [f"more: {' '.join(more[:3])}"] if more else []
     text += [f"missing: {' '.join(less[:3])}"] if less else []
     return [f"{path}: differs from the profile; {'; '.join(text) or 'in its order'}"]
@@ -74,10 +75,9 @@ def _check_permissions(path: Path, profile: Profile, enclave: str) -> list[str]:
             for part in allow.findall(rule)
             for topic in part.iter("topic")
         }
-        if allowed - wanted:
-            found.append(f"{path}: {rule}: more than the policy: {', '.join(sorted(allowed - wanted)[:5])}")
-        if wanted - allowed:
-            found.append(f"{path}: {rule}: missing: {', '.join(sorted(wanted - allowed)[:5])}")
+        for text, names in (("more than the policy", allowed - wanted), ("missing", wanted - allowed)):
+            if names:
+                found.append(f"{path}: {rule}: {text}: {', '.join(sorted(names)[:5])}")
     for item in document.iter("not_after"):
         end = datetime.fromisoformat(str(item.text))
         if (end if end.tzinfo else end.replace(tzinfo=UTC)) < datetime.now(UTC):

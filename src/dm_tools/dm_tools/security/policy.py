@@ -14,6 +14,35 @@ ROOT = "/dm"
 _RULES = {"topic": ("publish", "subscribe"), "service": ("reply", "request"), "action": ("execute", "call")}
 _ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
 _ACTION_TOPICS = ("feedback", "status")
+GOVERNANCE_SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
+GOVERNANCE = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" xsi:noNamespaceSchemaLocation="{schema}">
+  <domain_access_rules>
+    <domain_rule>
+      <domains>
+        <id>{domain}</id>
+      </domains>
+      <allow_unauthenticated_participants>false</allow_unauthenticated_participants>
+      <enable_join_access_control>true</enable_join_access_control>
+      <discovery_protection_kind>ENCRYPT</discovery_protection_kind>
+      <liveliness_protection_kind>ENCRYPT</liveliness_protection_kind>
+      <rtps_protection_kind>SIGN</rtps_protection_kind>
+      <topic_access_rules>
+        <topic_rule>
+          <topic_expression>*</topic_expression>
+          <enable_discovery_protection>true</enable_discovery_protection>
+          <enable_liveliness_protection>true</enable_liveliness_protection>
+          <enable_read_access_control>true</enable_read_access_control>
+          <enable_write_access_control>true</enable_write_access_control>
+          <metadata_protection_kind>ENCRYPT</metadata_protection_kind>
+          <data_protection_kind>ENCRYPT</data_protection_kind>
+        </topic_rule>
+      </topic_access_rules>
+    </domain_rule>
+  </domain_access_rules>
+</dds>
+"""
 
 
 @dataclass(frozen=True)
@@ -75,33 +104,7 @@ def policy_xml(profile: Profile, enclave: str) -> str:
 
 def governance_xml(profile: Profile) -> str:
     """Who may join the domain and how: authenticated participants only, access control, everything encrypted."""
-    head = {
-        "xmlns:xsi": "http://www.w3.org/2001/XMLSchema-instance",
-        "xsi:noNamespaceSchemaLocation": "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd",
-    }
-    document = xml.Element("dds", head)
-    rule = xml.SubElement(xml.SubElement(document, "domain_access_rules"), "domain_rule")
-    xml.SubElement(xml.SubElement(rule, "domains"), "id").text = str(profile.domain)
-    for name, value in (
-        ("allow_unauthenticated_participants", "false"),
-        ("enable_join_access_control", "true"),
-        ("discovery_protection_kind", "ENCRYPT"),
-        ("liveliness_protection_kind", "ENCRYPT"),
-        ("rtps_protection_kind", "SIGN"),
-    ):
-        xml.SubElement(rule, name).text = value
-    topics = xml.SubElement(xml.SubElement(rule, "topic_access_rules"), "topic_rule")
-    for name, value in (
-        ("topic_expression", "*"),
-        ("enable_discovery_protection", "true"),
-        ("enable_liveliness_protection", "true"),
-        ("enable_read_access_control", "true"),
-        ("enable_write_access_control", "true"),
-        ("metadata_protection_kind", "ENCRYPT"),
-        ("data_protection_kind", "ENCRYPT"),
-    ):
-        xml.SubElement(topics, name).text = value
-    return _text(document)
+    return GOVERNANCE.format(domain=profile.domain, schema=GOVERNANCE_SCHEMA)
 
 
 def _text(document: xml.Element) -> str:
