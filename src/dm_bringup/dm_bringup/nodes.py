@@ -115,18 +115,14 @@ def arguments_of(node: SuiteNode, values: Mapping[str, str]) -> dict[str, Any]:
     Raises:
         ValueError: a value that cannot be; the message names the argument, the value and what is allowed.
     """
-    parameters: list[Any] = [values["config"]]
-    given = {name: values[name] for name in ("use_sim_time", "autostart") if values[name]}
-    if not node.lifecycle:
-        given.pop("autostart", None)
-    if given.get("autostart") == BY_EVENTS:
-        given["autostart"] = "false"
-    switches = {name: flag(name, text, BY_EVENTS if name == "autostart" else "") for name, text in given.items()}
-    if switches:
-        parameters.append(switches)
+    switches = {}
+    if values["use_sim_time"]:
+        switches["use_sim_time"] = flag("use_sim_time", values["use_sim_time"])
+    if node.lifecycle and (autostart := values["autostart"]):
+        switches["autostart"] = autostart != BY_EVENTS and flag("autostart", autostart, BY_EVENTS)
     return {
         "namespace": values["namespace"],
-        "parameters": parameters,
+        "parameters": [values["config"], switches] if switches else [values["config"]],
         "remappings": [remapping(rule) for rule in values["remap"].split()],
         "arguments": ["--ros-args", "--log-level", values["log_level"]],
         "respawn": flag("respawn", values["respawn"]),
